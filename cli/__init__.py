@@ -1,0 +1,2 @@
+"""x."""
+def main(): return 0

@@ -1,0 +1,142 @@
+"""The cross-section of an array: blocks of any shape, iron ring, and air out to the boundary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gmsh
+import numpy as np
+
+from halbach_fe import regions as tags
+from halbach_fe.blocks import MagnetBlock, Outline, array_outer_radius, blocks_of
+from halbach_fe.errors import StudyError
+from halbach_fe.geo.session import gmsh_session, write_mesh
+from halbach_fe.regions import BlockRegion, Regions
+from halbach_fe.study import Study
+
+DEFAULT_BOUNDARY_RATIO = 10.0
+"""Boundary radius over the magnet's: a dipole's 1/r^3 leaves 1e-3 of what the boundary changes."""
+
+
+def magnet_radius(study: Study) -> float:
+    """Radius in m of everything that is not air."""
+    radius = array_outer_radius(study)
+    if study.iron_ring is None:
+        return radius
+    if study.iron_ring.inner_radius_m < radius * (1 - 1e-9):
+        raise StudyError(
+            f"Input `iron_ring.inner_radius_m` of study must be at least {radius:.6g}, where the "
+            f"blocks end; instead received {study.iron_ring.inner_radius_m:g}. Enlarge the ring."
+        )
+    return study.iron_ring.outer_radius_m
+
+
+def boundary_radius(study: Study) -> float:
+    """Radius in m where the field is cut off."""
+    inside = magnet_radius(study)
+    radius = study.open_boundary.radius_m or DEFAULT_BOUNDARY_RATIO * inside
+    if radius <= 1.2 * inside:
+        raise StudyError(
+            f"Input `open_boundary.radius_m` of study must be well beyond the magnet "
+            f"({inside:g} m); instead received {radius:g}. Leave it out for "
+            f"{DEFAULT_BOUNDARY_RATIO * inside:g}."
+        )
+    return radius
+
+
+def mesh_2d(study: Study, mesh_path: Path) -> Regions:
+    """Mesh the cross-section with curved second-order triangles and return its regions."""
+    blocks = blocks_of(study)
+    with gmsh_session(study.name):
+        surfaces = draw(study, blocks)
+        gmsh.model.mesh.generate(2)
+        gmsh.model.mesh.setOrder(2)
+        for tag, entities in surfaces.items():
+            gmsh.model.addPhysicalGroup(2, entities, tag)
+        gmsh.model.addPhysicalGroup(1, outer_curves(study), tags.OUTER_BOUNDARY_TAG)
+        write_mesh(mesh_path)
+    return regions_of(study, blocks)
+
+
+def draw(study: Study, blocks: tuple[MagnetBlock, ...]) -> dict[int, list[int]]:
+    """Draw the first ring's cross-section; return physical tag -> surfaces (none empty).
+
+    Sizes are set, nothing is meshed yet.
+    """
+    occ = gmsh.model.occ
+    disk = [(2, occ.addDisk(0, 0, 0, boundary_radius(study), boundary_radius(study)))]
+    drawn = [(tags.FIRST_BLOCK_TAG + i, (2, _surface(block.outline)))
+             for i, block in enumerate(blocks) if block.ring == 1]
+    if study.iron_ring is not None:
+        loops = [occ.addCurveLoop([occ.addCircle(0, 0, 0, radius)])
+                 for radius in (study.iron_ring.outer_radius_m, study.iron_ring.inner_radius_m)]
+        drawn.append((tags.IRON_TAG, (2, occ.addPlaneSurface(loops))))
+    _, children = occ.fragment(disk, [entity for _, entity in drawn])
+    occ.synchronize()
+    gmsh.model.removeEntities(
+        [point for point in gmsh.model.getEntities(0)
+         if not len(gmsh.model.getAdjacencies(*point)[0])])
+    surfaces = {tag: [entity for _, entity in pieces]
+                for (tag, _), pieces in zip(drawn, children[1:], strict=True)}
+    solid = {entity for pieces in surfaces.values() for entity in pieces}
+    surfaces[tags.AIR_TAG] = [entity for _, entity in children[0] if entity not in solid]
+    _set_sizes(study)
+    return surfaces
+
+
+def outer_curves(study: Study) -> list[int]:
+    """The curves of the outer boundary."""
+    radius = boundary_radius(study)
+    found = []
+    for _, curve in gmsh.model.getEntities(1):
+        low, high = gmsh.model.getParametrizationBounds(1, curve)
+        middle = gmsh.model.getValue(1, curve, [(low[0] + high[0]) / 2])
+        if np.hypot(middle[0], middle[1]) > radius * (1 - 1e-6):
+            found.append(curve)
+    return found
+
+
+def regions_of(study: Study, blocks: tuple[MagnetBlock, ...]) -> Regions:
+    """The region file's content; block tags count on from FIRST_BLOCK_TAG in block order."""
+    return Regions(
+        study=study.name, dimension=study.dimension, air=tags.AIR_TAG,
+        iron=None if study.iron_ring is None else tags.IRON_TAG,
+        outer_boundary=tags.OUTER_BOUNDARY_TAG,
+        blocks=tuple(
+            BlockRegion(name=block.name, ring=block.ring, slot=block.slot,
+                        tag=tags.FIRST_BLOCK_TAG + i)
+            for i, block in enumerate(blocks)),
+    )
+
+
+def _surface(outline: Outline) -> int:
+    occ = gmsh.model.occ
+    points = [occ.addPoint(*edge.start, 0) for edge in outline]
+    curves = []
+    for i, edge in enumerate(outline):
+        ends = points[i], points[(i + 1) % len(points)]
+        if edge.arc:
+            centre = occ.addPoint(0, 0, 0)
+            curves.append(occ.addCircleArc(ends[0], centre, ends[1]))
+            occ.remove([(0, centre)])
+        else:
+            curves.append(occ.addLine(*ends))
+    return int(occ.addPlaneSurface([occ.addCurveLoop(curves)]))
+
+
+def _set_sizes(study: Study) -> None:
+    """Element size: the bore's, the blocks', then growing linearly towards the boundary."""
+    block_size = study.mesh.block_size_m
+    bore_size = study.mesh.bore_size_m or block_size
+    bore, magnet = study.array.inner_radius_m, magnet_radius(study)
+    rise = study.mesh.growth - 1
+
+    def size(_dim: int, _tag: int, x: float, y: float, _z: float, _lc: float) -> float:
+        radius = float(np.hypot(x, y))
+        if radius < bore * (1 - 1e-9):
+            return bore_size
+        return block_size + rise * max(0.0, radius - magnet)
+
+    for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)
+    gmsh.model.mesh.setSizeCallback(size)

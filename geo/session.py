@@ -1,0 +1,48 @@
+"""One private Gmsh session: Gmsh keeps global state, so nothing of it may leak."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import gmsh
+
+from halbach_fe.errors import MeshError
+
+
+@contextmanager
+def gmsh_session(name: str) -> Iterator[None]:
+    """Start Gmsh quietly and reproducibly, and stop it whatever happens.
+
+    Raises
+    ------
+    MeshError
+        In place of Gmsh's bare exceptions.
+    """
+    gmsh.initialize(readConfigFiles=False, interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("General.NumThreads", 1)  # the same mesh on every machine
+        gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)  # the newest that GetDP reads here
+        gmsh.option.setNumber("Mesh.Binary", 1)
+        gmsh.model.add(name)
+        yield
+    except MeshError:
+        raise
+    except Exception as error:  # gmsh raises plain Exception
+        raise MeshError(
+            f"Gmsh could not mesh study '{name}': {error}. Check radii, gaps and element sizes."
+        ) from error
+    finally:
+        gmsh.finalize()
+
+
+def write_mesh(path: Path) -> None:
+    """Write the current model; the file appears whole or not at all."""
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    try:
+        gmsh.write(str(temporary))
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

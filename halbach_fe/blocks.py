@@ -1,0 +1,304 @@
+"""The blocks of an array: where they stand, their shape, their nominal magnetization.
+
+Every block is a prism along z: an outline in the (x, y) plane, of straight edges and arcs about
+the z axis, between two z. The mesh, the exact field and the checks of a user's points all start
+from the blocks listed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.errors import StudyError
+from halbach_fe.study import MU_0, Array, Study
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A directed edge of an outline, straight or (``arc``) along a circle about the z axis."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    arc: bool = False
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Start angle and signed sweep in rad of an arc; the sweep is the shorter way round."""
+        first = np.arctan2(self.start[1], self.start[0])
+        last = np.arctan2(self.end[1], self.end[0])
+        sweep = (last - first + np.pi) % (2 * np.pi) - np.pi
+        return float(first), float(sweep)
+
+    @property
+    def radius(self) -> float:
+        """Distance of the start from the z axis in m."""
+        return float(np.hypot(*self.start))
+
+    @property
+    def length(self) -> float:
+        """Length in m."""
+        if self.arc:
+            return abs(self.angles[1]) * self.radius
+        return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
+
+    def at(self, t: Floats) -> tuple[Floats, Floats]:
+        """Return points (n, 2) in m and outward normals times speed (n, 2) in m, t in [0, 1].
+
+        Outlines run counter-clockwise, so outward is to the right of the edge.
+        """
+        t = np.asarray(t, float)[:, None]
+        if self.arc:
+            first, sweep = self.angles
+            radial = np.hstack([np.cos(first + sweep * t), np.sin(first + sweep * t)])
+            return self.radius * radial, self.radius * sweep * radial
+        start, end = np.array(self.start), np.array(self.end)
+        along = end - start
+        return start + t * along, np.broadcast_to([along[1], -along[0]], (len(t), 2))
+
+
+Outline = tuple[Edge, ...]
+
+
+@dataclass(frozen=True)
+class MagnetBlock:
+    """One block; ``ring`` and ``slot`` count from 1. Lengths in m, remanence in T."""
+
+    ring: int
+    slot: int
+    outline: Outline
+    z_min: float
+    z_max: float
+    easy_axis: tuple[float, float, float]
+    remanence: float
+    recoil_permeability: float
+
+    @property
+    def name(self) -> str:
+        """Label used in regions, parameters and reports."""
+        return f"r{self.ring:02d}s{self.slot:02d}"
+
+    @cached_property
+    def area(self) -> float:
+        """Cross-section in m^2, by Green's theorem (exact: the integrand is a polynomial, or a
+        constant on arcs)."""
+        t, weight = np.polynomial.legendre.leggauss(3)
+        total = 0.0
+        for edge in self.outline:
+            points, normals = edge.at((t + 1) / 2)
+            total += float(np.sum(weight / 2 * np.einsum("ij,ij->i", points, normals))) / 2
+        return total
+
+    @property
+    def volume(self) -> float:
+        """Volume in m^3."""
+        return self.area * (self.z_max - self.z_min)
+
+    @property
+    def magnetization(self) -> Floats:
+        """Nominal M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
+        return np.array(self.easy_axis) * self.remanence / (MU_0 * self.recoil_permeability)
+
+    @property
+    def corner_radius(self) -> float:
+        """Largest distance of the outline from the z axis in m."""
+        return max(edge.radius for edge in self.outline)
+
+    def contains(self, points: Floats) -> NDArray[np.bool_]:
+        """Tell which points (n, 3) in m lie inside the block (its surface is outside)."""
+        inside = (points[:, 2] > self.z_min) & (points[:, 2] < self.z_max)
+        inside[inside] = outline_contains(self.outline, points[inside, :2])
+        return inside
+
+
+def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
+    """Tell which points (n, 2) lie inside an outline, by their angle of view of each edge.
+
+    Outlines are polygons, of which some edges bulge as arcs about the origin: the polygon's
+    winding number is corrected by the circular segments between chord and arc.
+    """
+    inside = np.zeros(len(points), bool)
+    x, y = points.T
+    for edge in outline:  # even-odd rule along +x
+        (x0, y0), (x1, y1) = edge.start, edge.end
+        crosses = (y0 > y) != (y1 > y)
+        if y1 != y0:
+            inside ^= crosses & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+    for edge in outline:
+        if edge.arc:  # a point between chord and arc is on the other side than the chord says
+            (x0, y0), (x1, y1) = edge.start, edge.end
+            side = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
+            beyond = side < 0 if edge.angles[1] > 0 else side > 0
+            inside ^= beyond & (np.hypot(x, y) < edge.radius)
+    return inside
+
+
+def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
+    """Return all blocks of a study, ring by ring (lowest z first), slot by slot.
+
+    In a 2D study the one ring stretches from z = -inf to +inf.
+
+    Raises
+    ------
+    StudyError
+        If neighbouring blocks overlap.
+    """
+    array = study.array
+    outlines = [_outline(array, slot) for slot in range(1, array.blocks_per_ring + 1)]
+    _check_overlaps(outlines)
+    blocks = []
+    for ring, (z_min, z_max) in enumerate(ring_limits(study), start=1):
+        for slot, outline in enumerate(outlines, start=1):
+            angle = np.radians(magnetization_angle_deg(array, slot))
+            block = MagnetBlock(
+                ring=ring, slot=slot, outline=outline, z_min=z_min, z_max=z_max,
+                easy_axis=(float(np.cos(angle)), float(np.sin(angle)), 0.0),
+                remanence=np.nan, recoil_permeability=array.recoil_permeability,
+            )
+            blocks.append(_with_remanence(block, array))
+    return tuple(blocks)
+
+
+def position_angle_deg(array: Array, slot: int) -> float:
+    """Angle of the middle of block ``slot`` (from 1) about the z axis."""
+    return array.first_block_angle_deg + (slot - 1) * 360.0 / array.blocks_per_ring
+
+
+def magnetization_angle_deg(array: Array, slot: int) -> float:
+    """Nominal direction of magnetization of block ``slot`` (from 1)."""
+    turn = (1 + array.multipole_order) * (slot - 1) * 360.0 / array.blocks_per_ring
+    return array.first_magnetization_angle_deg + turn
+
+
+def ring_limits(study: Study) -> list[tuple[float, float]]:
+    """z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
+    array = study.array
+    if study.dimension == 2:
+        return [(-np.inf, np.inf)]
+    assert array.ring_length_m is not None  # the study model guarantees it
+    pitch = array.ring_length_m + array.ring_gap_m
+    length = array.rings * pitch - array.ring_gap_m
+    starts = -length / 2 + pitch * np.arange(array.rings)
+    return [(float(z), float(z + array.ring_length_m)) for z in starts]
+
+
+def array_half_length(study: Study) -> float:
+    """Half the length of the array in m; infinite in 2D."""
+    return ring_limits(study)[-1][1]
+
+
+def array_outer_radius(study: Study) -> float:
+    """Radius in m of the smallest cylinder around all blocks (corners included)."""
+    return max(edge.radius for slot in range(1, study.array.blocks_per_ring + 1)
+               for edge in _outline(study.array, slot))
+
+
+def points_in_material(study: Study, points: Floats) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) in m lie inside a block or the iron ring."""
+    inside = np.zeros(len(points), bool)
+    for block in blocks_of(study):
+        inside |= block.contains(points)
+    ring = study.iron_ring
+    if ring is not None:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        half = ring.length_m / 2 if ring.length_m else array_half_length(study)
+        if study.dimension == 2:
+            half = np.inf
+        inside |= ((radius > ring.inner_radius_m) & (radius < ring.outer_radius_m)
+                   & (np.abs(points[:, 2]) < half))
+    return inside
+
+
+def _with_remanence(block: MagnetBlock, array: Array) -> MagnetBlock:
+    """Fill in the remanence; a moment m means B_r = mu_0 m / V, m being the remanent moment.
+
+    (The moment that a Helmholtz coil shows of a lone block is smaller by the self-demagnetization
+    1 + N (mu_r - 1), at most some 2 %; a nominal value does not know it.)
+    """
+    remanence = array.remanence_T
+    if remanence is None:
+        assert array.block_moment_A_m2 is not None and array.ring_length_m is not None
+        remanence = MU_0 * array.block_moment_A_m2 / (block.area * array.ring_length_m)
+        if remanence > 2.0:
+            raise StudyError(
+                f"Input `array.block_moment_A_m2` of study must be a moment of a remanence up to "
+                f"2 T; instead received {array.block_moment_A_m2:g}, which is {remanence:.3g} T in "
+                f"this block. Check moment, radii and ring length."
+            )
+    return MagnetBlock(
+        ring=block.ring, slot=block.slot, outline=block.outline, z_min=block.z_min,
+        z_max=block.z_max, easy_axis=block.easy_axis, remanence=remanence,
+        recoil_permeability=block.recoil_permeability,
+    )
+
+
+def _outline(array: Array, slot: int) -> Outline:
+    """Outline of block ``slot``, counter-clockwise."""
+    middle = np.radians(position_angle_deg(array, slot))
+    half_pitch = np.pi / array.blocks_per_ring
+    inner, outer, block = array.inner_radius_m, array.outer_radius_m, array.block
+    if block.shape == "sector":
+        half = half_pitch - np.radians(block.angular_gap_deg) / 2
+        if half <= 0:
+            raise StudyError(
+                f"Input `array.block.angular_gap_deg` of study must be less than the pitch of "
+                f"{np.degrees(2 * half_pitch):g} deg; instead received {block.angular_gap_deg:g}."
+                " Reduce the gap or the number of blocks."
+            )
+        corners = [(r, middle + s * half) for r, s in
+                   ((inner, -1), (outer, -1), (outer, 1), (inner, 1))]
+        local = np.array([(r * np.cos(a), r * np.sin(a)) for r, a in corners])
+        return _edges(local, arcs=(1, 3))
+    if block.shape == "trapezoid":
+        # The side faces are parallel to the sector's limits, half a gap inside them.
+        inset = block.side_gap_m / 2 / np.cos(half_pitch)
+        widths = [r * np.tan(half_pitch) - inset for r in (inner, outer)]
+        if widths[0] <= 0:
+            raise StudyError(
+                f"Input `array.block.side_gap_m` of study must leave the block some width at the "
+                f"inner radius; instead received {block.side_gap_m:g}. Reduce the gap."
+            )
+        local = np.array([(inner, -widths[0]), (outer, -widths[1]),
+                          (outer, widths[1]), (inner, widths[0])])
+        return _edges(local @ _turn(middle).T)
+    half_width, half_depth = block.width_m / 2, (outer - inner) / 2
+    local = np.array([(-half_depth, -half_width), (half_depth, -half_width),
+                      (half_depth, half_width), (-half_depth, half_width)])
+    facing = (middle if block.orientation == "position"
+              else np.radians(magnetization_angle_deg(array, slot)))
+    centre = (inner + outer) / 2 * np.array([np.cos(middle), np.sin(middle)])
+    return _edges(local @ _turn(facing).T + centre)
+
+
+def _turn(angle: float) -> Floats:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
+    points = [(float(x), float(y)) for x, y in corners]
+    return tuple(Edge(points[i], points[(i + 1) % len(points)], arc=i in arcs)
+                 for i in range(len(points)))
+
+
+def _check_overlaps(outlines: list[Outline]) -> None:
+    """Refuse outlines that overlap: some sample of one's boundary lies well inside another.
+
+    Shared faces are allowed; samples are drawn slightly inwards so that rounding decides nothing.
+    """
+    t = np.linspace(0.0, 1.0, 9)
+    for i, outline in enumerate(outlines):
+        centre = np.mean([edge.start for edge in outline], axis=0)
+        samples = np.vstack([edge.at(t)[0] for edge in outline])
+        samples = np.vstack([centre + (1 - 1e-6) * (samples - centre), centre])
+        for j, other in enumerate(outlines):
+            if i != j and outline_contains(other, samples).any():
+                raise StudyError(
+                    f"Input `array.block` of study must leave neighbours apart; instead blocks "
+                    f"{i + 1} and {j + 1} of a ring overlap. Reduce the block's width, or place "
+                    "the blocks on a larger radius."
+                )

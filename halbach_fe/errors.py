@@ -1,0 +1,79 @@
+"""The errors a user can cause or meet, each with its own exit code.
+
+One sentence pattern for all of them, so that they read alike::
+
+    Input WHAT of WHERE must be EXPECTED; instead received GIVEN. HINT
+
+An error of any other type that reaches the command line is a bug of ours (exit code 1).
+"""
+
+from __future__ import annotations
+
+
+class HalbachError(Exception):
+    """Base of every error that is reported as one sentence instead of a traceback."""
+
+    exit_code = 1
+
+
+class StudyError(HalbachError):
+    """The study file cannot be read or describes something that cannot be built."""
+
+    exit_code = 3
+
+
+class MeasurementError(HalbachError):
+    """The measured map cannot be read, or holds values that cannot be readings."""
+
+    exit_code = 4
+
+
+class MeshError(HalbachError):
+    """Gmsh could not mesh the study, or the mesh does not hold what the solve needs."""
+
+    exit_code = 5
+
+
+class GetDPNotFoundError(HalbachError):
+    """No usable GetDP executable."""
+
+    exit_code = 6
+
+
+class GetDPError(HalbachError):
+    """GetDP failed, or answered with something that did not pass verification."""
+
+    exit_code = 7
+
+
+class OutputError(HalbachError):
+    """Results cannot be written, or a stored result cannot be read back."""
+
+    exit_code = 8
+
+
+class CheckFailedError(HalbachError):
+    """A self-check ran and its figure was out of bounds."""
+
+    exit_code = 9
+
+
+EXIT_CODES: dict[int, str] = {
+    0: "success",
+    1: "unexpected error (a bug: please report it)",
+    2: "wrong command line",
+    StudyError.exit_code: "study file refused",
+    MeasurementError.exit_code: "measured map refused",
+    MeshError.exit_code: "mesh could not be built or verified",
+    GetDPNotFoundError.exit_code: "GetDP not found",
+    GetDPError.exit_code: "GetDP failed or its answer did not pass verification",
+    OutputError.exit_code: "results could not be written or read back",
+    CheckFailedError.exit_code: "a self-check failed",
+    130: "interrupted (Ctrl-C)",
+}
+
+
+def must_be(what: str, where: str, expected: str, received: object, hint: str = "") -> str:
+    """Return the project's error sentence: what, where, what was expected, what to do."""
+    sentence = f"Input {what} of {where} must be {expected}; instead received {received}."
+    return f"{sentence} {hint}" if hint else sentence

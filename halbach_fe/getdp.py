@@ -1,0 +1,345 @@
+"""The one module that runs GetDP, and that believes nothing it says.
+
+GetDP ends with exit code 0 after many failures: an unconverged solver, a region that the mesh
+lacks, a misspelt ``-setnumber``, a point outside the mesh. So every run happens in a private
+folder, with short relative names (a path over 256 characters overflows a buffer of GetDP), and
+its exit code, every line of its log, the number of unknowns, the residual of every solve and
+every number of its output are checked before the result is handed on.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import GetDPError, GetDPNotFoundError
+
+ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
+MAX_NAME = 200
+"""GetDP keeps paths in 256 characters, and appends to them."""
+
+MAX_RELATIVE_RESIDUAL = 1e-8
+"""A direct solve leaves 1e-13; 1e-8 of the source is still 1e-4 of the smallest error we state."""
+
+SOLVER_OPTIONS = (
+    "-ksp_type", "preonly", "-pc_type", "cholesky", "-pc_factor_mat_solver_type", "mumps",
+)
+"""The curl-curl matrix is symmetric: Cholesky takes half the memory of LU."""
+
+_INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp`), or name it with --getdp or "
+            f"{ENVIRONMENT_VARIABLE}.")
+_NAMED_FAILURES = (  # pattern in the log, what it means
+    (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
+    (r"[Nn]o space left", "the disk is full"),
+    (r"MUMPS|INFOG|MatSolve.*mumps|factorization", "MUMPS could not factorize the matrix"),
+    (r"IterativeLoop did NOT converge|not converge", "an iteration did not converge"),
+    (r"assuming zero|Unset|undefined run-time", "a run-time variable was never set"),
+    (r"Unknown (constraint|region)", "a region or constraint is unknown"),
+    (r"Zero-size system", "the system has no unknowns"),
+)
+
+
+@dataclass(frozen=True)
+class GetDP:
+    """A GetDP executable and what it says of itself."""
+
+    executable: Path
+    version: str
+    build_options: tuple[str, ...]
+    petsc: str
+
+    def __str__(self) -> str:
+        return f"GetDP {self.version} ({self.executable}; PETSc {self.petsc or 'none'})"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of GetDP.
+
+    Attributes
+    ----------
+    problem, mesh : str
+        Names inside the run folder.
+    resolution : str
+        The resolution to solve.
+    numbers : mapping
+        ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
+    outputs : tuple of str
+        Files that the run must write.
+    unknowns : int or None
+        Number of unknowns that the system must have; None where it cannot be foretold.
+    options : tuple of str
+        Further PETSc options.
+    time_limit_s : float
+        The run is ended after so many seconds.
+    threads : int
+        Threads of the linear algebra.
+    """
+
+    problem: str
+    mesh: str
+    resolution: str
+    outputs: tuple[str, ...]
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    unknowns: int | None = None
+    options: tuple[str, ...] = SOLVER_OPTIONS
+    time_limit_s: float = 3600.0
+    threads: int = 1
+
+
+def find_getdp(named: str | Path | None = None) -> GetDP:
+    """Find GetDP: as named, else in the environment variable, else on PATH; ask what it is.
+
+    Raises
+    ------
+    GetDPNotFoundError
+        If there is none, or what is there does not answer like GetDP.
+    """
+    wanted = str(named) if named else os.environ.get(ENVIRONMENT_VARIABLE) or "getdp"
+    found = shutil.which(wanted)
+    if found is None:
+        raise GetDPNotFoundError(f"GetDP was not found: `{wanted}` is no executable. {_INSTALL}")
+    try:
+        answer = subprocess.run([found, "-info"], capture_output=True, text=True, timeout=30,
+                                errors="replace", check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise GetDPNotFoundError(f"GetDP at {found} does not answer ({error}). {_INSTALL}") from None
+    said = dict(re.findall(r"^(.+?)\s*:\s*(.*)$", answer.stdout + answer.stderr, re.MULTILINE))
+    if answer.returncode != 0 or "Version" not in said:
+        raise GetDPNotFoundError(f"{found} does not answer like GetDP. {_INSTALL}")
+    return GetDP(executable=Path(found).resolve(), version=said["Version"],
+                 build_options=tuple(said.get("Build options", "").split()),
+                 petsc=said.get("PETSc version", ""))
+
+
+def run(
+    getdp: GetDP,
+    job: Job,
+    folder: Path,
+    on_line: Callable[[str], None] | None = None,
+    cancel: threading.Event | None = None,
+) -> list[str]:
+    """Run a job in ``folder``, verify how it went, and return its log.
+
+    The log is kept as ``getdp.log`` in the folder. ``on_line`` sees every line as it comes;
+    setting ``cancel`` ends the run.
+
+    Raises
+    ------
+    GetDPError
+        With what went wrong, by name, and where the log is.
+    """
+    _check_before(job, folder)
+    arguments = [
+        str(getdp.executable), job.problem, "-msh", job.mesh, "-solve", job.resolution,
+        "-v", "4", "-petsc_prealloc", "100", "-ksp_error_if_not_converged", *job.options,
+    ]
+    for name, value in job.numbers.items():
+        arguments += ["-setnumber", name, f"{value:.17g}"]
+    for output in job.outputs:
+        (folder / output).unlink(missing_ok=True)  # GetDP would append to, or leave, a stale one
+    lines = _execute(arguments, job, folder, on_line, cancel)
+    _check_log(lines, job, folder)
+    for output in job.outputs:
+        if not (folder / output).is_file() or not (folder / output).stat().st_size:
+            raise _failure(f"it did not write {output}", folder)
+    return lines
+
+
+def read_flux_density(path: Path, points: Floats, sources: int) -> Floats:
+    """Read GetDP's SimpleTable of B at points, one block of rows per source, and verify it.
+
+    Parameters
+    ----------
+    path : Path
+        Rows ``x y z Bx By Bz``.
+    points : ndarray, shape (n, 3), in m
+        Where B was asked for.
+    sources : int
+        How many blocks of rows there must be.
+
+    Returns
+    -------
+    ndarray, shape (sources, n, 3), in T
+
+    Raises
+    ------
+    GetDPError
+        Wrong number of rows or columns, other points, values that are not finite, or the zeros
+        that stand for a point outside the mesh.
+    """
+    where = path.parent
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (ValueError, OSError) as error:
+        raise _failure(f"{path.name} is not a table of six columns ({error}); a point outside the "
+                       "mesh looks like this, and so does a full disk", where) from None
+    if table.shape != (sources * len(points), 6):
+        raise _failure(f"{path.name} holds {table.shape[0]} rows of {table.shape[1]} columns in "
+                       f"place of {sources * len(points)} of 6; is the disk full?", where)
+    table = table.reshape(sources, len(points), 6)
+    scale = max(1e-9, float(np.abs(points).max()))
+    if not np.allclose(table[:, :, :3], points, rtol=0, atol=1e-9 * scale):
+        raise _failure(f"{path.name} was evaluated at other points than asked for", where)
+    flux_density = table[:, :, 3:]
+    if not np.isfinite(flux_density).all():
+        raise _failure(f"{path.name} holds values that are not finite", where)
+    zero = np.argwhere(~flux_density.any(axis=2))
+    if len(zero):
+        x, y, z = points[zero[0, 1]]
+        raise _failure(f"the field at ({x:g}, {y:g}, {z:g}) m is exactly zero, GetDP's sign for a "
+                       f"point outside the mesh ({len(zero)} such values)", where)
+    return flux_density
+
+
+def declared_constants(folder: Path) -> set[str]:
+    """Names in the DefineConstant blocks of all problem files of a folder."""
+    names: set[str] = set()
+    for path in folder.glob("*.pro"):
+        text = re.sub(r"//[^\n]*", "", path.read_text(encoding="utf-8"))
+        for block in re.findall(r"DefineConstant\s*\[(.*?)\]\s*;", text, re.DOTALL):
+            names.update(re.findall(r"(\w+)\s*=", block))
+    return names
+
+
+def _check_before(job: Job, folder: Path) -> None:
+    for name in (job.problem, job.mesh, *job.outputs):
+        if len(name) > MAX_NAME:
+            raise _failure(f"the name {name[:30]}... has {len(name)} characters, and GetDP's "
+                           f"buffers end at 256; keep names under {MAX_NAME}", folder)
+    for name in (job.problem, job.mesh):
+        if not (folder / name).is_file():
+            raise _failure(f"{name} is missing from the run folder", folder)
+    unknown = set(job.numbers) - declared_constants(folder)
+    if unknown:
+        raise _failure(f"-setnumber {min(unknown)} sets a constant that no DefineConstant "
+                       "declares, and GetDP would ignore it", folder)
+
+
+def _execute(
+    arguments: list[str], job: Job, folder: Path,
+    on_line: Callable[[str], None] | None, cancel: threading.Event | None,
+) -> list[str]:
+    threads = str(job.threads)
+    environment = os.environ | {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+    lines: list[str] = []
+    try:
+        process = subprocess.Popen(
+            arguments, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+            start_new_session=True)
+    except OSError as error:
+        raise _failure(f"it could not be started ({error.strerror})", folder) from None
+
+    def read() -> None:
+        assert process.stdout is not None
+        for text in process.stdout:  # progress bars use carriage returns
+            for line in re.split(r"[\r\b]+", text.rstrip("\n")):
+                if line.strip() and "Processing (" not in line:
+                    lines.append(line)
+                    if on_line is not None:
+                        on_line(line)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    deadline = time.monotonic() + job.time_limit_s
+    ended = ""
+    try:
+        while process.poll() is None:
+            if cancel is not None and cancel.is_set():
+                ended = "it was cancelled"
+            elif time.monotonic() > deadline:
+                ended = (f"it was still running after the time limit of {job.time_limit_s:g} s; "
+                         "use a coarser mesh or raise --time-limit")
+            if ended:
+                break
+            time.sleep(0.02)
+    finally:
+        if process.poll() is None:
+            _kill(process)
+        reader.join(timeout=10)
+        _save_log(folder, arguments, lines)
+    if ended:
+        raise _failure(ended, folder)
+    if process.returncode < 0:
+        name = signal.Signals(-process.returncode).name
+        hint = {"SIGKILL": "; out of memory?", "SIGXFSZ": "; a file grew over its limit"}
+        raise _failure(f"it crashed ({name}{hint.get(name, '')})", folder)
+    if process.returncode:
+        complaint = next((line for line in lines if re.match(r"\s*Error\s*:", line)), "")
+        said = complaint.partition(":")[2].strip() or (lines[-1].strip() if lines else "nothing")
+        name = _name_of("\n".join(lines), f"exit code {process.returncode}")
+        raise _failure(f"{name}: '{said[:200]}'", folder)
+    return lines
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()
+
+
+def _save_log(folder: Path, arguments: list[str], lines: list[str]) -> None:
+    try:
+        (folder / "getdp.log").write_text("\n".join([" ".join(arguments[1:]), *lines, ""]),
+                                          encoding="utf-8")
+    except OSError:
+        pass  # the failure that filled the disk is the one to report
+
+
+def _check_log(lines: list[str], job: Job, folder: Path) -> None:
+    for line in lines:
+        if re.match(r"\s*(Warning|Error)\s*:", line):
+            said = line.partition(":")[2].strip()
+            raise _failure(f"{_name_of(said, 'GetDP warned')}: '{said[:200]}'", folder)
+    text = "\n".join(lines)
+    sizes = [int(n) for n in re.findall(r"System \d+/\d+: (\d+) Dofs", text)]
+    if not sizes or 0 in sizes:
+        raise _failure("the system has no unknowns: is the mesh empty?", folder)
+    if job.unknowns is not None and sizes[0] != job.unknowns:
+        raise _failure(
+            f"the system has {sizes[0]} unknowns where the mesh gives {job.unknowns}: a boundary "
+            "condition, a gauge or a region is missing", folder)
+    _check_residuals(lines, folder)
+
+
+def _check_residuals(lines: list[str], folder: Path) -> None:
+    """Every linear solve must have brought its residual down."""
+    first = last = None
+    for line in [*lines, "  0 KSP Residual norm 0"]:
+        match = re.search(r"(\d+) KSP Residual norm (\S+)", line)
+        if not match:
+            continue
+        if match[1] == "0":
+            if first is not None and not last <= MAX_RELATIVE_RESIDUAL * first:
+                raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
+                               "linear solver did not converge", folder)
+            first = last = float(match[2])
+        else:
+            last = float(match[2])
+
+
+def _name_of(text: str, otherwise: str) -> str:
+    return next((name for pattern, name in _NAMED_FAILURES if re.search(pattern, text)), otherwise)
+
+
+def _failure(what: str, folder: Path) -> GetDPError:
+    hint = ""
+    if shutil.disk_usage(folder).free < 10_000_000:
+        hint = " The disk is full: free some space."
+    log = folder / "getdp.log"
+    return GetDPError(f"GetDP did not give a result that can be trusted: {what}.{hint}"
+                      + (f" Its log is {log}." if log.is_file() else ""))

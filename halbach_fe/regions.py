@@ -1,0 +1,68 @@
+"""The region file: which physical tag of the mesh is which part of the magnet.
+
+Geometry writes it beside the mesh; the solve reads it and refuses a mesh that does not match.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from halbach_fe.errors import MeshError
+
+AIR_TAG = 1
+IRON_TAG = 2
+OUTER_BOUNDARY_TAG = 10
+FIRST_BLOCK_TAG = 1001
+
+
+class BlockRegion(BaseModel):
+    """The physical tag of one block."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str
+    ring: int
+    slot: int
+    tag: int
+
+
+class Regions(BaseModel):
+    """Names and tags of every physical group of a mesh."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    study: str
+    dimension: int
+    air: int
+    iron: int | None
+    outer_boundary: int
+    blocks: tuple[BlockRegion, ...]
+
+    @property
+    def volume_tags(self) -> tuple[int, ...]:
+        """Tags of every region that is solved in (surfaces in 2D)."""
+        iron = () if self.iron is None else (self.iron,)
+        return (self.air, *iron, *(block.tag for block in self.blocks))
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Tag to name."""
+        names = {self.air: "air", self.outer_boundary: "outer boundary"}
+        if self.iron is not None:
+            names[self.iron] = "iron ring"
+        return names | {block.tag: f"block {block.name}" for block in self.blocks}
+
+    def write(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> Regions:
+        """Read what `write` wrote; raise MeshError for anything else."""
+        try:
+            return cls.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, ValidationError) as error:
+            raise MeshError(
+                f"Input region file {path} must be one written beside a mesh; instead reading it "
+                f"failed with '{str(error).splitlines()[0]}'. Mesh the study again."
+            ) from None

@@ -1,0 +1,432 @@
+"""The study file: one TOML document that says everything about a magnet and its measurement.
+
+Keys carry their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors. The models are
+frozen: a study is a value, and everything downstream is a function of it.
+
+The convention for magnetization, used everywhere in halbach-fe, is that of
+``nu(|B|) B = H + M``. In a block of recoil permeability mu_r therefore
+``M = B_r / (mu_0 mu_r)``, with B_r the remanence: M is neither ``B_r / mu_0`` nor the
+magnetization at the working point.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from halbach_fe.errors import StudyError, must_be
+
+MU_0 = 4e-7 * math.pi
+"""Vacuum permeability in T m/A; the pre-2019 value, 1.3e-10 relative from the measured one."""
+
+MAX_LENGTH_M = 10.0
+MIN_LENGTH_M = 1e-4
+
+# The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
+Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
+Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M)]
+Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
+Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Component = Literal["x", "y", "z"]
+COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SectorBlock(_Model):
+    """A sector of an annulus; ``angular_gap_deg`` is the free angle between neighbours."""
+
+    shape: Literal["sector"]
+    angular_gap_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
+
+
+class TrapezoidBlock(_Model):
+    """A trapezoid with flat faces at the inner and the outer radius.
+
+    ``side_gap_m`` is the clearance between the parallel side faces of neighbours.
+    """
+
+    shape: Literal["trapezoid"]
+    side_gap_m: Gap = 0.0
+
+
+class CuboidBlock(_Model):
+    """A cuboid, radially from the inner to the outer radius of the array, ``width_m`` wide.
+
+    ``orientation`` says what its faces follow: the block's ``position`` angle, or its
+    ``magnetization`` angle, as is usual in arrays built from magnetized cubes.
+    """
+
+    shape: Literal["cuboid"]
+    width_m: Length
+    orientation: Literal["position", "magnetization"] = "position"
+
+
+Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminator="shape")]
+
+
+class Array(_Model):
+    """The permanent-magnet array, in general: ``rings`` equal rings of ``blocks_per_ring`` blocks.
+
+    Block ``i`` (from 1) sits at ``first_block_angle_deg + (i-1) 360/N``; its magnetization turns
+    ``1 + multipole_order`` times faster (K. Halbach, Nucl. Instrum. Methods 169 (1980) 1), from
+    ``first_magnetization_angle_deg``. Rings are numbered from 1 at the lowest z.
+    """
+
+    multipole_order: Annotated[int, Field(ge=1, le=20)] = 1
+    blocks_per_ring: Annotated[int, Field(ge=4, le=512)]
+    rings: Annotated[int, Field(ge=1, le=1000)] = 1
+    inner_radius_m: Length
+    outer_radius_m: Length
+    ring_length_m: Length | None = None
+    ring_gap_m: Gap = 0.0
+    first_block_angle_deg: Angle = 0.0
+    first_magnetization_angle_deg: Angle = 0.0
+    recoil_permeability: Annotated[float, Field(ge=1.0, le=2.0)] = 1.0
+    remanence_T: Remanence | None = None
+    block_moment_A_m2: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
+    block: Block
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Array:
+        if self.outer_radius_m <= self.inner_radius_m:
+            raise ValueError(
+                f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
+                f"({self.inner_radius_m}); exchange or correct them"
+            )
+        if (self.remanence_T is None) == (self.block_moment_A_m2 is None):
+            raise ValueError("give exactly one of remanence_T and block_moment_A_m2")
+        if self.block_moment_A_m2 is not None and self.ring_length_m is None:
+            raise ValueError("block_moment_A_m2 needs ring_length_m, to know the block's volume")
+        return self
+
+
+class IronRing(_Model):
+    """A coaxial iron tube outside the array, of constant permeability."""
+
+    inner_radius_m: Length
+    outer_radius_m: Length
+    length_m: Length | None = None
+    relative_permeability: Annotated[float, Field(ge=1.0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronRing:
+        if self.outer_radius_m <= self.inner_radius_m:
+            raise ValueError(
+                f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
+                f"({self.inner_radius_m})"
+            )
+        return self
+
+
+class Mesh(_Model):
+    """Element sizes. In 3D the cross-section is extruded in layers along z."""
+
+    block_size_m: Length
+    bore_size_m: Length | None = None
+    layers_per_ring: Annotated[int, Field(ge=1, le=100)] = 2
+    growth: Annotated[float, Field(gt=1.0, le=4.0)] = 1.6
+
+
+class OpenBoundary(_Model):
+    """Where the field is cut off. Elements grow geometrically towards it, so far is cheap."""
+
+    radius_m: Annotated[float, Field(ge=MIN_LENGTH_M, le=100 * MAX_LENGTH_M)] | None = None
+    half_length_m: Annotated[float, Field(ge=MIN_LENGTH_M, le=100 * MAX_LENGTH_M)] | None = None
+
+
+class LinePositions(_Model):
+    """``count`` equally spaced points from ``start_m`` to ``end_m``, both included."""
+
+    kind: Literal["line"]
+    start_m: Point
+    end_m: Point
+    count: Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+class CirclePositions(_Model):
+    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z."""
+
+    kind: Literal["circles"]
+    radius_m: Length
+    angles: Annotated[int, Field(ge=1, le=10_000)]
+    z_min_m: Coordinate = 0.0
+    z_max_m: Coordinate = 0.0
+    count: Annotated[int, Field(ge=1, le=100_000)] = 1
+
+    @model_validator(mode="after")
+    def _consistent(self) -> CirclePositions:
+        if self.z_max_m < self.z_min_m or (self.count > 1) != (self.z_max_m > self.z_min_m):
+            raise ValueError(
+                f"{self.count} circles between z_min_m = {self.z_min_m} and "
+                f"z_max_m = {self.z_max_m} make no sense; one circle needs equal limits, "
+                "several need z_min_m < z_max_m"
+            )
+        return self
+
+
+class PointPositions(_Model):
+    """A list of points."""
+
+    kind: Literal["points"]
+    points_m: Annotated[tuple[Point, ...], Field(min_length=1)]
+
+
+Positions = Annotated[
+    LinePositions | CirclePositions | PointPositions, Field(discriminator="kind")
+]
+
+
+class FluxDensity(_Model):
+    """Observe components of B at points, in tesla."""
+
+    quantity: Literal["flux_density"]
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
+    positions: Positions
+
+
+class FourierCoefficients(_Model):
+    """Observe A_1..A_K, B_1..B_K of B_r on circles: B_r = sum A_k cos(k phi) + B_k sin(k phi)."""
+
+    quantity: Literal["fourier_coefficients"]
+    harmonics: Annotated[int, Field(ge=1, le=1000)]
+    positions: CirclePositions
+
+    @model_validator(mode="after")
+    def _resolved(self) -> FourierCoefficients:
+        if self.positions.angles <= 2 * self.harmonics:
+            raise ValueError(
+                f"{self.harmonics} harmonics need more than {2 * self.harmonics} angles on the "
+                f"circle, not {self.positions.angles}"
+            )
+        return self
+
+
+Observation = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="quantity")]
+
+
+class NoiseRegion(_Model):
+    """A z window with one standard deviation per reading. The first region that fits is used."""
+
+    name: Annotated[str, Field(min_length=1)]
+    z_min_m: float = -math.inf
+    z_max_m: float = math.inf
+    sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Noise(_Model):
+    """Measurement noise by region; a map that carries its own sigma overrides it."""
+
+    regions: Annotated[tuple[NoiseRegion, ...], Field(min_length=1)]
+
+
+class Prior(_Model):
+    """What is known of the blocks before the map: sd about the nominal magnetization.
+
+    ``magnitude_sd`` and ``common_mode_sd`` are fractions of the nominal magnetization: the first
+    is independent from block to block, the second shared by all (the calibration of the
+    Helmholtz coil, or a nominal value that is off). ``direction_sd_deg`` holds for each of the
+    two directions across the easy axis.
+    """
+
+    magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
+    direction_sd_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 1.0
+    common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+
+
+class HeldOut(_Model):
+    """Which readings are kept from the update and only predicted.
+
+    Readings are grouped in runs of ``window`` consecutive z positions; the last of every
+    ``every`` runs is held out.
+    """
+
+    every: Annotated[int, Field(ge=2, le=1000)] = 2
+    window: Annotated[int, Field(ge=1, le=100_000)] = 1
+
+
+class Inference(_Model):
+    """How the update is done and judged."""
+
+    held_out: HeldOut | None = None
+
+
+class Solver(_Model):
+    """``reaction``: exact field of the blocks plus the finite-element reaction of permeability
+    and iron. ``direct``: the finite-element field as it is.
+    """
+
+    method: Literal["reaction", "direct"] = "reaction"
+
+
+class Study(_Model):
+    """A magnet, how it is discretized, how it is measured, and what is known beforehand."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
+    description: str = ""
+    dimension: Literal[2, 3] = 3
+    array: Array
+    iron_ring: IronRing | None = None
+    mesh: Mesh
+    open_boundary: OpenBoundary = OpenBoundary()
+    solver: Solver = Solver()
+    observation: Observation
+    noise: Noise | None = None
+    prior: Prior = Prior()
+    inference: Inference = Inference()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Study:
+        if self.dimension == 3 and self.array.ring_length_m is None:
+            raise ValueError("a 3D study needs array.ring_length_m")
+        if self.dimension == 2 and self.array.rings != 1:
+            raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        return self
+
+
+def read_study(path: str | Path) -> Study:
+    """Read and validate a study file.
+
+    Raises
+    ------
+    StudyError
+        With one sentence that names the file, the key, what was expected and what to do.
+    """
+    path = Path(path)
+    where = f"study file {path}"
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StudyError(
+            must_be("path", where, "a readable file", f"'{reason}'", "Check the path.")
+        ) from None
+    if not raw.strip():
+        raise StudyError(
+            must_be("content", where, "a TOML document", "an empty file",
+                    "Start from one of the files under studies/.")
+        )
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise StudyError(
+            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
+                    "Save it as UTF-8 text.")
+        ) from None
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise StudyError(
+            must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
+        ) from None
+    return parse_study(document, where)
+
+
+def parse_study(document: dict[str, Any], where: str = "study") -> Study:
+    """Validate a study given as nested dictionaries; raise StudyError as `read_study` does."""
+    try:
+        return Study.model_validate(document)
+    except ValidationError as error:
+        raise StudyError(_sentence(error, where)) from None
+
+
+def _sentence(error: ValidationError, where: str) -> str:
+    """Turn the first of pydantic's complaints into our sentence, and count the others."""
+    errors = error.errors(include_url=False)
+    # An unknown key is the likeliest cause of the others (a misspelt key is also a missing one).
+    errors.sort(key=lambda e: e["type"] != "extra_forbidden")
+    first = errors[0]
+    key, model = _locate(first["loc"])
+    received, kind = first.get("input"), first["type"]
+    hint = ""
+    if kind == "extra_forbidden":
+        expected = "a known key"
+        name = str(first["loc"][-1])
+        near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
+        hint = (f"Did you mean `{near[0]}`?" if near
+                else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
+        received = f"`{name}`"
+    elif kind == "missing":
+        expected, received = "given", "nothing"
+        hint = "Add the key."
+    elif kind == "value_error":
+        expected = "consistent"
+        received = first["msg"].removeprefix("Value error, ")
+        sentence = f"Input `{key or 'the whole'}` of {where} must be {expected}: {received}."
+        return sentence + _more(errors)
+    else:
+        expected = first["msg"].removeprefix("Input should be ").lower()
+        if isinstance(received, int | float) and not isinstance(received, bool):
+            hint = _unit_hint(key, float(received))
+        elif isinstance(received, dict | list):
+            received = "a table" if isinstance(received, dict) else "a list"
+        else:
+            received = repr(received)
+    return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
+
+
+def _more(errors: list[Any]) -> str:
+    return f" ({len(errors) - 1} more in this file.)" if len(errors) > 1 else ""
+
+
+def _unit_hint(key: str, value: float) -> str:
+    """Guess a unit that is wrong by a factor of 1000."""
+    wrong = {"_m": "millimetres", "_T": "millitesla"}
+    for suffix, unit in wrong.items():
+        if key.endswith(suffix) and abs(value) > 1:
+            return f"Was it meant in {unit}? Then write {value / 1000:g}."
+    if key.endswith("_m") and 0 < abs(value) < MIN_LENGTH_M:
+        return f"Was it meant in kilometres? Then write {value * 1000:g}."
+    return "Correct the value."
+
+
+def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
+    """Return the dotted key of a pydantic location, and the model that holds its last part.
+
+    pydantic puts the tag of a discriminated union into the location; a user never wrote it.
+    """
+    models: list[type[BaseModel]] = [Study]
+    owner: type[BaseModel] | None = Study
+    parts: list[str] = []
+    for part in location:
+        if isinstance(part, int):
+            parts[-1] += f"[{part}]"
+            continue
+        tagged = [m for m in models if len(models) > 1 and part in _tags(m)]
+        if tagged:
+            models = owner_models = tagged
+            owner = owner_models[0]
+            continue
+        owner = models[0] if models else None
+        parts.append(part)
+        field = owner.model_fields.get(part) if owner else None
+        models = _models_in(field.annotation) if field else []
+    return ".".join(parts), owner
+
+
+def _tags(model: type[BaseModel]) -> set[str]:
+    return {
+        str(value)
+        for field in model.model_fields.values()
+        if get_origin(field.annotation) is Literal
+        for value in get_args(field.annotation)
+    }
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """All models mentioned in an annotation, in order."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if get_origin(annotation) in (Union, types.UnionType, Annotated, tuple):
+        return [model for arg in get_args(annotation) for model in _models_in(arg)]
+    return []

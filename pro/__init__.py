@@ -1,0 +1,1 @@
+"""GetDP problem files: plain `.pro` files, and the template of the generated case data."""
