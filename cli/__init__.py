@@ -1,2 +1,53 @@
-"""x."""
-def main(): return 0
+"""The command line: one file per verb, each with ``add_arguments`` and ``run``."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib import metadata
+
+from halbach_fe.cli import doctor, infer, schema, solve
+from halbach_fe.errors import EXIT_CODES, HalbachError
+
+VERBS = {"solve": solve, "infer": infer, "doctor": doctor, "schema": schema}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
+    top = argparse.ArgumentParser(
+        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
+        epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    top.add_argument("--version", action="version", version=metadata.version("halbach-fe"))
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, module in VERBS.items():
+        text = (module.__doc__ or "").strip()
+        verb = verbs.add_parser(name, help=text.splitlines()[0], description=text,
+                                formatter_class=argparse.RawDescriptionHelpFormatter)
+        module.add_arguments(verb)
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; return its exit code (`halbach_fe.errors.EXIT_CODES`)."""
+    arguments = parser().parse_args(argv)
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return int(VERBS[arguments.verb].run(arguments))
+    except HalbachError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130
+    except BrokenPipeError:
+        return 0
+    except Exception:
+        traceback.print_exc()
+        sys.stderr.write("error: this is a bug in halbach-fe; please report it with the above.\n")
+        return 1
+    finally:
+        signal.signal(signal.SIGTERM, previous)

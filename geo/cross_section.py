@@ -14,8 +14,9 @@ from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
 
-DEFAULT_BOUNDARY_RATIO = 10.0
-"""Boundary radius over the magnet's: a dipole's 1/r^3 leaves 1e-3 of what the boundary changes."""
+DEFAULT_BOUNDARY_RATIO = {2: 30.0, 3: 10.0}
+"""Boundary radius over the magnet's, by dimension: a block's far field falls as 1/r^2 and 1/r^3,
+and so does what the boundary changes; both leave 1e-3 of it."""
 
 
 def magnet_radius(study: Study) -> float:
@@ -34,12 +35,13 @@ def magnet_radius(study: Study) -> float:
 def boundary_radius(study: Study) -> float:
     """Radius in m where the field is cut off."""
     inside = magnet_radius(study)
-    radius = study.open_boundary.radius_m or DEFAULT_BOUNDARY_RATIO * inside
+    default = DEFAULT_BOUNDARY_RATIO[study.dimension] * inside
+    radius = study.open_boundary.radius_m or default
     if radius <= 1.2 * inside:
         raise StudyError(
             f"Input `open_boundary.radius_m` of study must be well beyond the magnet "
             f"({inside:g} m); instead received {radius:g}. Leave it out for "
-            f"{DEFAULT_BOUNDARY_RATIO * inside:g}."
+            f"{default:g}."
         )
     return radius
 

@@ -90,12 +90,13 @@ def half_length(study: Study) -> float:
     end, radius = array_half_length(study), magnet_radius(study)
     if study.iron_ring is not None and study.iron_ring.length_m:
         end = max(end, study.iron_ring.length_m / 2)
-    half = study.open_boundary.half_length_m or end + DEFAULT_BOUNDARY_RATIO * radius
+    default = end + DEFAULT_BOUNDARY_RATIO[study.dimension] * radius
+    half = study.open_boundary.half_length_m or default
     if half <= end + 0.2 * radius:
         raise StudyError(
             f"Input `open_boundary.half_length_m` of study must be well beyond the magnet's end "
             f"({end:g} m); instead received {half:g}. Leave it out for "
-            f"{end + DEFAULT_BOUNDARY_RATIO * radius:g}."
+            f"{default:g}."
         )
     return half
 

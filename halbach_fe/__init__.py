@@ -1,0 +1,1 @@
+"""halbach-fe: finite elements and Bayesian inference for permanent-magnet Halbach arrays."""

@@ -1,0 +1,1 @@
+"""Bayesian update of the block magnetizations. Sees arrays and labels only."""

@@ -1,0 +1,86 @@
+"""What the verbs share: options, progress, tables."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from halbach_fe.getdp import find_getdp
+from halbach_fe.solve import Workshop
+
+
+def add_study_arguments(parser: argparse.ArgumentParser) -> None:
+    """STUDY, -o, and the options of every verb that solves."""
+    parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                        help="folder for results; made if it does not exist")
+    parser.add_argument("--jobs", type=positive, default=min(2, os.cpu_count() or 1), metavar="N",
+                        help="GetDP processes at a time (default: %(default)s)")
+    parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
+                        help="for each GetDP process (default: %(default)g)")
+    add_getdp_argument(parser)
+    add_json_argument(parser)
+
+
+def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
+    """--getdp."""
+    parser.add_argument("--getdp", metavar="PATH",
+                        help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """--json."""
+    parser.add_argument("--json", action="store_true", help="print results as JSON")
+
+
+def positive(text: str) -> int:
+    """Parse a whole number of at least 1."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {value}")
+    return value
+
+
+@contextmanager
+def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
+    """A workshop in the output folder; shows progress on a terminal's stderr."""
+    getdp = find_getdp(arguments.getdp)
+    console = Console(stderr=True)
+    with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
+                  MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
+                  disable=not console.is_terminal) as bar:
+        task = bar.add_task("solving", total=None)
+        yield Workshop(
+            getdp=getdp, folder=arguments.output, jobs=arguments.jobs,
+            time_limit_s=arguments.time_limit,
+            progress=lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def print_json(value: object) -> None:
+    """Print machine-readable results on stdout."""
+    sys.stdout.write(json.dumps(value, indent=1) + "\n")
+
+
+def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
+    """Print rows of text on stdout."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    table = Table(title=title or None, title_justify="left")
+    for number, name in enumerate(rows[0]):
+        table.add_column(name, justify="left" if number < 2 else "right")
+    for row in rows:
+        table.add_row(*row.values())
+    console.print(table)
+
+
+def say(text: str) -> None:
+    """Tell the user something that is not a result: on stderr."""
+    sys.stderr.write(text + "\n")

@@ -1,0 +1,73 @@
+"""Check this installation: versions, GetDP's build, and a one-second solve against a closed form.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import tempfile
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.analytic import ideal_sectors, layered_bore_field
+from halbach_fe.cli import common
+from halbach_fe.errors import CheckFailedError
+from halbach_fe.getdp import GetDP, find_getdp
+from halbach_fe.solve import Workshop, solve_nominal
+from halbach_fe.study import parse_study
+
+PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "xarray", "pydantic", "jinja2",
+            "matplotlib")
+TOLERANCE = {"direct": 5e-3, "reaction": 5e-4}
+"""Of the bore field, on the coarse mesh used here: measured 1.5e-3 and 2e-5, times some safety."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_getdp_argument(parser)
+    common.add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the findings; fail if GetDP is missing or its solve is wrong."""
+    findings = {"halbach-fe": metadata.version("halbach-fe"),
+                "python": platform.python_version(), "system": platform.platform()}
+    findings |= {name: metadata.version(name) for name in PACKAGES}
+    getdp = find_getdp(arguments.getdp)
+    findings |= {"getdp": f"{getdp.version} ({getdp.executable})", "petsc": getdp.petsc,
+                 "getdp build": " ".join(getdp.build_options)}
+    errors = {method: solve_error(getdp, method) for method in TOLERANCE}
+    findings |= {f"2D {method} solve, error": f"{error:.1e} of the bore field"
+                 for method, error in errors.items()}
+    if arguments.json:
+        common.print_json(findings | {"errors": errors, "tolerances": TOLERANCE})
+    else:
+        common.print_table([{"what": key, "found": value} for key, value in findings.items()])
+    for method, error in errors.items():
+        if not error <= TOLERANCE[method]:
+            raise CheckFailedError(
+                f"The {method} solve differs from the closed form by {error:.1e} of the bore "
+                f"field, where {TOLERANCE[method]:.0e} is allowed. Reinstall GetDP.")
+    return 0
+
+
+def solve_error(getdp: GetDP, method: str) -> float:
+    """Error of a 2D solve of a dipole with an iron ring, relative to its field."""
+    inner, outer, mu, iron = 0.1, 0.18, 1.05, (0.19, 0.21, 500.0)
+    study = parse_study({
+        "name": "doctor", "dimension": 2, "solver": {"method": method},
+        "array": {"blocks_per_ring": 16, "inner_radius_m": inner, "outer_radius_m": outer,
+                  "remanence_T": 1.0, "recoil_permeability": mu, "block": {"shape": "sector"}},
+        "iron_ring": {"inner_radius_m": iron[0], "outer_radius_m": iron[1],
+                      "relative_permeability": iron[2]},
+        "mesh": {"block_size_m": 0.012},
+        "observation": {"quantity": "flux_density", "positions": {
+            "kind": "circles", "radius_m": 0.07, "angles": 12}}})
+    angle = np.radians(7 + 30.0 * np.arange(12))  # off the mesh's lines of symmetry
+    points = 0.07 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    exact = layered_bore_field(ideal_sectors(1, 16, 1.0), inner, outer, mu, points[:, :2], iron)
+    with tempfile.TemporaryDirectory() as folder:
+        found = solve_nominal(study, points, Workshop(getdp, Path(folder)))[:, :2]
+    return float(np.abs(found - exact).max() / np.abs(exact).max())

@@ -1,0 +1,18 @@
+"""Print the JSON schema of the study file."""
+
+from __future__ import annotations
+
+import argparse
+
+from halbach_fe.cli import common
+from halbach_fe.study import Study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Nothing to add."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the schema."""
+    common.print_json(Study.model_json_schema())
+    return 0

@@ -1,0 +1,60 @@
+"""Compute the field of a study's nominal magnet at the study's positions.
+
+Writes field_map.h5, field_map.csv and field_map.vtu (open it in ParaView), readings.csv with the
+study's observation, and the GetDP run folders, which can be run by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from importlib import metadata
+
+import numpy as np
+
+from halbach_fe.cli import common
+from halbach_fe.field_map import field_map, write_map
+from halbach_fe.observation import observe, points_from
+from halbach_fe.solve import solve_nominal
+from halbach_fe.study import read_study
+from halbach_fe.update import write_text
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve, write the maps, print a summary."""
+    study = read_study(arguments.study)
+    points = points_from(study.observation.positions)
+    started = time.monotonic()
+    with common.workshop(arguments) as workshop:
+        flux_density = solve_nominal(study, points, workshop)
+        getdp = workshop.getdp
+    data = field_map(points, flux_density, attributes={
+        "study": study.name, "halbach_fe": metadata.version("halbach-fe"), "getdp": getdp.version,
+        "method": study.solver.method})
+    for suffix in (".h5", ".csv", ".vtu"):
+        write_map(data, arguments.output / f"field_map{suffix}")
+    observation = observe(study, points, np.ones_like(flux_density, bool))
+    readings = observation.apply(flux_density)
+    lines = ["label,x_m,y_m,z_m,value_T"] + [
+        f"{label},{x!r},{y!r},{z!r},{value!r}" for label, (x, y, z), value in zip(
+            observation.labels, observation.positions.tolist(), readings.tolist(), strict=True)]
+    write_text(arguments.output / "readings.csv", "\n".join([*lines, ""]))
+    size = np.linalg.norm(flux_density, axis=1)
+    strongest = int(np.argmax(size))
+    summary = {
+        "study": study.name, "points": len(points), "readings": len(readings),
+        "method": study.solver.method, "max_B_T": float(size.max()),
+        "max_B_at_m": points[strongest].tolist(), "min_B_T": float(size.min()),
+        "mean_B_T": flux_density.mean(axis=0).tolist(),
+        "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
+    }
+    if arguments.json:
+        common.print_json(summary)
+    else:
+        common.print_table([{"what": key, "value": str(value)} for key, value in summary.items()])
+    return 0

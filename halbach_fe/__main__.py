@@ -1,0 +1,7 @@
+"""``python -m halbach_fe``."""
+
+import sys
+
+from halbach_fe.cli import main
+
+sys.exit(main())

@@ -1,0 +1,310 @@
+"""Field maps: B at labelled points, measured or computed, and their files.
+
+A map is an `xarray.Dataset` with
+
+* ``B_T`` (point, component): flux density in T, NaN where a component was not measured;
+* coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m and ``component`` = x, y, z;
+* optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
+* attributes: provenance, free text by key.
+
+HDF5 and CSV hold all of it and read back equal; VTU is for looking at it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import meshio
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import MeasurementError, OutputError, must_be
+from halbach_fe.study import COMPONENTS, MAX_LENGTH_M
+
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
+SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
+OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
+MAX_FIELD_T = 10.0
+"""No permanent magnet comes near; a larger number is one in mT or G."""
+
+
+def field_map(
+    points: Floats, flux_density: Floats, sigma: Floats | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> xr.Dataset:
+    """Make a map from points (n, 3) in m and B (n, 3) in T, and sigma (n, 3) in T if known."""
+    data = xr.Dataset(
+        {"B_T": (("point", "component"), np.array(flux_density, float))},
+        coords={"component": list(COMPONENTS)} | {
+            name: ("point", np.array(points[:, i], float), {"units": "m"})
+            for i, name in enumerate(POSITION_COLUMNS)},
+        attrs=dict(attributes or {}))
+    data["B_T"].attrs["units"] = "T"
+    if sigma is not None:
+        data["sigma_T"] = (("point", "component"), np.array(sigma, float), {"units": "T"})
+    return data
+
+
+def points_of(data: xr.Dataset) -> Floats:
+    """Positions (n, 3) of a map in m."""
+    return np.column_stack([data[name].values for name in POSITION_COLUMNS])
+
+
+def write_map(data: xr.Dataset, path: Path) -> None:
+    """Write a map; the suffix decides: .h5, .csv or .vtu. The file appears whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        Unknown suffix, or a file that cannot be written.
+    """
+    writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
+        ".h5": lambda d, p: d.to_netcdf(p, engine="h5netcdf"),
+        ".csv": _write_csv,
+        ".vtu": _write_vtu,
+    }
+    if path.suffix not in writers:
+        raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
+                                  f"'{path.suffix}'"))
+    with atomic(path) as temporary:
+        writers[path.suffix](data, temporary)
+
+
+def read_map(path: str | Path) -> xr.Dataset:
+    """Read and validate a map from CSV or HDF5 (.h5, .hdf5, .nc).
+
+    CSV: ``# key: value`` comments are attributes; the header names the columns x_m, y_m, z_m and
+    some of Bx_T, By_T, Bz_T in any order, optionally sigma_T or sigma_Bx_T ..., time_s, scan. An
+    empty field is a component that was not measured.
+
+    Raises
+    ------
+    MeasurementError
+        With one sentence that names the file, the line and what to do.
+    """
+    path = Path(path)
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise MeasurementError(must_be("path", f"map {path}", "a readable file",
+                                       f"'{error.strerror}'", "Check the path.")) from None
+    if not raw.strip():
+        raise MeasurementError(must_be("content", f"map {path}", "a table of readings",
+                                       "an empty file"))
+    data = _read_hdf5(path) if path.suffix in (".h5", ".hdf5", ".nc") else _read_csv(raw, path)
+    _check(data, path)
+    return data
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``, moved there when the block succeeds.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; nothing is left behind.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix,
+                                        dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror}.") from None
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_csv(data: xr.Dataset, path: Path) -> None:
+    columns: dict[str, NDArray[np.generic]] = {name: data[name].values
+                                               for name in POSITION_COLUMNS}
+    columns |= {name: data["B_T"].values[:, i] for i, name in enumerate(FIELD_COLUMNS)}
+    if "sigma_T" in data:
+        columns |= {name: data["sigma_T"].values[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
+    columns |= {name: data[name].values for name in ("time_s", "scan") if name in data}
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for key, value in data.attrs.items():
+            file.write(f"# {key}: {' '.join(str(value).split())}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([_cell(value) for value in row])
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float | np.floating):
+        return "" if np.isnan(value) else repr(float(value))
+    return str(value)
+
+
+def _write_vtu(data: xr.Dataset, path: Path) -> None:
+    points = points_of(data)
+    cells = [("vertex", np.arange(len(points))[:, None])]
+    values = {"B_T": np.nan_to_num(data["B_T"].values)}
+    if "sigma_T" in data:
+        values["sigma_T"] = np.nan_to_num(data["sigma_T"].values)
+    meshio.write(path, meshio.Mesh(points, cells, point_data=values), file_format="vtu")
+
+
+def _read_hdf5(path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            data = opened.load()
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise MeasurementError(must_be("content", where, "a whole HDF5 file",
+                                       f"'{str(error).splitlines()[0]}'")) from None
+    for name in ("B_T", *POSITION_COLUMNS):
+        if name not in data.variables:
+            raise MeasurementError(must_be("variable", where, f"`{name}`", "a file without it"))
+    if data["B_T"].dims != ("point", "component") or list(
+            data.get("component", xr.DataArray([])).values) != list(COMPONENTS):
+        raise MeasurementError(must_be("`B_T`", where, "labelled (point, component = x, y, z)",
+                                       f"dimensions {data['B_T'].dims}"))
+    return data
+
+
+def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise MeasurementError(
+            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
+                    "Save it as UTF-8 text.")) from None
+    attributes: dict[str, str] = {}
+    rows: list[tuple[int, list[str]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        comment = re.match(r"\s*#\s*(?:([^:]+?)\s*:\s*(.*))?", line)
+        if comment:
+            if comment[1]:
+                attributes[comment[1]] = comment[2].strip()
+        elif line.strip():
+            rows.append((number, [cell.strip() for cell in next(csv.reader(io.StringIO(line)))]))
+    if not rows:
+        raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
+    header = rows[0][1]
+    _check_header(header, where)
+    if len(rows) == 1:
+        raise MeasurementError(must_be("content", where, "at least one reading",
+                                       "a header alone"))
+    table: dict[str, list[float]] = {name: [] for name in header}
+    scans: list[str] = []
+    for number, cells in rows[1:]:
+        if len(cells) != len(header):
+            raise MeasurementError(must_be(f"line {number}", where, f"{len(header)} values",
+                                           str(len(cells)), "Is the file cut short?"))
+        for name, cell in zip(header, cells, strict=True):
+            if name == "scan":
+                scans.append(cell)
+            else:
+                table[name].append(_number(cell, name, number, where))
+    points = np.column_stack([table[name] for name in POSITION_COLUMNS])
+    empty = np.full(len(points), np.nan)
+    data = field_map(points, np.column_stack([table.get(n, empty) for n in FIELD_COLUMNS]),
+                     attributes=attributes)
+    if "sigma_T" in table:
+        data["sigma_T"] = (("point", "component"), np.repeat([table["sigma_T"]], 3, 0).T)
+    elif any(name in table for name in SIGMA_COLUMNS):
+        data["sigma_T"] = (("point", "component"),
+                           np.column_stack([table.get(n, empty) for n in SIGMA_COLUMNS]))
+    if "time_s" in table:
+        data["time_s"] = ("point", table["time_s"])
+    if scans:
+        data["scan"] = ("point", scans)
+    return data
+
+
+def _check_header(header: list[str], where: str) -> None:
+    known = (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS)
+    for name in header:
+        if name not in known:
+            raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
+                                           f"column '{name}'", "Rename or remove it."))
+    if len(set(header)) < len(header):
+        raise MeasurementError(must_be("header", where, "without repeated columns",
+                                       ",".join(header)))
+    missing = [name for name in POSITION_COLUMNS if name not in header]
+    if missing or not any(name in header for name in FIELD_COLUMNS):
+        expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T"
+        raise MeasurementError(must_be("header", where, f"complete with {expected}",
+                                       ",".join(header)))
+    if "sigma_T" in header and any(name in header for name in SIGMA_COLUMNS):
+        raise MeasurementError(must_be("header", where, "with sigma_T or sigma_Bx_T ..., not both",
+                                       ",".join(header)))
+
+
+def _number(cell: str, name: str, number: int, where: str) -> float:
+    if not cell and (name in FIELD_COLUMNS or name in SIGMA_COLUMNS):
+        return np.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise MeasurementError(must_be(f"{name} in line {number}", where, "a finite number",
+                                       f"'{cell}'", "Leave a missing component empty."))
+    return value
+
+
+def _check(data: xr.Dataset, path: Path) -> None:
+    """Refuse what cannot be a reading."""
+    where = f"map {path}"
+    points, values = points_of(data), data["B_T"].values
+    if np.isinf(values).any() or not np.isfinite(points).all():
+        row = int(np.argmax(np.isinf(values).any(axis=1) | ~np.isfinite(points).all(axis=1)))
+        raise MeasurementError(must_be(f"reading {row + 1}", where, "finite numbers",
+                                       "an infinite or missing one"))
+    blank = np.isnan(values).all(axis=1)
+    if blank.any():
+        raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
+                                       "at least one component", "none", "Remove the line."))
+    if np.abs(points).max() > 10 * MAX_LENGTH_M:
+        raise MeasurementError(must_be(
+            "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{np.abs(points).max():g}",
+            "Are they in millimetres? Divide them by 1000."))
+    largest = float(np.nanmax(np.abs(values)))
+    if largest > MAX_FIELD_T:
+        unit = "gauss" if largest > 2000 else "millitesla"
+        raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
+                                       f"{largest:g}", f"Are they in {unit}?"))
+    if "sigma_T" in data:
+        sigma = data["sigma_T"].values[~np.isnan(values)]
+        if not (sigma > 0).all() or not np.isfinite(sigma).all():
+            raise MeasurementError(must_be("sigma", where, "positive for every reading",
+                                           "zero, a negative or a missing one"))
+    _check_duplicates(data, points, where)
+
+
+def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
+    """The same point twice is an error, unless the file says when or in which scan."""
+    keys = [points]
+    if "time_s" in data:
+        keys.append(data["time_s"].values[:, None])
+    if "scan" in data:
+        keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None])
+    unique, first = np.unique(np.hstack(keys), axis=0, return_index=True)
+    if len(unique) < len(points):
+        row = int(np.setdiff1d(np.arange(len(points)), first)[0])
+        x, y, z = points[row]
+        raise MeasurementError(must_be(
+            f"reading {row + 1}", where, "at a point of its own", f"({x:g}, {y:g}, {z:g}) m again",
+            "Remove it, or tell repeated readings apart by time_s or scan."))

@@ -1,0 +1,188 @@
+"""From B at points to the readings that an inference compares: labelled rows of numbers.
+
+An `Observation` is a set of points and a sparse matrix that turns B there (all components, point
+by point) into readings: a selection for flux densities, a Fourier analysis for circles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import xarray as xr
+from numpy.typing import NDArray
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import MeasurementError, StudyError, must_be
+from halbach_fe.field_map import points_of
+from halbach_fe.study import COMPONENTS, FourierCoefficients, Noise, Positions, Study
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Readings as linear functions of B at points.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), in m
+    operator : sparse array, shape (readings, 3 n)
+        Applied to B in T, flattened point by point.
+    labels : tuple of str
+        Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
+    positions : ndarray, shape (readings, 3), in m
+        Where each reading belongs; a circle's centre for a Fourier coefficient.
+    """
+
+    points: Floats
+    operator: sparse.csr_array
+    labels: tuple[str, ...]
+    positions: Floats
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def apply(self, fields: Floats) -> Floats:
+        """Readings of fields (..., n, 3) in T; shape (..., readings)."""
+        flat = fields.reshape(-1, 3 * len(self.points))
+        return np.asarray(self.operator @ flat.T).T.reshape(*fields.shape[:-2], len(self))
+
+
+def points_from(positions: Positions) -> Floats:
+    """Expand the positions of a study into points (n, 3) in m."""
+    if positions.kind == "line":
+        return np.linspace(positions.start_m, positions.end_m, positions.count)
+    if positions.kind == "points":
+        return np.array(positions.points_m, float)
+    angle = 2 * np.pi * np.arange(positions.angles) / positions.angles
+    z = np.linspace(positions.z_min_m, positions.z_max_m, positions.count)
+    circle = positions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.tile(circle, (len(z), 1)), np.repeat(z, len(circle))])
+
+
+def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observation:
+    """The study's observation on the points of a map.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    measured : ndarray of bool, shape (n, 3)
+        Which components the map holds at each point.
+    """
+    if study.observation.quantity == "flux_density":
+        wanted = np.array([name in study.observation.components for name in COMPONENTS])
+        point, component = np.nonzero(measured & wanted)
+        if not len(point):
+            raise MeasurementError(must_be(
+                "components", "map", f"some of {', '.join(study.observation.components)}, which "
+                "the study observes", "none of them"))
+        operator = sparse.csr_array(
+            (np.ones(len(point)), (np.arange(len(point)), 3 * point + component)),
+            shape=(len(point), 3 * len(points)))
+        return Observation(points, operator, tuple(f"B{COMPONENTS[c]}" for c in component),
+                           points[point])
+    return _fourier(study.observation, points, measured)
+
+
+def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.int64]]:
+    """Group points into full circles of the study's radius; indices by angle, one row a circle.
+
+    Raises
+    ------
+    MeasurementError
+        If the points are not circles of equally spaced points about the z axis.
+    """
+    radius = settings.positions.radius_m
+    if not np.allclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=1e-6):
+        raise MeasurementError(must_be(
+            "points", "map", f"on circles of radius {radius:g} m, as the study's Fourier "
+            "coefficients need", "points at other radii", "Observe flux_density instead."))
+    found = []
+    for z in np.unique(np.round(points[:, 2], 9)):
+        index = np.flatnonzero(np.abs(points[:, 2] - z) < 1e-9)
+        angle = np.arctan2(points[index, 1], points[index, 0]) % (2 * np.pi)
+        order = np.argsort(angle)
+        steps = np.diff(angle[order], append=angle[order][0] + 2 * np.pi)
+        if len(index) <= 2 * settings.harmonics or not np.allclose(
+                steps, 2 * np.pi / len(index), atol=1e-6):
+            raise MeasurementError(must_be(
+                f"circle at z = {z:g} m", "map",
+                f"more than {2 * settings.harmonics} equally spaced points", f"{len(index)} points"
+            ))
+        found.append(index[order])
+    return found
+
+
+def _fourier(
+    settings: FourierCoefficients, points: Floats, measured: NDArray[np.bool_]
+) -> Observation:
+    if not measured[:, :2].all():
+        raise MeasurementError(must_be("components", "map",
+                                       "Bx and By at every point, for the Fourier coefficients "
+                                       "of B_r", "points without them"))
+    order = np.arange(1, settings.harmonics + 1)
+    rows, columns, values = [], [], []
+    labels: list[str] = []
+    positions = []
+    for index in circles(points, settings):
+        angle = np.arctan2(points[index, 1], points[index, 0])
+        wave = np.vstack([np.cos(np.outer(order, angle)), np.sin(np.outer(order, angle))])
+        wave *= 2 / len(index)
+        for axis, direction in enumerate((np.cos(angle), np.sin(angle))):
+            values.append((wave * direction).ravel())
+            columns.append(np.tile(3 * index + axis, len(wave)))
+            rows.append(len(labels) + np.repeat(np.arange(len(wave)), len(index)))
+        labels += [f"A{k}" for k in order] + [f"B{k}" for k in order]
+        positions += [(0.0, 0.0, points[index[0], 2])] * (2 * len(order))
+    operator = sparse.csr_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(len(labels), 3 * len(points)))
+    return Observation(points, operator, tuple(labels), np.array(positions))
+
+
+def noise_regions(noise: Noise, z: Floats) -> NDArray[np.int64]:
+    """Index of the noise region of each z in m: the first whose window holds it.
+
+    Raises
+    ------
+    StudyError
+        If some z is in none.
+    """
+    region = np.full(len(z), -1)
+    for number, window in reversed(list(enumerate(noise.regions))):
+        region[(z >= window.z_min_m) & (z <= window.z_max_m)] = number
+    if (region < 0).any():
+        raise StudyError(
+            f"Input `noise.regions` of study must cover every reading; instead z = "
+            f"{z[np.argmin(region)]:g} m is in none. Add a last region without limits.")
+    return region
+
+
+def standard_deviations(study: Study, observation: Observation, data: xr.Dataset) -> Floats:
+    """Noise of each reading (readings,) in T: from the map where it says, else by region.
+
+    For Fourier coefficients a map's own point noise is propagated; the regions' sigma is that of
+    the coefficients themselves.
+    """
+    if "sigma_T" in data:
+        variance = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
+        return np.sqrt(np.asarray((observation.operator**2) @ variance))
+    if study.noise is None:
+        raise StudyError(
+            f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
+            "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
+    sigma = np.array([region.sigma_T for region in study.noise.regions])
+    return sigma[noise_regions(study.noise, observation.positions[:, 2])]
+
+
+def held_out(study: Study, z: Floats) -> NDArray[np.bool_]:
+    """Tell which readings at heights z (n,) in m the study keeps from the update."""
+    settings = study.inference.held_out
+    if settings is None:
+        return np.zeros(len(z), bool)
+    _, rank = np.unique(np.round(z, 9), return_inverse=True)
+    return np.asarray((rank // settings.window) % settings.every == settings.every - 1)
+
+
+__all__ = ["Observation", "circles", "held_out", "noise_regions", "observe", "points_from",
+           "points_of", "standard_deviations"]

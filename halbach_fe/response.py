@@ -1,0 +1,136 @@
+"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p.
+
+Each column is the field of one block magnetized by 1 A/m along one axis: its exact field in
+vacuum plus the finite-element reaction, or the finite-element field alone (method ``direct``).
+One more solve, of the nominal array at once, is compared with the sum of the columns.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.errors import GetDPError
+from halbach_fe.exact_field import field_of, unit_field
+from halbach_fe.field_map import atomic
+from halbach_fe.observation import Observation
+from halbach_fe.solve import Workshop, check_points, solve_sources, source_number
+from halbach_fe.study import COMPONENTS, MU_0, Study
+
+SUPERPOSITION_TOLERANCE = 1e-8
+"""Of the largest reading. The problem is linear and the solver direct: what remains is rounding
+and the 16 digits of GetDP's text, about 1e-12; a wrong or missing column shows at 1e-3."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """H and its labels.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (readings, parameters), in T m/A
+    parameters : tuple of str
+        ``r01s05.Mx``: ring 1, slot 5, component x.
+    nominal : ndarray, shape (parameters,), in A/m
+        The study's nominal magnetization.
+    superposition_error : float
+        Largest difference between H times nominal and a direct solve, relative to the largest
+        reading.
+    """
+
+    matrix: Floats
+    parameters: tuple[str, ...]
+    nominal: Floats
+    superposition_error: float
+
+
+def parameter_names(study: Study) -> tuple[str, ...]:
+    """Names of the parameters p, block by block; the cross-section has no M_z."""
+    components = COMPONENTS[: study.dimension]
+    return tuple(f"{block.name}.M{c}" for block in blocks_of(study) for c in components)
+
+
+def response(study: Study, observation: Observation, workshop: Workshop) -> Response:
+    """Build H, or take it from the workshop's folder if it is there for the same inputs."""
+    key = _key(study, observation, workshop)
+    path = workshop.folder / "response.h5"
+    stored = _read(path, key)
+    if stored is not None:
+        return stored
+    check_points(study, observation.points)
+    blocks = blocks_of(study)
+    last = source_number(len(blocks) - 1, 2)
+    fields = solve_sources(study, observation.points, (0, last), workshop)
+    check = fields[0]
+    exact = study.solver.method == "reaction"
+    columns = []
+    for number, block in enumerate(blocks):
+        first = source_number(number, 0)
+        field = fields[first:first + 3]  # (3, n, 3): per T of remanence
+        if exact:
+            field = field + np.moveaxis(unit_field(block, observation.points), 2, 0)
+        # B_r = mu_0 mu_r M turns per tesla into per A/m
+        field = field[: study.dimension] * MU_0 * block.recoil_permeability
+        columns.append(observation.apply(field).T)
+    matrix = np.hstack(columns)
+    nominal = np.concatenate([block.magnetization[: study.dimension] for block in blocks])
+    if exact:
+        check = check + field_of(blocks, observation.points)
+    built = Response(matrix, parameter_names(study), nominal,
+                     verify_superposition(matrix, nominal, observation.apply(check)))
+    _write(path, key, built)
+    return built
+
+
+def verify_superposition(matrix: Floats, nominal: Floats, direct: Floats) -> float:
+    """Return max |H p - q| / max |q| for a directly solved q; raise GetDPError if too large."""
+    error = float(np.abs(matrix @ nominal - direct).max() / np.abs(direct).max())
+    if not error <= SUPERPOSITION_TOLERANCE:
+        raise GetDPError(
+            f"The columns of the response do not add up to the directly solved field: the largest "
+            f"difference is {error:.1e} of it, where {SUPERPOSITION_TOLERANCE:.0e} is allowed. "
+            "A column is wrong; please report this with the study.")
+    return error
+
+
+def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
+    """Digest of all that the matrix depends on."""
+    relevant = study.model_dump(
+        mode="json", include={"dimension", "array", "iron_ring", "mesh", "open_boundary", "solver"})
+    digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
+    digest.update(metadata.version("halbach-fe").encode())
+    digest.update(f"{workshop.getdp.version} {workshop.getdp.petsc}".encode())
+    digest.update(np.ascontiguousarray(observation.points).tobytes())
+    operator = observation.operator.tocoo()
+    for part in (*operator.coords, operator.data):
+        digest.update(np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()
+
+
+def _write(path: Path, key: str, built: Response) -> None:
+    data = xr.Dataset(
+        {"H": (("reading", "parameter"), built.matrix, {"units": "T m/A"}),
+         "nominal": ("parameter", built.nominal, {"units": "A/m"})},
+        coords={"parameter": list(built.parameters)},
+        attrs={"key": key, "superposition_error": built.superposition_error})
+    with atomic(path) as temporary:
+        data.to_netcdf(temporary, engine="h5netcdf")
+
+
+def _read(path: Path, key: str) -> Response | None:
+    """The stored response; None if there is none, or it is of other inputs, or damaged."""
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as data:
+            if data.attrs["key"] != key:
+                return None
+            return Response(data["H"].values, tuple(map(str, data["parameter"].values)),
+                            data["nominal"].values, float(data.attrs["superposition_error"]))
+    except (OSError, KeyError, ValueError, RuntimeError):
+        return None

@@ -1,0 +1,212 @@
+"""From a study and a measured map to the updated magnet: the inference, and how well it predicts.
+
+Readings are split into those that update the model and those held out; both are predicted by the
+prior and by the posterior, with error bars, and compared region by region.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from halbach_fe.blocks import Floats, points_in_material
+from halbach_fe.errors import MeasurementError, must_be
+from halbach_fe.field_map import atomic, points_of
+from halbach_fe.inference.linear import chi2_per_reading, posterior, predict
+from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.observation import (
+    Observation,
+    held_out,
+    noise_regions,
+    observe,
+    standard_deviations,
+)
+from halbach_fe.response import Response, response
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study
+
+COVERAGE_Z = 1.959964
+"""Half width of a central 95 % band in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Readings as a model foretells them: mean and sd (readings,) in T, without noise."""
+
+    mean: Floats
+    sd: Floats
+
+
+@dataclass(frozen=True)
+class RegionScore:
+    """How prior and posterior predict the readings of one region.
+
+    Relative errors are ``|measured - predicted| / |measured|``; coverage is the fraction of
+    readings within the 95 % band of prediction and noise; chi2 is per reading.
+    """
+
+    region: str
+    part: str
+    readings: int
+    median_relative_error_prior: float
+    median_relative_error_posterior: float
+    coverage95_prior: float
+    coverage95_posterior: float
+    chi2_prior: float
+    chi2_posterior: float
+
+
+@dataclass(frozen=True)
+class Update:
+    """A study, a map, and what the one says about the other."""
+
+    study: Study
+    observation: Observation
+    readings: Floats
+    sigma: Floats
+    held_out: NDArray[np.bool_]
+    regions: tuple[str, ...]
+    response: Response
+    prior: Gaussian
+    posterior: Gaussian
+    prediction_prior: Prediction
+    prediction_posterior: Prediction
+
+    @property
+    def scores(self) -> tuple[RegionScore, ...]:
+        """Scores by region, training and held-out readings apart."""
+        return tuple(
+            self._score(region, part, chosen)
+            for region in dict.fromkeys(self.regions)
+            for part, mask in (("training", ~self.held_out), ("held out", self.held_out))
+            if (chosen := mask & (np.array(self.regions) == region)).any())
+
+    def relative_error(self, prediction: Prediction) -> Floats:
+        """|measured - predicted| / |measured| of every reading."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.abs((self.readings - prediction.mean) / self.readings))
+
+    def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
+        figures = {}
+        for name, model, prediction in (
+                ("prior", self.prior, self.prediction_prior),
+                ("posterior", self.posterior, self.prediction_posterior)):
+            total = np.hypot(prediction.sd, self.sigma)[chosen]
+            error = (self.readings - prediction.mean)[chosen]
+            figures[f"median_relative_error_{name}"] = float(
+                np.median(self.relative_error(prediction)[chosen]))
+            figures[f"coverage95_{name}"] = float(np.mean(np.abs(error) <= COVERAGE_Z * total))
+            figures[f"chi2_{name}"] = chi2_per_reading(
+                self.response.matrix[chosen], self.readings[chosen], self.sigma[chosen], model)
+        return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
+
+
+def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
+    """Update the block magnetizations of a study with a measured map.
+
+    Parameters
+    ----------
+    study : Study
+    data : Dataset
+        As `halbach_fe.field_map.read_map` returns it.
+    workshop : Workshop
+        Its folder receives the mesh, the run folders and the response matrix.
+
+    Raises
+    ------
+    MeasurementError
+        If the map does not fit the study.
+    """
+    points = points_of(data)
+    if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
+        raise MeasurementError(must_be(
+            "points", "map", "in one plane for a 2D study",
+            f"z from {points[:, 2].min():g} to {points[:, 2].max():g} m",
+            "Use a 3D study, or one circle of the map."))
+    inside = points_in_material(study, points)
+    if inside.any():
+        row = int(np.argmax(inside))
+        x, y, z = points[row]
+        raise MeasurementError(must_be(
+            f"reading {row + 1}", "map", "at a point in air",
+            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron ({inside.sum()} such readings)",
+            "Check the study's radii and the map's axes and units."))
+    measured = ~np.isnan(data["B_T"].values)
+    observation = observe(study, points, measured)
+    sigma = standard_deviations(study, observation, data)
+    keep = held_out(study, observation.positions[:, 2])
+    if keep.all():
+        raise MeasurementError(must_be(
+            "readings", "map", "enough for the study to leave some for the update",
+            f"{len(keep)}, all held out", "Change inference.held_out."))
+    if study.noise is None:
+        regions = ("all",) * len(observation)
+    else:
+        names = [region.name for region in study.noise.regions]
+        regions = tuple(names[i] for i in noise_regions(study.noise,
+                                                        observation.positions[:, 2]))
+    readings = observation.apply(np.nan_to_num(data["B_T"].values))
+    model = response(study, observation, workshop)
+    before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
+                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    after = posterior(model.matrix[~keep], readings[~keep], sigma[~keep], before)
+    return Update(
+        study=study, observation=observation, readings=readings, sigma=sigma, held_out=keep,
+        regions=regions, response=model, prior=before, posterior=after,
+        prediction_prior=Prediction(*predict(model.matrix, before)),
+        prediction_posterior=Prediction(*predict(model.matrix, after)))
+
+
+def write_update(update: Update, folder: Path) -> None:
+    """Write posterior.h5, prediction.csv and summary.json."""
+    parameters = list(update.response.parameters)
+    labels = {"reading": list(update.observation.labels)}
+    magnetization = xr.Dataset(
+        {name: ("parameter", values, {"units": "A/m"})
+         for name, values in (
+             ("nominal", update.response.nominal),
+             ("prior_mean", update.prior.mean), ("prior_sd", update.prior.sd),
+             ("posterior_mean", update.posterior.mean), ("posterior_sd", update.posterior.sd))},
+        coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
+    magnetization["posterior_covariance"] = (("parameter", "parameter_2"),
+                                             update.posterior.covariance, {"units": "A2/m2"})
+    with atomic(folder / "posterior.h5") as temporary:
+        magnetization.to_netcdf(temporary, engine="h5netcdf")
+    x, y, z = update.observation.positions.T
+    columns = {
+        "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
+        "region": np.array(update.regions), "held_out": update.held_out.astype(int),
+        "measured_T": update.readings, "sigma_T": update.sigma,
+        "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
+        "posterior_mean_T": update.prediction_posterior.mean,
+        "posterior_sd_T": update.prediction_posterior.sd}
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    text = "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows), ""])
+    write_text(folder / "prediction.csv", text)
+    write_text(folder / "summary.json", json.dumps(summary(update), indent=1) + "\n")
+
+
+def summary(update: Update) -> dict[str, object]:
+    """What a script wants to know of an update."""
+    shift = update.posterior.mean - update.prior.mean
+    return {
+        "study": update.study.name,
+        "readings": len(update.readings),
+        "held_out": int(update.held_out.sum()),
+        "parameters": len(update.response.parameters),
+        "superposition_error": update.response.superposition_error,
+        "largest_shift_A_per_m": float(np.abs(shift).max()),
+        "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
+        "scores": [asdict(score) for score in update.scores],
+    }
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
