@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from halbach_fe.cli import doctor, infer, schema, solve
+
 from halbach_fe.errors import EXIT_CODES, HalbachError
 
 VERBS = {"solve": solve, "infer": infer, "doctor": doctor, "schema": schema}

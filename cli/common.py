@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -77,7 +78,7 @@ def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
     for number, name in enumerate(rows[0]):
         table.add_column(name, justify="left" if number < 2 else "right")
     for row in rows:
-        table.add_row(*row.values())
+        table.add_row(*(escape(value) for value in row.values()))
     console.print(table)
 
 

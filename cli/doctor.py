@@ -1,5 +1,4 @@
-"""Check this installation: versions, GetDP's build, and a one-second solve against a closed form.
-"""
+"""Check this installation: versions, GetDP's build, a one-second solve against a closed form."""
 
 from __future__ import annotations
 
@@ -10,9 +9,9 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
+from halbach_fe.cli import common
 
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
-from halbach_fe.cli import common
 from halbach_fe.errors import CheckFailedError
 from halbach_fe.getdp import GetDP, find_getdp
 from halbach_fe.solve import Workshop, solve_nominal

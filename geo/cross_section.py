@@ -6,11 +6,11 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
+from halbach_fe.geo.session import gmsh_session, write_mesh
 
 from halbach_fe import regions as tags
 from halbach_fe.blocks import MagnetBlock, Outline, array_outer_radius, blocks_of
 from halbach_fe.errors import StudyError
-from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
 

@@ -7,15 +7,11 @@ stacking the plane mesh takes a second.)
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import gmsh
 import numpy as np
-from numpy.typing import NDArray
-
-from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, array_half_length, blocks_of, ring_limits
-from halbach_fe.errors import StudyError
 from halbach_fe.geo.cross_section import (
     DEFAULT_BOUNDARY_RATIO,
     boundary_radius,
@@ -24,6 +20,11 @@ from halbach_fe.geo.cross_section import (
     regions_of,
 )
 from halbach_fe.geo.session import gmsh_session, write_mesh
+from numpy.typing import NDArray
+
+from halbach_fe import regions as tags
+from halbach_fe.blocks import Floats, array_half_length, blocks_of, ring_limits
+from halbach_fe.errors import StudyError
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
 
@@ -40,7 +41,9 @@ def mesh_3d(study: Study, mesh_path: Path) -> Regions:
     with gmsh_session(study.name):
         surfaces = draw(study, blocks)
         gmsh.option.setNumber("Mesh.RecombineAll", 1)
-        gmsh.option.setNumber("Mesh.Algorithm", 8)  # frontal-Delaunay for quadrangles
+        # Packing of parallelograms: the worst quadrangle stays convex by a wide margin, where
+        # the other algorithms make slivers in which GetDP cannot locate points.
+        gmsh.option.setNumber("Mesh.Algorithm", 9)
         gmsh.model.mesh.generate(2)
         points, cells = _plane_mesh(surfaces)
         z = layers(study)
@@ -64,9 +67,9 @@ def layers(study: Study) -> Floats:
     limits = {limit for ring in ring_limits(study) for limit in ring} | {-iron_end, iron_end}
     # Rounding must not leave slivers between limits that are meant to be equal.
     stops = sorted(limits)
-    stops = [stops[0]] + [b for a, b in zip(stops, stops[1:], strict=False) if b - a > 1e-9]
+    stops = [stops[0]] + [b for a, b in pairwise(stops) if b - a > 1e-9]
     z: list[float] = [stops[0]]
-    for start, stop in zip(stops, stops[1:], strict=False):
+    for start, stop in pairwise(stops):
         count = max(1, int(np.ceil((stop - start) / thickness - 1e-6)))
         z += list(np.linspace(start, stop, count + 1)[1:])
     outside = _outside_layers(z[-1], thickness, study)
@@ -140,11 +143,11 @@ def _stack(study: Study, points: Floats, cells: dict[int, tuple[Ints, Ints]], z:
     faces: dict[int, list[Ints]] = {TRIANGLE: [], QUADRANGLE: []}
     for kind, (corners, region) in cells.items():
         for level in range(levels - 1):
-            tag = _layer_tags(study, region, (z[level] + z[level + 1]) / 2)
+            materials = _layer_tags(study, region, (z[level] + z[level + 1]) / 2)
             prism = np.hstack([corners + level * count, corners + (level + 1) * count])
-            for one in np.unique(tag):
-                volumes.setdefault(int(one), {}).setdefault(_STACKED[kind], []).append(
-                    prism[tag == one])
+            for tag in np.unique(materials).tolist():
+                volumes.setdefault(tag, {}).setdefault(_STACKED[kind], []).append(
+                    prism[materials == tag])
         faces[kind] += [corners, corners + (levels - 1) * count]
     rim = _rim(points, cells, boundary_radius(study))
     for level in range(levels - 1):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import gmsh
 
-from halbach_fe.errors import MeshError
+from halbach_fe.errors import HalbachError, MeshError
 
 
 @contextmanager
@@ -20,15 +22,18 @@ def gmsh_session(name: str) -> Iterator[None]:
     MeshError
         In place of Gmsh's bare exceptions.
     """
+    on_termination = signal.getsignal(signal.SIGTERM)
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, on_termination)  # Gmsh resets it
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("General.NumThreads", 1)  # the same mesh on every machine
         gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)  # the newest that GetDP reads here
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.model.add(name)
         yield
-    except MeshError:
+    except HalbachError:
         raise
     except Exception as error:  # gmsh raises plain Exception
         raise MeshError(

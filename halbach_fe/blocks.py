@@ -86,7 +86,8 @@ class MagnetBlock:
     @cached_property
     def area(self) -> float:
         """Cross-section in m^2, by Green's theorem (exact: the integrand is a polynomial, or a
-        constant on arcs)."""
+        constant on arcs).
+        """
         t, weight = np.polynomial.legendre.leggauss(3)
         total = 0.0
         for edge in self.outline:
@@ -110,8 +111,8 @@ class MagnetBlock:
         return max(edge.radius for edge in self.outline)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m lie inside the block (its surface is outside)."""
-        inside = (points[:, 2] > self.z_min) & (points[:, 2] < self.z_max)
+        """Tell which points (n, 3) in m lie inside the block or on its end faces."""
+        inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)
         inside[inside] = outline_contains(self.outline, points[inside, :2])
         return inside
 
@@ -209,8 +210,8 @@ def points_in_material(study: Study, points: Floats) -> NDArray[np.bool_]:
         half = ring.length_m / 2 if ring.length_m else array_half_length(study)
         if study.dimension == 2:
             half = np.inf
-        inside |= ((radius > ring.inner_radius_m) & (radius < ring.outer_radius_m)
-                   & (np.abs(points[:, 2]) < half))
+        inside |= ((radius >= ring.inner_radius_m) & (radius <= ring.outer_radius_m)
+                   & (np.abs(points[:, 2]) <= half))
     return inside
 
 
@@ -222,7 +223,8 @@ def _with_remanence(block: MagnetBlock, array: Array) -> MagnetBlock:
     """
     remanence = array.remanence_T
     if remanence is None:
-        assert array.block_moment_A_m2 is not None and array.ring_length_m is not None
+        assert array.block_moment_A_m2 is not None  # the study model guarantees both
+        assert array.ring_length_m is not None
         remanence = MU_0 * array.block_moment_A_m2 / (block.area * array.ring_length_m)
         if remanence > 2.0:
             raise StudyError(

@@ -300,7 +300,7 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
     if "time_s" in data:
         keys.append(data["time_s"].values[:, None])
     if "scan" in data:
-        keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None])
+        keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None].astype(float))
     unique, first = np.unique(np.hstack(keys), axis=0, return_index=True)
     if len(unique) < len(points):
         row = int(np.setdiff1d(np.arange(len(points)), first)[0])

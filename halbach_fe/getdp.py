@@ -9,6 +9,7 @@ every number of its output are checked before the result is handed on.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -114,7 +115,8 @@ def find_getdp(named: str | Path | None = None) -> GetDP:
         answer = subprocess.run([found, "-info"], capture_output=True, text=True, timeout=30,
                                 errors="replace", check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise GetDPNotFoundError(f"GetDP at {found} does not answer ({error}). {_INSTALL}") from None
+        raise GetDPNotFoundError(
+            f"GetDP at {found} does not answer ({error}). {_INSTALL}") from None
     said = dict(re.findall(r"^(.+?)\s*:\s*(.*)$", answer.stdout + answer.stderr, re.MULTILINE))
     if answer.returncode != 0 or "Version" not in said:
         raise GetDPNotFoundError(f"{found} does not answer like GetDP. {_INSTALL}")
@@ -244,12 +246,13 @@ def _execute(
 
     def read() -> None:
         assert process.stdout is not None
-        for text in process.stdout:  # progress bars use carriage returns
-            for line in re.split(r"[\r\b]+", text.rstrip("\n")):
-                if line.strip() and "Processing (" not in line:
-                    lines.append(line)
-                    if on_line is not None:
-                        on_line(line)
+        with process.stdout:
+            for text in process.stdout:  # progress bars use carriage returns
+                for line in re.split(r"[\r\b]+", text.rstrip("\n")):
+                    if line.strip() and not re.search(r"rocessing \(|%\s+: P", line):
+                        lines.append(line)
+                        if on_line is not None:
+                            on_line(line)
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
@@ -285,19 +288,15 @@ def _execute(
 
 
 def _kill(process: subprocess.Popen[str]) -> None:
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     process.wait()
 
 
 def _save_log(folder: Path, arguments: list[str], lines: list[str]) -> None:
-    try:
-        (folder / "getdp.log").write_text("\n".join([" ".join(arguments[1:]), *lines, ""]),
-                                          encoding="utf-8")
-    except OSError:
-        pass  # the failure that filled the disk is the one to report
+    text = "\n".join([" ".join(arguments[1:]), *lines, ""])
+    with contextlib.suppress(OSError):  # the failure that filled the disk is the one to report
+        (folder / "getdp.log").write_text(text, encoding="utf-8")
 
 
 def _check_log(lines: list[str], job: Job, folder: Path) -> None:
@@ -318,7 +317,8 @@ def _check_log(lines: list[str], job: Job, folder: Path) -> None:
 
 def _check_residuals(lines: list[str], folder: Path) -> None:
     """Every linear solve must have brought its residual down."""
-    first = last = None
+    first: float | None = None
+    last = np.nan
     for line in [*lines, "  0 KSP Residual norm 0"]:
         match = re.search(r"(\d+) KSP Residual norm (\S+)", line)
         if not match:

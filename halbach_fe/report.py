@@ -47,7 +47,8 @@ def score_table(update: Update, published: Published | None = None) -> list[dict
     rows = []
     for score in update.scores:
         row = {
-            "region": score.region, "readings": f"{score.readings} {score.part}",
+            "region": score.region,
+            "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "prior": _percent(score.median_relative_error_prior),
             "posterior": _percent(score.median_relative_error_posterior),
             "95 % band holds": f"{score.coverage95_posterior:.0%}",
@@ -112,7 +113,7 @@ def _conflict(update: Update) -> str:
 
 
 def _percent(value: float) -> str:
-    return f"{100 * value:.3g} %"
+    return f"{100 * value:.3g}\u00a0%"
 
 
 def _z_of(update: Update, region: str, part: str) -> Floats:
@@ -158,7 +159,7 @@ def _profile(update: Update) -> Figure:
     bottom.plot(z[held], residual[held], "o", mfc="none", color=MEASURED, ms=4)
     bottom.set_ylabel("measured − posterior\nin mT")
     bottom.set_xlabel("z in m")
-    bottom.legend(loc="upper center")
+    bottom.legend(loc="lower center")
     return figure
 
 

@@ -66,21 +66,21 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
         return stored
     check_points(study, observation.points)
     blocks = blocks_of(study)
-    last = source_number(len(blocks) - 1, 2)
+    dimension = study.dimension
+    last = source_number(study, len(blocks) - 1, dimension - 1)
     fields = solve_sources(study, observation.points, (0, last), workshop)
     check = fields[0]
     exact = study.solver.method == "reaction"
     columns = []
     for number, block in enumerate(blocks):
-        first = source_number(number, 0)
-        field = fields[first:first + 3]  # (3, n, 3): per T of remanence
+        first = source_number(study, number, 0)
+        field = fields[first:first + dimension]  # (dimension, n, 3): per T of remanence
         if exact:
-            field = field + np.moveaxis(unit_field(block, observation.points), 2, 0)
+            field = field + np.moveaxis(unit_field(block, observation.points), 2, 0)[:dimension]
         # B_r = mu_0 mu_r M turns per tesla into per A/m
-        field = field[: study.dimension] * MU_0 * block.recoil_permeability
-        columns.append(observation.apply(field).T)
+        columns.append(observation.apply(field * MU_0 * block.recoil_permeability).T)
     matrix = np.hstack(columns)
-    nominal = np.concatenate([block.magnetization[: study.dimension] for block in blocks])
+    nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     if exact:
         check = check + field_of(blocks, observation.points)
     built = Response(matrix, parameter_names(study), nominal,

@@ -10,6 +10,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata, resources
+from itertools import pairwise
 from pathlib import Path
 
 import jinja2
@@ -17,7 +18,7 @@ import numpy as np
 
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
-from halbach_fe.errors import MeshError, OutputError, StudyError
+from halbach_fe.errors import GetDPError, MeshError, OutputError, StudyError
 from halbach_fe.exact_field import field_of
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
@@ -54,9 +55,9 @@ class Workshop:
     progress: Progress | None = None
 
 
-def source_number(block: int, component: int) -> int:
+def source_number(study: Study, block: int, component: int) -> int:
     """Number of the source '1 T of block ``block`` along axis ``component``', both from 0."""
-    return 3 * block + component + 1
+    return study.dimension * block + component + 1
 
 
 def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
@@ -97,7 +98,7 @@ def solve_sources(
     _check_inside(mesh, points)
     parts = max(1, min(count, workshop.jobs // len(variants)))
     limits = np.linspace(first, last + 1, parts + 1).astype(int)
-    ranges = [(int(a), int(b) - 1) for a, b in zip(limits, limits[1:], strict=False)]
+    ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
     counter = _Counter(count * len(variants), workshop.progress)
     cancel = threading.Event()
     with ThreadPoolExecutor(max(1, workshop.jobs)) as pool:
@@ -167,44 +168,56 @@ def _run(
     study: Study, mesh: VerifiedMesh, points: Floats, sources: tuple[int, int], vacuum: bool,
     workshop: Workshop, counter: _Counter, cancel: threading.Event,
 ) -> Floats:
-    variant = "vacuum" if vacuum else "real"
-    problem = f"magnetostatics_{study.dimension}d.pro"
-    job = Job(
-        problem=problem, mesh=MESH_NAME, resolution="Magnetostatics",
-        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]},
-        outputs=(FLUX_DENSITY_FILE,), unknowns=mesh.unknowns,
-        time_limit_s=workshop.time_limit_s)
-    with _run_folder(workshop.folder, f"getdp-{variant}") as folder:
-        for name in (problem, *PROBLEM_INCLUDES):
-            text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
-            (folder / name).write_bytes(text)
-        (folder / "case.pro").write_text(render_case(study, mesh, points), encoding="utf-8")
-        shutil.copyfile(mesh.path, folder / MESH_NAME)
+    name = f"getdp-{'vacuum' if vacuum else 'real'}" + (f"-{sources[0]}" if sources[0] > 1 else "")
+    with _run_folder(workshop.folder, name, cancel) as folder:
+        job = stage(study, mesh, points, folder, sources, vacuum, workshop.time_limit_s)
         runner.run(workshop.getdp, job, folder, counter.line, cancel)
         return runner.read_flux_density(folder / FLUX_DENSITY_FILE, points,
                                         sources[1] - sources[0] + 1)
 
 
+def stage(
+    study: Study, mesh: VerifiedMesh, points: Floats, folder: Path,
+    sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE), vacuum: bool = False,
+    time_limit_s: float = 3600.0,
+) -> Job:
+    """Fill a run folder with everything that GetDP needs, and return the job to run there."""
+    problem = f"magnetostatics_{study.dimension}d.pro"
+    for name in (problem, *PROBLEM_INCLUDES):
+        text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
+        (folder / name).write_bytes(text)
+    (folder / "case.pro").write_text(render_case(study, mesh, points), encoding="utf-8")
+    shutil.copyfile(mesh.path, folder / MESH_NAME)
+    return Job(
+        problem=problem, mesh=MESH_NAME, resolution="Magnetostatics",
+        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]},
+        outputs=(FLUX_DENSITY_FILE,), unknowns=mesh.unknowns, time_limit_s=time_limit_s)
+
+
 @contextmanager
-def _run_folder(parent: Path, name: str) -> Iterator[Path]:
-    """A private folder; kept under ``name`` when the run succeeds or GetDP fails (with its log),
-    and never left half-made.
+def _run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Path]:
+    """A private folder, kept as ``name`` after a good run and as ``name-failed`` (with the log)
+    after a bad one; anything else that ends the run leaves nothing.
     """
     folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=_make(parent)))
     try:
         yield folder
+        _replace(folder, parent / name)
+    except GetDPError as error:
+        if cancel.is_set():
+            raise
+        kept = parent / f"{name}-failed"
+        _replace(folder, kept)
+        raise GetDPError(str(error).replace(str(folder), str(kept))) from None
     except OSError as error:
-        raise OutputError(f"Cannot write into {folder}: {error.strerror}.") from None
+        raise OutputError(f"Cannot write into {parent}: {error.strerror}.") from None
     finally:
-        kept = parent / name
-        try:
-            if (folder / "getdp.log").is_file():
-                shutil.rmtree(kept, ignore_errors=True)
-                folder.rename(kept)
-            else:
-                shutil.rmtree(folder, ignore_errors=True)
-        except OSError:
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replace(folder: Path, kept: Path) -> None:
+    shutil.rmtree(kept, ignore_errors=True)
+    folder.rename(kept)
 
 
 def _make(folder: Path) -> Path:

@@ -30,6 +30,9 @@ from halbach_fe.response import Response, response
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
 
+ALL_READINGS = "all"
+"""The one region of a study without noise regions."""
+
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
 
@@ -80,9 +83,11 @@ class Update:
     @property
     def scores(self) -> tuple[RegionScore, ...]:
         """Scores by region, training and held-out readings apart."""
+        noise = self.study.noise
+        names = [region.name for region in noise.regions] if noise else [ALL_READINGS]
         return tuple(
             self._score(region, part, chosen)
-            for region in dict.fromkeys(self.regions)
+            for region in dict.fromkeys(names)
             for part, mask in (("training", ~self.held_out), ("held out", self.held_out))
             if (chosen := mask & (np.array(self.regions) == region)).any())
 
@@ -145,7 +150,7 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
             "readings", "map", "enough for the study to leave some for the update",
             f"{len(keep)}, all held out", "Change inference.held_out."))
     if study.noise is None:
-        regions = ("all",) * len(observation)
+        regions = (ALL_READINGS,) * len(observation)
     else:
         names = [region.name for region in study.noise.regions]
         regions = tuple(names[i] for i in noise_regions(study.noise,

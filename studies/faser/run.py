@@ -14,8 +14,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-
 from halbach_fe.cli import common
+
 from halbach_fe.errors import HalbachError
 from halbach_fe.field_map import field_map, read_map, write_map
 from halbach_fe.report import Published, score_table, write_report
@@ -52,6 +52,8 @@ def main() -> int:
     parser.set_defaults(study=HERE / "study.toml")
     parser.add_argument("-o", "--output", type=Path, default=Path("results/faser"))
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--z-step-m", type=float, default=Z_STEP_M,
+                        help="assumed distance of the readings (default: %(default)g m)")
     parser.add_argument("--time-limit", type=float, default=3600.0)
     common.add_getdp_argument(parser)
     arguments = parser.parse_args()

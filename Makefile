@@ -1,0 +1,31 @@
+# make demo     the main job: the FASER dipole, before and after its measurement
+# make test     all tests
+# Both set up everything they need first (tools/setup.sh).
+
+.PHONY: demo test lint wheel-check setup setup-test clean
+
+demo: setup
+	.venv/bin/python studies/faser/run.py -o results/faser
+
+test: setup-test
+	.venv/bin/python -m pytest
+
+lint: setup-test
+	.venv/bin/ruff check .
+	@# mypy follows folders, not the package-dir mapping: show it the installed layout
+	rm -rf build/typed && mkdir -p build/typed && cp -rs "$(CURDIR)/halbach_fe" build/typed/
+	for room in geo pro cli; do ln -s "$(CURDIR)/$$room" build/typed/halbach_fe/$$room; done
+	cd build/typed && ../../.venv/bin/mypy --config-file ../../pyproject.toml -p halbach_fe
+
+# The wheel, alone in a clean environment outside the checkout, solves a study.
+wheel-check: setup
+	tools/check_wheel.sh
+
+setup:
+	tools/setup.sh
+
+setup-test:
+	tools/setup.sh test
+
+clean:
+	rm -rf .venv build dist results *.egg-info

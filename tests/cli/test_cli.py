@@ -1,0 +1,250 @@
+"""The command line as a user meets it: results, messages, exit codes, interruptions."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from halbach_fe.cli import main, parser
+
+from halbach_fe.errors import EXIT_CODES
+from halbach_fe.field_map import field_map, read_map, write_map
+from halbach_fe.study import Study
+from tests.conftest import ROOT, circle
+
+STUDY = """
+name = "cli"
+dimension = 2
+[array]
+blocks_per_ring = 8
+inner_radius_m = 0.05
+outer_radius_m = 0.09
+remanence_T = 1.0
+recoil_permeability = 1.05
+[array.block]
+shape = "sector"
+[mesh]
+block_size_m = 0.02
+[observation]
+quantity = "flux_density"
+components = ["x", "y"]
+[observation.positions]
+kind = "circles"
+radius_m = 0.03
+angles = 10
+[[noise.regions]]
+name = "bore"
+sigma_T = 1e-4
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+@pytest.fixture
+def measured(tmp_path):
+    path = tmp_path / "map.csv"
+    points = circle(0.03, 10)
+    write_map(field_map(points, np.tile([0.55, 0.0, np.nan], (10, 1))), path)
+    return path
+
+
+def test_solve_writes_maps(study, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["solve", str(study), "-o", str(out), "--json"]) == 0
+    shown = capsys.readouterr()
+    summary = json.loads(shown.out)
+    assert shown.err == ""
+    names = {path.name for path in out.iterdir()}
+    assert {"field_map.h5", "field_map.csv", "field_map.vtu", "readings.csv"} <= names
+    data = read_map(out / "field_map.h5")
+    np.testing.assert_array_equal(data["B_T"], read_map(out / "field_map.csv")["B_T"])
+    assert data.attrs["study"] == "cli"
+    assert summary["points"] == 10
+    assert summary["max_B_T"] == pytest.approx(0.55, abs=0.05)
+    assert not [name for name in names if name.startswith(".")]
+    # the run folder can be run by hand
+    done = subprocess.run(["getdp", "magnetostatics_2d.pro", "-msh", "mesh.msh", "-solve",
+                           "Magnetostatics"], cwd=out / "getdp-real", capture_output=True,
+                          check=False)
+    assert done.returncode == 0
+
+
+def test_infer_writes_everything(study, measured, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["infer", str(study), "--measurements", str(measured), "-o", str(out)]
+    assert main(arguments) == 0
+    shown = capsys.readouterr()
+    assert "posterior" in shown.out
+    assert "Report:" in shown.err
+    assert {"posterior.h5", "prediction.csv", "summary.json", "report.html", "profile.png",
+            "response.h5"} <= {path.name for path in out.iterdir()}
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["parameters"] == 16
+
+
+def test_schema_is_that_of_the_model(capsys):
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == Study.model_json_schema()
+
+
+def test_doctor(capsys):
+    assert main(["doctor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert 0 < found["errors"]["reaction"] < found["errors"]["direct"]
+
+
+def test_doctor_can_fail(monkeypatch, capsys):
+    monkeypatch.setattr("halbach_fe.cli.doctor.TOLERANCE", {"reaction": 1e-9})
+    assert main(["doctor"]) == 9
+    assert "differs from the closed form" in capsys.readouterr().err
+
+
+def test_module_and_version_run():
+    done = subprocess.run([sys.executable, "-m", "halbach_fe", "--version"], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout.strip()
+
+
+def refused(arguments, capsys):
+    code = main([str(argument) for argument in arguments])
+    shown = capsys.readouterr()
+    assert shown.err.startswith("error: ")
+    assert len(shown.err.strip().splitlines()) == 1
+    assert "Traceback" not in shown.err
+    return code, shown.err
+
+
+@pytest.mark.parametrize(("edit", "code", "said"), [
+    (("inner_radius_m = 0.05", "inner_radius_m = 50"), 3, "millimetres"),
+    (("inner_radius_m", "inner_radius"), 3, "Did you mean"),
+    (("outer_radius_m = 0.09", "outer_radius_m = 0.04"), 3, "larger than inner_radius_m"),
+    (("radius_m = 0.03", "radius_m = 0.07"), 3, "inside magnet or iron"),
+    (("radius_m = 0.03", "radius_m = 5.0"), 5, "meshed region"),
+])
+def test_bad_studies(study, tmp_path, capsys, edit, code, said):
+    study.write_text(STUDY.replace(*edit))
+    out = tmp_path / "out"
+    found, sentence = refused(["solve", study, "-o", out], capsys)
+    assert found == code
+    assert said in sentence
+    assert not list(out.glob("field_map*"))
+
+
+def test_bad_maps(study, measured, tmp_path, capsys):
+    out = tmp_path / "out"
+    measured.write_text(measured.read_text().replace("0.55", "nan", 1))
+    code, sentence = refused(["infer", study, "--measurements", measured, "-o", out], capsys)
+    assert (code, out.exists()) == (4, False)
+    assert "finite number" in sentence
+
+
+def test_no_getdp(study, tmp_path, capsys):
+    code, sentence = refused(["solve", study, "-o", tmp_path / "out", "--getdp", "/nowhere"],
+                             capsys)
+    assert code == 6
+    assert "apt-get install getdp" in sentence
+
+
+def fake_getdp(tmp_path, body):
+    path = tmp_path / "fake-getdp"
+    path.write_text("#!/bin/sh\nif [ \"$1\" = -info ]; then\n"
+                    f"echo 'Version          : 3.2.0'; exit 0\nfi\n{body}\n")
+    path.chmod(0o755)
+    return path
+
+
+@pytest.mark.parametrize(("body", "said"), [
+    ("kill -SEGV $$", "SIGSEGV"),
+    ("sleep 60", "time limit"),
+    ("echo 'Info : System 1/1: 10 Dofs'; echo 0 > flux_density.txt", "unknowns"),
+    ("echo 'Error   : No space left on device'; exit 1", "disk is full"),
+])
+def test_getdp_that_fails(study, tmp_path, capsys, body, said):
+    out = tmp_path / "out"
+    code, sentence = refused(["solve", study, "-o", out, "--time-limit", 1, "--getdp",
+                              fake_getdp(tmp_path, body)], capsys)
+    assert code == 7
+    assert said in sentence
+    assert not list(out.glob("field_map*"))
+    log = sentence.split("Its log is ")[1].strip().rstrip(".")
+    assert os.path.isfile(log), "the log that the message names must exist"
+
+
+def test_output_that_cannot_be_written(study, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    code, sentence = refused(["solve", study, "-o", tmp_path / "file" / "out"], capsys)
+    assert code == 8
+    assert "Cannot" in sentence
+
+
+@pytest.fixture
+def small_disk(tmp_path, request):
+    """A file system of a few kilobytes, where the test may mount one."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={request.param}k", "tmpfs",
+                              str(path)], capture_output=True, check=False)
+    if mounted.returncode:
+        pytest.skip("mounting a small file system needs root")
+    yield path
+    subprocess.run(["umount", str(path)], check=True)
+
+
+@pytest.mark.parametrize("small_disk", [16, 64, 128, 256], indirect=True)
+def test_full_disk(study, small_disk, capsys):
+    """Whoever meets the end of the disk first (mesh, run folder, GetDP, results): one sentence,
+    and no result half-written.
+    """
+    code, sentence = refused(["solve", study, "-o", small_disk / "out"], capsys)
+    assert code in (5, 7, 8)
+    assert "No space left" in sentence or "disk is full" in sentence
+    for path in small_disk.rglob("field_map.[ch]*"):
+        assert read_map(path).sizes["point"] == 10
+    assert not list(small_disk.rglob(".*.tmp*"))
+    assert not list(small_disk.rglob(".field_map*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_ends_getdp_too(study, tmp_path, number):
+    out = tmp_path / "out"
+    marker = tmp_path / "pid"
+    fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(out), "--getdp",
+         str(fake)], stderr=subprocess.PIPE, text=True)
+    while not (marker.exists() and marker.read_text().strip()):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert said.strip().endswith("interrupted")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(marker.read_text()), 0)
+    assert not list(out.glob("field_map*"))
+
+
+def test_every_exit_code_is_documented():
+    text = parser().format_help()
+    readme = (ROOT / "README.md").read_text()
+    for code, meaning in EXIT_CODES.items():
+        assert f"{code:3d}  {meaning}" in text
+        assert f"| {code} | {meaning} |" in readme
+
+
+def test_a_bug_is_called_a_bug(study, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("halbach_fe.cli.solve.points_from", lambda _: 1 / 0)
+    assert main(["solve", str(study), "-o", str(tmp_path / "out")]) == 1
+    assert "please report it" in capsys.readouterr().err

@@ -1,0 +1,83 @@
+"""Fixtures: GetDP, and small studies that solve in about a second."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from halbach_fe.getdp import GetDP, find_getdp
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study, parse_study
+
+ROOT = Path(__file__).parent.parent
+
+# A dipole of FASER's cross-section; sizes coarse enough for tests.
+DIPOLE: dict[str, Any] = {
+    "name": "dipole",
+    "dimension": 2,
+    "array": {
+        "blocks_per_ring": 16, "rings": 1, "inner_radius_m": 0.104, "outer_radius_m": 0.1865,
+        "first_block_angle_deg": 90.0, "first_magnetization_angle_deg": 180.0,
+        "remanence_T": 1.06, "recoil_permeability": 1.05, "block": {"shape": "sector"},
+    },
+    "mesh": {"block_size_m": 0.02},
+    "observation": {
+        "quantity": "flux_density",
+        "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24},
+    },
+}
+
+StudyMaker = Callable[..., Study]
+
+
+def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A copy with some keys changed; ``array__rings=2`` goes one level down."""
+    result = copy.deepcopy(document)
+    for key, value in changes.items():
+        *path, last = key.split("__")
+        table = result
+        for part in path:
+            table = table.setdefault(part, {})
+        table[last] = value
+    return result
+
+
+@pytest.fixture
+def dipole() -> StudyMaker:
+    """Make the 2D dipole study, with changes."""
+    return lambda **changes: parse_study(changed(DIPOLE, **changes))
+
+
+@pytest.fixture
+def short_dipole() -> StudyMaker:
+    """Make a 3D dipole of two rings, with changes."""
+    base = changed(DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,
+                   mesh={"block_size_m": 0.03, "layers_per_ring": 2, "growth": 2.0})
+    return lambda **changes: parse_study(changed(base, **changes))
+
+
+@pytest.fixture(scope="session")
+def getdp() -> GetDP:
+    """GetDP is a requirement of the tests, not an option."""
+    return find_getdp()
+
+
+@pytest.fixture
+def workshop(getdp: GetDP, tmp_path: Path) -> Workshop:
+    return Workshop(getdp, tmp_path / "work", jobs=2)
+
+
+@pytest.fixture
+def generator() -> np.random.Generator:
+    return np.random.default_rng(20231)
+
+
+def circle(radius: float, count: int = 24, z: float = 0.0, start: float = 0.03) -> np.ndarray:
+    """Points (count, 3) on a circle; ``start`` in rad keeps them off lines of symmetry."""
+    angle = start + 2 * np.pi * np.arange(count) / count
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)])

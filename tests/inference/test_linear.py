@@ -1,0 +1,138 @@
+"""The closed-form posterior against hand-worked numbers, the textbook formula, and sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.errors import StudyError
+from halbach_fe.inference.linear import chi2_per_reading, posterior, predict
+from halbach_fe.inference.prior import Gaussian, block_prior
+
+
+def textbook(matrix, readings, sigma, prior):
+    """C_1 = (H' S^-1 H + C_0^-1)^-1 and its mean, as printed; sound only for tame numbers."""
+    weight = matrix.T / sigma**2
+    precision = np.linalg.inv(prior.covariance)
+    covariance = np.linalg.inv(weight @ matrix + precision)
+    return covariance @ (weight @ readings + precision @ prior.mean), covariance
+
+
+def problem(generator, n=12, m=5):
+    root = np.eye(m) + 0.2 * generator.standard_normal((m, m))
+    prior = Gaussian(generator.standard_normal(m), root)
+    matrix, sigma = generator.standard_normal((n, m)), generator.uniform(0.1, 0.5, n)
+    return matrix, generator.standard_normal(n), sigma, prior
+
+
+def test_one_reading_of_one_parameter():
+    """Prior 1 +- 2, reading 5 +- 1 of it: mean (1/4 + 5)/(1/4 + 1), variance 1/(1/4 + 1)."""
+    found = posterior(np.array([[1.0]]), np.array([5.0]), np.array([1.0]),
+                      Gaussian(np.array([1.0]), np.array([[2.0]])))
+    assert found.mean == pytest.approx([5.25 / 1.25])
+    assert found.sd == pytest.approx([1 / np.sqrt(1.25)])
+
+
+@pytest.mark.parametrize(("n", "m"), [(12, 5), (3, 8), (1, 1)])
+def test_against_the_textbook_formula(generator, n, m):
+    case = problem(generator, n, m)
+    mean, covariance = textbook(*case)
+    found = posterior(*case)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8, atol=1e-12)
+
+
+def test_against_brute_force_sampling(generator):
+    """Weights of 400 000 prior draws; 3 of 4 readings are vague, so that some draws count."""
+    matrix, readings, _, prior = problem(generator, 4, 2)
+    sigma = np.array([1.0, 2.0, 2.0, 2.0])
+    draws = prior.sample(400_000, generator)
+    weight = np.exp(-0.5 * np.sum(((draws @ matrix.T - readings) / sigma) ** 2, axis=1))
+    weight /= weight.sum()
+    mean = weight @ draws
+    spread = np.sqrt(weight @ (draws - mean) ** 2)
+    effective = 1 / np.sum(weight**2)
+    found = posterior(matrix, readings, sigma, prior)
+    assert effective > 10_000
+    assert np.all(np.abs(mean - found.mean) < 5 * found.sd / np.sqrt(effective))
+    assert spread == pytest.approx(found.sd, rel=5 / np.sqrt(effective))
+
+
+def test_sound_where_the_textbook_formula_breaks(generator):
+    """Two readings that differ by 1e-7: the normal equations square that and lose the
+    difference in rounding, the QR keeps half of the digits.
+    """
+    prior = Gaussian(np.zeros(2), np.eye(2))
+    matrix = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]])
+    truth = np.array([0.3, -0.2])
+    found = posterior(matrix, matrix @ truth, np.full(2, 1e-12), prior)
+    np.testing.assert_allclose(found.mean, truth, atol=1e-5)
+    wrong, _ = textbook(matrix, matrix @ truth, np.full(2, 1e-12), prior)
+    assert np.abs(wrong - truth).max() > 1e-5
+
+
+def test_singular_prior_is_respected(generator):
+    """A common mode alone: the posterior stays on its line."""
+    nominal = np.array([1.0, 0.0, 0.0, 2.0])
+    prior = Gaussian(nominal, 0.1 * nominal[:, None])
+    found = posterior(generator.standard_normal((3, 4)), generator.standard_normal(3),
+                      np.ones(3), prior)
+    assert found.root.shape == (4, 1)
+    assert np.linalg.matrix_rank(np.column_stack([found.mean, nominal]), tol=1e-9) == 1
+
+
+def test_uninformative_data_leave_the_prior(generator):
+    matrix, readings, sigma, prior = problem(generator)
+    found = posterior(matrix, readings, sigma * 1e9, prior)
+    np.testing.assert_allclose(found.mean, prior.mean, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, prior.covariance, atol=1e-6)
+
+
+def test_calibration_over_many_truths(generator):
+    """Truth drawn from the prior: z-scores are standard normal. Twice too small an error bar is
+    seen by the same figure.
+    """
+    matrix, _, sigma, prior = problem(generator)
+    scores = []
+    for truth in prior.sample(2000, generator):
+        readings = matrix @ truth + sigma * generator.standard_normal(len(sigma))
+        found = posterior(matrix, readings, sigma, prior)
+        scores.append((truth - found.mean) / found.sd)
+    rms = np.sqrt(np.mean(np.square(scores)))
+    # 10 000 correlated values: at least 2000 effective, 1.6 % in the rms; 0.07 is over 4 sigma
+    assert rms == pytest.approx(1.0, abs=0.07)
+    assert 2 * rms != pytest.approx(1.0, abs=0.07)
+
+
+def test_prediction_and_chi2(generator):
+    matrix, _, sigma, prior = problem(generator, 400, 5)
+    mean, sd = predict(matrix, prior)
+    draws = prior.sample(20_000, generator) @ matrix.T
+    np.testing.assert_allclose(sd, draws.std(axis=0), rtol=0.05)
+    np.testing.assert_allclose(mean, matrix @ prior.mean)
+    certain = Gaussian(prior.mean, np.zeros((5, 1)))
+    readings = mean + sigma * generator.standard_normal(400)
+    # sd of chi2/n over 400 readings is 0.07
+    assert chi2_per_reading(matrix, readings, sigma, certain) == pytest.approx(1.0, abs=0.3)
+    assert chi2_per_reading(matrix, readings + 3 * sigma, sigma, certain) > 3
+
+
+def test_block_prior_along_and_across(generator):
+    nominal = np.array([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])
+    prior = block_prior(nominal, 3, magnitude_sd=0.01, direction_sd_deg=1.0, common_mode_sd=0.02)
+    covariance = prior.covariance
+    along = np.array([0.6, 0.8, 0.0])
+    block = covariance[:3, :3]
+    assert along @ block @ along == pytest.approx(25 * (0.01**2 + 0.02**2))
+    across = np.array([0.0, 0.0, 1.0])
+    assert across @ block @ across == pytest.approx(25 * np.radians(1.0) ** 2)
+    assert along @ block @ across == pytest.approx(0, abs=1e-15)
+    # the common mode correlates the magnitudes of different blocks
+    assert along @ covariance[:3, 5] == pytest.approx(5 * 2 * 0.02**2)
+    alone = block_prior(nominal, 3, 0.01, 1.0)
+    assert alone.covariance[:3, 3:] == pytest.approx(0)
+
+
+def test_a_block_without_magnetization_is_refused():
+    with pytest.raises(StudyError, match="must not vanish"):
+        block_prior(np.zeros(3), 3, 0.01, 1.0)

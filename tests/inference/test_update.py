@@ -1,0 +1,137 @@
+"""The whole way: synthetic maps from independent models, updated, and predicted where held out."""
+
+from __future__ import annotations
+
+import json
+
+import magpylib
+import numpy as np
+import pytest
+import xarray as xr
+
+from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
+from halbach_fe.blocks import blocks_of, position_angle_deg
+from halbach_fe.errors import MeasurementError, StudyError
+from halbach_fe.field_map import field_map
+from halbach_fe.report import write_report
+from halbach_fe.study import MU_0
+from halbach_fe.update import infer, write_update
+from tests.conftest import circle
+
+NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-5}]}
+IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
+
+
+def iron_campaign(dipole, generator, noise=1e-5):
+    """A 2D map of a dipole with permeability and iron whose blocks are off, in closed form."""
+    study = dipole(iron_ring=IRON, noise=NOISE, mesh__block_size_m=0.01,
+                   inference={"held_out": {"every": 2}},
+                   observation__components=["x", "y"])
+    change = 0.01 * (generator.standard_normal(16) + 1j * generator.standard_normal(16))
+    sectors = [Sector(s.middle, s.half_width, s.remanence * (1 + d)) for s, d in
+               zip(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), change, strict=True)]
+    remanence = np.array([s.remanence for s in sectors])
+    truth = np.column_stack([remanence.real, remanence.imag]).ravel() / (MU_0 * 1.05)
+    points = np.vstack([circle(0.075, 60), circle(0.05, 60)])
+    exact = layered_bore_field(sectors, 0.104, 0.1865, 1.05, points[:, :2], (0.19, 0.2, 1000.0))
+    field = np.column_stack([exact, np.full(len(points), np.nan)])
+    field[:, :2] += noise * generator.standard_normal((len(points), 2))
+    return study, field_map(points, field), truth
+
+
+def test_permeable_dipole_with_iron_is_learnt(dipole, generator, workshop):
+    """Truth by closed form, model by finite elements: error falls, error bars hold."""
+    study, data, truth = iron_campaign(dipole, generator)
+    # hold out the inner circle by giving it another scan height is not possible in 2D: all train
+    update = infer(study.model_copy(update={"inference": study.inference.model_copy(
+        update={"held_out": None})}), data, workshop)
+    before = np.abs(update.prior.mean - truth)
+    after = np.abs(update.posterior.mean - truth)
+    assert np.median(after) < 0.5 * np.median(before)
+    score = (update.posterior.mean - truth) / update.posterior.sd
+    # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    (region,) = update.scores
+    assert region.chi2_posterior == pytest.approx(1.0, abs=0.4)  # 240 readings: sd 0.09
+    assert region.median_relative_error_posterior < 0.1 * region.median_relative_error_prior
+
+
+def test_a_model_without_the_iron_does_not_fit(dipole, generator, workshop):
+    """Negative control: the same map, the iron left out, is not described."""
+    study, data, _ = iron_campaign(dipole, generator)
+    update = infer(dipole(noise=NOISE, mesh__block_size_m=0.01,
+                          observation__components=["x", "y"]), data, workshop)
+    assert study.iron_ring is not None
+    score = update.scores[0]
+    assert score.chi2_posterior > 1.5 or np.abs(
+        update.posterior.mean / update.prior.mean - 1).max() > 0.05
+
+
+def magpylib_campaign(short_dipole, generator):
+    """A 3D map by magpylib, three components at random points, z windows held out."""
+    study = short_dipole(array__recoil_permeability=1.0, noise=NOISE,
+                         inference={"held_out": {"every": 3, "window": 5}})
+    points = np.vstack([circle(0.08, 16, z, 0.1 * z) for z in np.linspace(-0.16, 0.16, 30)])
+    field = np.zeros_like(points)
+    truth = []
+    for block in blocks_of(study):
+        middle = position_angle_deg(study.array, block.slot)
+        polarization = np.array(block.easy_axis) * block.remanence
+        polarization = polarization + 0.01 * block.remanence * generator.standard_normal(3)
+        truth.append(polarization / MU_0)
+        field += magpylib.magnet.CylinderSegment(
+            dimension=(0.104, 0.1865, 0.08, middle - 11.25, middle + 11.25),
+            position=(0, 0, (block.z_min + block.z_max) / 2), polarization=polarization,
+        ).getB(points)
+    field += 1e-5 * generator.standard_normal(field.shape)
+    return study, field_map(points, field), np.concatenate(truth)
+
+
+def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, generator, workshop,
+                                                             tmp_path):
+    study, data, truth = magpylib_campaign(short_dipole, generator)
+    update = infer(study, data, workshop)
+    score = (update.posterior.mean - truth) / update.posterior.sd
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.3)  # 96 values: sd 0.07
+    training, unseen = update.scores
+    assert unseen.part == "held out"
+    assert unseen.readings == 480
+    # Predicted within bands: 480 readings of 95 %: sd 1 %
+    assert unseen.coverage95_posterior == pytest.approx(0.95, abs=0.04)
+    assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.3)  # sd 0.065
+    assert unseen.median_relative_error_posterior < 0.1 * unseen.median_relative_error_prior
+    assert training.chi2_posterior < 1.2
+
+    write_update(update, tmp_path)
+    write_report(update, tmp_path)
+    with xr.open_dataset(tmp_path / "posterior.h5", engine="h5netcdf") as stored:
+        np.testing.assert_allclose(stored["posterior_mean"], update.posterior.mean)
+        np.testing.assert_allclose(np.sqrt(np.diag(stored["posterior_covariance"])),
+                                   stored["posterior_sd"])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["scores"][1]["readings"] == 480
+    assert len((tmp_path / "prediction.csv").read_text().splitlines()) == 1 + len(update.readings)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img alt=") == 3
+    assert "http" not in page.split("data:image")[0]
+    assert "disagree" not in page
+
+
+def test_report_says_when_the_model_does_not_fit(short_dipole, generator, workshop, tmp_path):
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    data["B_T"].values[:, 2] += 1e-3  # an offset of the z sensor: no magnet makes it
+    update = infer(study, data, workshop)
+    write_report(update, tmp_path)
+    assert "Model and measurement disagree" in (tmp_path / "report.html").read_text()
+
+
+def test_maps_that_do_not_fit_the_study(short_dipole, dipole, workshop):
+    study = short_dipole(noise=NOISE)
+    inside = field_map(np.array([[0, 0, 0], [0.15, 0, 0.04]]), np.ones((2, 3)))
+    with pytest.raises(MeasurementError, match=r"reading 2 of map must be at a point in air"):
+        infer(study, inside, workshop)
+    sloped = field_map(np.array([[0, 0, 0], [0, 0, 0.1]]), np.ones((2, 3)))
+    with pytest.raises(MeasurementError, match="one plane for a 2D study"):
+        infer(dipole(noise=NOISE), sloped, workshop)
+    with pytest.raises(StudyError, match="how noisy"):
+        infer(short_dipole(), field_map(np.zeros((1, 3)), np.ones((1, 3))), workshop)

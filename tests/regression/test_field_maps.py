@@ -1,0 +1,44 @@
+"""Stored field maps, recomputed; and the proof that a changed model would be noticed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.field_map import read_map
+from halbach_fe.solve import solve_nominal
+from halbach_fe.study import parse_study
+from tests.conftest import changed
+from tests.regression.cases import CASES, FOLDER, TOLERANCE, difference, points_of_case
+
+
+def stored(name):
+    return read_map(FOLDER / f"{name}.h5")["B_T"].values
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_map_is_unchanged(name, workshop):
+    study = CASES[name]
+    found = solve_nominal(study, points_of_case(study), workshop)
+    assert difference(found, stored(name)) < TOLERANCE[study.solver.method]
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("change", [
+    {"array__remanence_T": 1.06 * 1.03}, {"array__first_magnetization_angle_deg": 183.0},
+    {"array__recoil_permeability": 1.15}, {"array__inner_radius_m": 0.108},
+    {"iron_ring__outer_radius_m": 0.21, "array__multipole_order": 2}])
+def test_a_perturbed_model_fails(name, change, workshop):
+    document = CASES[name].model_dump(exclude_none=True)
+    study = parse_study(changed(document, **change))
+    found = solve_nominal(study, points_of_case(study), workshop)
+    assert difference(found, stored(name)) > TOLERANCE[study.solver.method]
+
+
+def test_the_comparison_itself_can_fail():
+    field = stored("dipole_3d_reaction")
+    assert difference(field, field) == 0
+    assert difference(-field, field) > 1
+    assert difference(field[:, [1, 0, 2]], field) > 0.5
+    assert difference(np.where(field == field.max(), np.nan, field), field) == np.inf
+    assert difference(field[:-1], field) == np.inf

@@ -1,0 +1,101 @@
+"""Readings: selections, Fourier coefficients, noise, held-out patterns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.errors import MeasurementError, StudyError
+from halbach_fe.field_map import field_map
+from halbach_fe.observation import held_out, observe, points_from, standard_deviations
+from tests.conftest import circle
+
+FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
+           "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}}
+
+
+def multipole_field(points, n, normal, skew):
+    """B_r = (normal cos n phi + skew sin n phi) and its tangential partner, as (x, y, z)."""
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    radial = normal * np.cos(n * angle) + skew * np.sin(n * angle)
+    tangential = -normal * np.sin(n * angle) + skew * np.cos(n * angle)
+    return np.column_stack([radial * np.cos(angle) - tangential * np.sin(angle),
+                            radial * np.sin(angle) + tangential * np.cos(angle), 0 * angle])
+
+
+@pytest.mark.parametrize("order", [1, 3, 5])
+def test_fourier_coefficients_of_a_pure_multipole(dipole, order, generator):
+    points = circle(0.075)[generator.permutation(24)]  # any order of points
+    observation = observe(dipole(observation=FOURIER), points, np.ones((24, 3), bool))
+    readings = dict(zip(observation.labels, observation.apply(
+        multipole_field(points, order, 0.3, -0.2)), strict=True))
+    expected = dict.fromkeys(observation.labels, 0.0) | {f"A{order}": 0.3, f"B{order}": -0.2}
+    assert readings == pytest.approx(expected, abs=1e-14)
+
+
+def test_fourier_needs_full_circles_of_the_radius(dipole):
+    study = dipole(observation=FOURIER)
+    full = np.ones((24, 3), bool)
+    for points in (circle(0.07), circle(0.075) * [1, 1.01, 1]):
+        with pytest.raises(MeasurementError, match="radius"):
+            observe(study, points, full)
+    with pytest.raises(MeasurementError, match="equally spaced"):
+        observe(study, circle(0.075)[1:], full[1:])
+    with pytest.raises(MeasurementError, match="Bx and By"):
+        observe(study, circle(0.075), full & [True, False, True])
+
+
+def test_flux_density_takes_what_was_measured(dipole):
+    study = dipole(observation__components=["x", "z"])
+    measured = np.array([[True, True, False], [False, True, True]])
+    observation = observe(study, np.eye(3)[:2], measured)
+    assert observation.labels == ("Bx", "Bz")
+    assert observation.apply(np.arange(6.0).reshape(2, 3)).tolist() == [0, 5]
+    with pytest.raises(MeasurementError, match="none of them"):
+        observe(study, np.eye(3)[:1], np.array([[False, True, False]]))
+
+
+def test_noise_by_region_and_from_the_map(dipole):
+    regions = [{"name": "body", "z_min_m": -0.1, "z_max_m": 0.1, "sigma_T": 1e-5},
+               {"name": "rest", "sigma_T": 1e-3}]
+    study = dipole(noise={"regions": regions})
+    points = np.array([[0, 0, 0.0], [0, 0, 0.2]])
+    observation = observe(study, points, np.ones((2, 3), bool))
+    data = field_map(points, np.ones((2, 3)))
+    assert standard_deviations(study, observation, data).tolist() == [1e-5] * 3 + [1e-3] * 3
+    data["sigma_T"] = (("point", "component"), np.full((2, 3), 7e-5))
+    assert standard_deviations(study, observation, data) == pytest.approx(7e-5)
+    with pytest.raises(StudyError, match="cover every reading"):
+        standard_deviations(dipole(noise={"regions": regions[:1]}), observation,
+                            data.drop_vars("sigma_T"))
+    with pytest.raises(StudyError, match="how noisy"):
+        standard_deviations(dipole(), observation, data.drop_vars("sigma_T"))
+
+
+def test_point_noise_propagates_to_fourier_coefficients(dipole, generator):
+    """Against sampling: 4000 draws know a standard deviation to 1.1 %; 5 % is over 4 sigma."""
+    study, points = dipole(observation=FOURIER), circle(0.075)
+    observation = observe(study, points, np.ones((24, 3), bool))
+    data = field_map(points, np.ones((24, 3)), np.full((24, 3), 1e-4))
+    draws = observation.apply(1e-4 * generator.standard_normal((4000, 24, 3)))
+    assert standard_deviations(study, observation, data) == pytest.approx(draws.std(0), rel=0.05)
+
+
+def test_held_out_pattern(dipole):
+    z = np.array([0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.4])
+    every_second = dipole(inference={"held_out": {"every": 2}})
+    assert held_out(every_second, z).tolist() == [False, False, True, False, True, True, False]
+    windows = dipole(inference={"held_out": {"every": 2, "window": 2}})
+    assert held_out(windows, z).tolist() == [False, False, False, True, True, True, False]
+    assert not held_out(dipole(), z).any()
+
+
+def test_positions_expand(dipole):
+    line = dipole(observation__positions={"kind": "line", "start_m": [0, 0, -1],
+                                          "end_m": [0, 0, 1], "count": 3})
+    assert points_from(line.observation.positions).tolist() == [[0, 0, -1], [0, 0, 0], [0, 0, 1]]
+    rings = dipole(observation__positions={"kind": "circles", "radius_m": 0.05, "angles": 4,
+                                           "z_min_m": -0.1, "z_max_m": 0.1, "count": 2})
+    points = points_from(rings.observation.positions)
+    assert points.shape == (8, 3)
+    assert np.hypot(points[:, 0], points[:, 1]) == pytest.approx(0.05)
