@@ -38,6 +38,10 @@ SOLVER_OPTIONS = (
 )
 """The curl-curl matrix is symmetric: Cholesky takes half the memory of LU."""
 
+_ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
+"""Open MPI, which Debian's GetDP is built with, otherwise starts a daemon for every run; it can
+outlive a killed run, and costs 8 s where the machine's own name does not resolve."""
+
 _INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp`), or name it with --getdp or "
             f"{ENVIRONMENT_VARIABLE}.")
 _NAMED_FAILURES = (  # pattern in the log, what it means
@@ -113,7 +117,7 @@ def find_getdp(named: str | Path | None = None) -> GetDP:
         raise GetDPNotFoundError(f"GetDP was not found: `{wanted}` is no executable. {_INSTALL}")
     try:
         answer = subprocess.run([found, "-info"], capture_output=True, text=True, timeout=30,
-                                errors="replace", check=False)
+                                errors="replace", check=False, env=os.environ | _ALONE)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise GetDPNotFoundError(
             f"GetDP at {found} does not answer ({error}). {_INSTALL}") from None
@@ -234,7 +238,8 @@ def _execute(
     on_line: Callable[[str], None] | None, cancel: threading.Event | None,
 ) -> list[str]:
     threads = str(job.threads)
-    environment = os.environ | {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+    environment = os.environ | _ALONE | {
+        "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
     lines: list[str] = []
     try:
         process = subprocess.Popen(
