@@ -25,7 +25,8 @@ fi
 if [ -n "$missing" ]; then
     if ! command -v apt-get >/dev/null 2>&1; then
         echo "This system has no apt-get. Please install by hand, then run again:" >&2
-        echo "  GetDP 3.2 or later with PETSc and MUMPS  (https://getdp.info), on PATH or named by HALBACH_FE_GETDP" >&2
+        echo "  GetDP 3.2 or later with PETSc and MUMPS, from https://getdp.info; then" >&2
+        echo "    export HALBACH_FE_GETDP=/path/to/getdp" >&2
         echo "  Python 3.11 or later with venv" >&2
         exit 1
     fi

@@ -25,8 +25,8 @@ from halbach_fe.update import infer, write_update
 HERE = Path(__file__).parent
 Z_STEP_M = 0.010
 ASSUMPTIONS = (
-    f"The profile is published by index, not by position. Here index i is at z = (i - 78.5) × "
-    f"{1000 * Z_STEP_M:g} mm: that step, and centred on the magnet. Neither is published.",
+    "The profile is published by index, not by position. Here index i is at z = (i - 78.5) × "
+    "{step_mm:g} mm: that step, and centred on the magnet. Neither is published.",
     "The 1.0 m magnet has 12 rings of 83.3 mm; the ring length is inferred.",
     "The nominal moment of 330 A m² per block, as published, gives a bore field some 2 % above "
     "the measured one; the prior allows 5 % for what all blocks share.",
@@ -34,15 +34,15 @@ ASSUMPTIONS = (
 )
 
 
-def profile_to_map(source: Path, target: Path) -> Published:
+def profile_to_map(source: Path, target: Path, z_step: float) -> Published:
     """Write the published profile as a map; return the published relative errors."""
     index, prior, posterior, measured = np.loadtxt(source, delimiter=",", skiprows=1).T
-    z = np.round((index - (len(index) + 1) / 2) * Z_STEP_M, 9)
+    z = np.round((index - (len(index) + 1) / 2) * z_step, 9)
     points = np.column_stack([0 * z, 0 * z, z])
     flux_density = np.full((len(z), 3), np.nan)
     flux_density[:, 0] = measured
     write_map(field_map(points, flux_density, attributes={
-        "source": "Fleig et al. 2023, Fig. 4", "assumed_z_step_m": str(Z_STEP_M)}), target)
+        "source": "Fleig et al. 2023, Fig. 4", "assumed_z_step_m": str(z_step)}), target)
     return Published("paper", z, prior, posterior)
 
 
@@ -59,13 +59,14 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         published = profile_to_map(HERE / "fig4_faser_on_axis.csv",
-                                   arguments.output / "measured.csv")
+                                   arguments.output / "measured.csv", arguments.z_step_m)
         common.say("FASER dipole: 576 unknown magnetizations, 156 readings. This takes minutes.")
         with common.workshop(arguments) as workshop:
             update = infer(read_study(arguments.study), read_map(arguments.output / "measured.csv"),
                            workshop)
         write_update(update, arguments.output)
-        write_report(update, arguments.output, published, ASSUMPTIONS)
+        assumptions = [s.format(step_mm=1000 * arguments.z_step_m) for s in ASSUMPTIONS]
+        write_report(update, arguments.output, published, assumptions)
     except HalbachError as error:
         common.say(f"error: {error}")
         return error.exit_code
