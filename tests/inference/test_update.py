@@ -135,3 +135,21 @@ def test_maps_that_do_not_fit_the_study(short_dipole, dipole, workshop):
         infer(dipole(noise=NOISE), sloped, workshop)
     with pytest.raises(StudyError, match="how noisy"):
         infer(short_dipole(), field_map(np.zeros((1, 3)), np.ones((1, 3))), workshop)
+
+
+def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, workshop):
+    """The paper's q_F: K = 8 harmonics on a circle, noise given for the coefficients."""
+    _, data, _ = iron_campaign(dipole, generator, noise=1e-6)
+    data = data.isel(point=slice(0, 60))  # the circle of 75 mm
+    study = dipole(iron_ring=IRON, mesh__block_size_m=0.01,
+                   noise={"regions": [{"name": "bore", "sigma_T": 2e-6}]},
+                   observation={"quantity": "fourier_coefficients", "harmonics": 8,
+                                "positions": {"kind": "circles", "radius_m": 0.075,
+                                              "angles": 60}})
+    update = infer(study, data, workshop)
+    assert update.observation.labels == tuple(
+        f"{part}{k}" for part in "AB" for k in range(1, 9))
+    before = np.abs(update.readings - update.prediction_prior.mean)
+    after = np.abs(update.readings - update.prediction_posterior.mean)
+    assert before.max() > 1e-3
+    assert after.max() < 1e-5
