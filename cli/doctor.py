@@ -14,7 +14,8 @@ from halbach_fe.cli import common
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
 from halbach_fe.errors import CheckFailedError
 from halbach_fe.getdp import GetDP, find_getdp
-from halbach_fe.solve import Workshop, solve_nominal
+from halbach_fe.routes import solve_nominal
+from halbach_fe.solve import Workshop
 from halbach_fe.study import parse_study
 
 PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "xarray", "pydantic", "jinja2",

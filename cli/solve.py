@@ -15,7 +15,7 @@ from halbach_fe.cli import common
 
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
-from halbach_fe.solve import solve_nominal
+from halbach_fe.routes import solve_nominal
 from halbach_fe.study import read_study
 from halbach_fe.update import write_text
 

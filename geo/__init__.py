@@ -8,5 +8,6 @@ layers along z. Both run by hand::
 
 from halbach_fe.geo.cross_section import mesh_2d
 from halbach_fe.geo.extruded import mesh_3d
+from halbach_fe.geo.meridian import mesh_meridian
 
-__all__ = ["mesh_2d", "mesh_3d"]
+__all__ = ["mesh_2d", "mesh_3d", "mesh_meridian"]

@@ -23,7 +23,7 @@ from halbach_fe.geo.session import gmsh_session, write_mesh
 from numpy.typing import NDArray
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, array_half_length, blocks_of, ring_limits
+from halbach_fe.blocks import Floats, array_half_length, blocks_of, iron_half_length, ring_limits
 from halbach_fe.errors import StudyError
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
@@ -60,9 +60,7 @@ def layers(study: Study) -> Floats:
     dense; then they grow.
     """
     assert study.array.ring_length_m is not None
-    end = array_half_length(study)
-    iron = study.iron_ring
-    iron_end = (iron.length_m / 2 if iron.length_m else end) if iron else end
+    iron_end = iron_half_length(study)
     thickness = study.array.ring_length_m / study.mesh.layers_per_ring
     limits = {limit for ring in ring_limits(study) for limit in ring} | {-iron_end, iron_end}
     # Rounding must not leave slivers between limits that are meant to be equal.
@@ -90,9 +88,8 @@ def _outside_layers(start: float, thickness: float, study: Study) -> list[float]
 
 def half_length(study: Study) -> float:
     """Half the length of the meshed cylinder in m."""
-    end, radius = array_half_length(study), magnet_radius(study)
-    if study.iron_ring is not None and study.iron_ring.length_m:
-        end = max(end, study.iron_ring.length_m / 2)
+    end = max(array_half_length(study), iron_half_length(study))
+    radius = magnet_radius(study)
     default = end + DEFAULT_BOUNDARY_RATIO[study.dimension] * radius
     half = study.open_boundary.half_length_m or default
     if half <= end + 0.2 * radius:
@@ -176,11 +173,8 @@ def _layer_tags(study: Study, region: Ints, z: float) -> Ints:
         if low < z < high:
             block = region >= tags.FIRST_BLOCK_TAG
             result[block] = region[block] + ring * study.array.blocks_per_ring
-    iron = study.iron_ring
-    if iron is not None:
-        half = iron.length_m / 2 if iron.length_m else array_half_length(study)
-        if abs(z) < half:
-            result[region == tags.IRON_TAG] = tags.IRON_TAG
+    if abs(z) < iron_half_length(study):
+        result[region == tags.IRON_TAG] = tags.IRON_TAG
     return result
 
 

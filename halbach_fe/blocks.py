@@ -193,6 +193,14 @@ def array_half_length(study: Study) -> float:
     return ring_limits(study)[-1][1]
 
 
+def iron_half_length(study: Study) -> float:
+    """Half the length of the iron ring in m: its own, or the array's; infinite in 2D."""
+    iron = study.iron_ring
+    if study.dimension == 3 and iron is not None and iron.length_m:
+        return iron.length_m / 2
+    return array_half_length(study)
+
+
 def array_outer_radius(study: Study) -> float:
     """Radius in m of the smallest cylinder around all blocks (corners included)."""
     return max(edge.radius for slot in range(1, study.array.blocks_per_ring + 1)
@@ -207,9 +215,7 @@ def points_in_material(study: Study, points: Floats) -> NDArray[np.bool_]:
     ring = study.iron_ring
     if ring is not None:
         radius = np.hypot(points[:, 0], points[:, 1])
-        half = ring.length_m / 2 if ring.length_m else array_half_length(study)
-        if study.dimension == 2:
-            half = np.inf
+        half = iron_half_length(study)
         inside |= ((radius >= ring.inner_radius_m) & (radius <= ring.outer_radius_m)
                    & (np.abs(points[:, 2]) <= half))
     return inside

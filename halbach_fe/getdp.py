@@ -163,21 +163,21 @@ def run(
     return lines
 
 
-def read_flux_density(path: Path, points: Floats, sources: int) -> Floats:
-    """Read GetDP's SimpleTable of B at points, one block of rows per source, and verify it.
+def read_vectors(path: Path, points: Floats, sources: int) -> Floats:
+    """Read GetDP's SimpleTable of vectors at points, one block of rows per source; verify it.
 
     Parameters
     ----------
     path : Path
-        Rows ``x y z Bx By Bz``.
+        Rows ``x y z`` and three components.
     points : ndarray, shape (n, 3), in m
-        Where B was asked for.
+        Where the vector was asked for.
     sources : int
         How many blocks of rows there must be.
 
     Returns
     -------
-    ndarray, shape (sources, n, 3), in T
+    ndarray, shape (sources, n, 3)
 
     Raises
     ------
@@ -198,15 +198,15 @@ def read_flux_density(path: Path, points: Floats, sources: int) -> Floats:
     scale = max(1e-9, float(np.abs(points).max()))
     if not np.allclose(table[:, :, :3], points, rtol=0, atol=1e-9 * scale):
         raise _failure(f"{path.name} was evaluated at other points than asked for", where)
-    flux_density = table[:, :, 3:]
-    if not np.isfinite(flux_density).all():
+    vectors = table[:, :, 3:]
+    if not np.isfinite(vectors).all():
         raise _failure(f"{path.name} holds values that are not finite", where)
-    zero = np.argwhere(~flux_density.any(axis=2))
+    zero = np.argwhere(~vectors.any(axis=2))
     if len(zero):
         x, y, z = points[zero[0, 1]]
         raise _failure(f"the field at ({x:g}, {y:g}, {z:g}) m is exactly zero, GetDP's sign for a "
                        f"point outside the mesh ({len(zero)} such values)", where)
-    return flux_density
+    return vectors
 
 
 def declared_constants(folder: Path) -> set[str]:

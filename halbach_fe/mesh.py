@@ -20,6 +20,11 @@ from halbach_fe.study import Study
 
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
+MERIDIAN = "meridian"
+"""Prefix of the mesh of the (r, z) half-plane."""
+
+MERIDIAN_ELEMENTS = 8
+"""Default number of elements across the blocks in the (r, z) half-plane."""
 
 # Edges of meshio's cells, by corner.
 _EDGES = {
@@ -50,6 +55,7 @@ class VerifiedMesh:
     regions: Regions
     nodes: int
     unknowns: int
+    axis_nodes: int
     radius: float
     half_length: float
 
@@ -63,6 +69,21 @@ def build_mesh(study: Study, folder: Path) -> MeshFiles:
         files = MeshFiles(folder / MESH_NAME, folder / REGIONS_NAME)
         builder = geo.mesh_2d if study.dimension == 2 else geo.mesh_3d
         builder(study, files.mesh).write(files.regions)
+    except OSError as error:
+        raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
+    return files
+
+
+def build_meridian(study: Study, folder: Path) -> MeshFiles:
+    """Mesh the (r, z) half-plane of a rotationally symmetric study into ``folder``."""
+    from halbach_fe import geo
+
+    files = MeshFiles(folder / f"{MERIDIAN}.msh", folder / f"{MERIDIAN}-regions.json")
+    size = study.mesh.meridian_size_m or (
+        study.array.outer_radius_m - study.array.inner_radius_m) / MERIDIAN_ELEMENTS
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        geo.mesh_meridian(study, size, files.mesh).write(files.regions)
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files
@@ -104,11 +125,17 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
             f"Mesh {files.mesh} lacks its outer boundary (region {regions.outer_boundary}); GetDP "
             "would solve without a boundary condition. Mesh the study again."
         )
+    extent = np.abs(mesh.points).max(axis=0)
+    if regions.axis is not None:  # x is r, y is z
+        radius, half_length = float(extent[0]), float(extent[1])
+    else:
+        radius = float(np.hypot(*mesh.points[:, :2].T).max())
+        half_length = float(extent[2]) if regions.dimension == 3 else np.inf
     return VerifiedMesh(
         path=files.mesh, regions=regions, nodes=len(mesh.points),
         unknowns=_count_unknowns(mesh, physical, regions),
-        radius=float(np.hypot(*mesh.points[:, :2].T).max()),
-        half_length=float(np.abs(mesh.points[:, 2]).max()) if regions.dimension == 3 else np.inf,
+        axis_nodes=_count_axis_nodes(mesh, physical, regions),
+        radius=radius, half_length=half_length,
     )
 
 
@@ -149,6 +176,18 @@ def _count_unknowns(mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regi
              for c, tags in zip(mesh.cells, physical, strict=True) if _DIMENSION[c.type] == 2]
     edges = _count_edges([(c.type, c.data) for c in volume], len(mesh.points))
     return edges - _count_edges(faces, len(mesh.points)) - inner_nodes
+
+
+def _count_axis_nodes(mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions) -> int:
+    """Nodes on the axis and off the outer boundary; 0 where the mesh has no axis."""
+    nodes = {
+        tag: np.unique(np.concatenate([
+            c.data[tags == tag].ravel() for c, tags in zip(mesh.cells, physical, strict=True)
+            if _DIMENSION[c.type] == regions.dimension - 1]))
+        for tag in (regions.axis, regions.outer_boundary) if tag is not None}
+    if regions.axis is None:
+        return 0
+    return len(np.setdiff1d(nodes[regions.axis], nodes[regions.outer_boundary]))
 
 
 def _count_edges(cells: list[tuple[str, np.ndarray]], nodes: int) -> int:

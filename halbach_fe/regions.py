@@ -14,6 +14,7 @@ from halbach_fe.errors import MeshError
 AIR_TAG = 1
 IRON_TAG = 2
 OUTER_BOUNDARY_TAG = 10
+AXIS_TAG = 11
 FIRST_BLOCK_TAG = 1001
 
 
@@ -36,6 +37,7 @@ class Regions(BaseModel):
     air: int
     iron: int | None
     outer_boundary: int
+    axis: int | None = None
     blocks: tuple[BlockRegion, ...]
 
     @property

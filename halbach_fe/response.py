@@ -21,7 +21,8 @@ from halbach_fe.errors import GetDPError
 from halbach_fe.exact_field import field_of, unit_field
 from halbach_fe.field_map import atomic
 from halbach_fe.observation import Observation
-from halbach_fe.solve import Workshop, check_points, solve_sources, source_number
+from halbach_fe.routes import check_points, finite_element_part
+from halbach_fe.solve import Workshop, source_number
 from halbach_fe.study import COMPONENTS, MU_0, Study
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -68,7 +69,7 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     blocks = blocks_of(study)
     dimension = study.dimension
     last = source_number(study, len(blocks) - 1, dimension - 1)
-    fields = solve_sources(study, observation.points, (0, last), workshop)
+    fields = finite_element_part(study, observation.points, (0, last), workshop)
     check = fields[0]
     exact = study.solver.method == "reaction"
     columns = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,9 +17,8 @@ import jinja2
 import numpy as np
 
 from halbach_fe import getdp as runner
-from halbach_fe.blocks import Floats, blocks_of, points_in_material
-from halbach_fe.errors import GetDPError, MeshError, OutputError, StudyError
-from halbach_fe.exact_field import field_of
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.errors import GetDPError, MeshError, OutputError
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
 from halbach_fe.study import MU_0, Study
@@ -60,15 +59,6 @@ def source_number(study: Study, block: int, component: int) -> int:
     return study.dimension * block + component + 1
 
 
-def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
-    """Field of the nominal array at points (n, 3) in m, by the study's method; (n, 3) in T."""
-    check_points(study, points)
-    correction = solve_sources(study, points, (NOMINAL_SOURCE, NOMINAL_SOURCE), workshop)[0]
-    if study.solver.method == "direct":
-        return correction
-    return field_of(blocks_of(study), points) + correction
-
-
 def solve_sources(
     study: Study, points: Floats, sources: tuple[int, int], workshop: Workshop
 ) -> Floats:
@@ -90,64 +80,68 @@ def solve_sources(
     """
     first, last = sources
     count = last - first + 1
-    if study.solver.method == "reaction" and not has_reaction(study):
-        return np.zeros((count, len(points), 3))
-    variants = [False] if study.solver.method == "direct" else [False, True]
-    folder = _make(workshop.folder)
+    folder = make_folder(workshop.folder)
     mesh = verify_mesh(build_mesh(study, folder))
-    _check_inside(mesh, points)
+    check_inside(mesh, points)
+    variants = [False] if study.solver.method == "direct" else [False, True]
     parts = max(1, min(count, workshop.jobs // len(variants)))
     limits = np.linspace(first, last + 1, parts + 1).astype(int)
     ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
-    counter = _Counter(count * len(variants), workshop.progress)
-    cancel = threading.Event()
-    with ThreadPoolExecutor(max(1, workshop.jobs)) as pool:
-        tasks = {
-            (vacuum, part): pool.submit(_run, study, mesh, points, part, vacuum, workshop,
-                                        counter, cancel)
-            for vacuum in variants for part in ranges
-        }
-        try:
-            wait(tasks.values(), return_when=FIRST_EXCEPTION)
-            for task in tasks.values():
-                if task.done():
-                    task.result()
-        finally:
-            cancel.set()  # on failure and on Ctrl-C nobody waits for the others
-    fields = [np.concatenate([tasks[vacuum, part].result() for part in ranges])
-              for vacuum in variants]
+    tasks = [_task(study, mesh, points, part, vacuum, workshop)
+             for vacuum in variants for part in ranges]
+    results = run_tasks(tasks, workshop)
+    fields = [np.concatenate(results[i * parts:(i + 1) * parts]) for i in range(len(variants))]
     return fields[0] if len(fields) == 1 else fields[0] - fields[1]
 
 
-def has_reaction(study: Study) -> bool:
-    """Tell whether any material differs from vacuum."""
-    return study.array.recoil_permeability != 1.0 or study.iron_ring is not None
+@dataclass(frozen=True)
+class Task:
+    """One GetDP run: how to fill its folder, how to read its answer, how many solves it makes."""
+
+    name: str
+    stage: Callable[[Path], Job]
+    read: Callable[[Path], Floats]
+    solves: int
 
 
-def check_points(study: Study, points: Floats) -> None:
-    """Refuse points inside magnet or iron, where the field is not what a probe can read."""
-    inside = points_in_material(study, points)
-    if inside.any():
-        x, y, z = points[np.argmax(inside)]
-        raise StudyError(
-            f"Input `observation.positions` of study {study.name} must lie in air; instead "
-            f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
-            f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
+def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
+    """Run GetDP for every task, ``workshop.jobs`` at a time; the first failure ends them all."""
+    counter = _Counter(sum(task.solves for task in tasks), workshop.progress)
+    cancel = threading.Event()
+
+    def run(task: Task) -> Floats:
+        with _run_folder(workshop.folder, task.name, cancel) as folder:
+            job = task.stage(folder)
+            runner.run(workshop.getdp, job, folder, counter.line, cancel)
+            return task.read(folder)
+
+    with ThreadPoolExecutor(max(1, workshop.jobs)) as pool:
+        futures = [pool.submit(run, task) for task in tasks]
+        try:
+            wait(futures, return_when=FIRST_EXCEPTION)
+            for future in futures:
+                if future.done():
+                    future.result()
+            return [future.result() for future in futures]
+        finally:
+            cancel.set()  # on failure and on Ctrl-C nobody waits for the others
+            for future in futures:
+                future.cancel()
 
 
-def render_case(study: Study, mesh: VerifiedMesh, points: Floats) -> str:
-    """The generated part of the problem, as GetDP text."""
-    source = resources.files("halbach_fe.pro").joinpath("case.pro.j2").read_text("utf-8")
+def render(template: str, *, study: Study, **data: object) -> str:
+    """The generated part of a problem, as GetDP text."""
+    source = resources.files("halbach_fe.pro").joinpath(template).read_text("utf-8")
     environment = jinja2.Environment(
         variable_start_string="<<", variable_end_string=">>", block_start_string="<%",
         block_end_string="%>", comment_start_string="<#", comment_end_string="#>",
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
         autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
     return environment.from_string(source).render(
-        study=study, version=metadata.version("halbach-fe"), mu_0=MU_0,
-        blocks=blocks_of(study), points=points.tolist(), regions=mesh.regions,
+        study=study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=blocks_of(study),
         recoil_permeability=study.array.recoil_permeability,
-        iron_permeability=study.iron_ring.relative_permeability if study.iron_ring else 1.0)
+        iron_permeability=study.iron_ring.relative_permeability if study.iron_ring else 1.0,
+        **data)
 
 
 class _Counter:
@@ -164,16 +158,17 @@ class _Counter:
                 self._progress(self._done, self._total)
 
 
-def _run(
+def _task(
     study: Study, mesh: VerifiedMesh, points: Floats, sources: tuple[int, int], vacuum: bool,
-    workshop: Workshop, counter: _Counter, cancel: threading.Event,
-) -> Floats:
-    name = f"getdp-{'vacuum' if vacuum else 'real'}" + (f"-{sources[0]}" if sources[0] > 1 else "")
-    with _run_folder(workshop.folder, name, cancel) as folder:
-        job = stage(study, mesh, points, folder, sources, vacuum, workshop.time_limit_s)
-        runner.run(workshop.getdp, job, folder, counter.line, cancel)
-        return runner.read_flux_density(folder / FLUX_DENSITY_FILE, points,
-                                        sources[1] - sources[0] + 1)
+    workshop: Workshop,
+) -> Task:
+    count = sources[1] - sources[0] + 1
+    return Task(
+        name=f"getdp-{'vacuum' if vacuum else 'real'}" + (f"-{sources[0]}" if sources[0] else ""),
+        stage=lambda folder: stage(study, mesh, points, folder, sources, vacuum,
+                                   workshop.time_limit_s),
+        read=lambda folder: runner.read_vectors(folder / FLUX_DENSITY_FILE, points, count),
+        solves=count)
 
 
 def stage(
@@ -186,7 +181,8 @@ def stage(
     for name in (problem, *PROBLEM_INCLUDES):
         text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
         (folder / name).write_bytes(text)
-    (folder / "case.pro").write_text(render_case(study, mesh, points), encoding="utf-8")
+    (folder / "case.pro").write_text(render("case.pro.j2", study=study, regions=mesh.regions,
+                                            points=points.tolist()), encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
     return Job(
         problem=problem, mesh=MESH_NAME, resolution="Magnetostatics",
@@ -199,7 +195,7 @@ def _run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pa
     """A private folder, kept as ``name`` after a good run and as ``name-failed`` (with the log)
     after a bad one; anything else that ends the run leaves nothing.
     """
-    folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=_make(parent)))
+    folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=make_folder(parent)))
     try:
         yield folder
         _replace(folder, parent / name)
@@ -220,7 +216,7 @@ def _replace(folder: Path, kept: Path) -> None:
     folder.rename(kept)
 
 
-def _make(folder: Path) -> Path:
+def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -228,7 +224,7 @@ def _make(folder: Path) -> Path:
     return folder
 
 
-def _check_inside(mesh: VerifiedMesh, points: Floats) -> None:
+def check_inside(mesh: VerifiedMesh, points: Floats) -> None:
     radius = np.hypot(points[:, 0], points[:, 1])
     outside = (radius > mesh.radius) | (np.abs(points[:, 2]) > mesh.half_length)
     if outside.any():

@@ -130,11 +130,16 @@ class IronRing(_Model):
 
 
 class Mesh(_Model):
-    """Element sizes. In 3D the cross-section is extruded in layers along z."""
+    """Element sizes. In 3D the cross-section is extruded in layers along z.
+
+    ``meridian_size_m`` is that of the (r, z) half-plane, for rotationally symmetric materials
+    (default: an eighth of the blocks' radial thickness).
+    """
 
     block_size_m: Length
     bore_size_m: Length | None = None
     layers_per_ring: Annotated[int, Field(ge=1, le=100)] = 2
+    meridian_size_m: Length | None = None
     growth: Annotated[float, Field(gt=1.0, le=4.0)] = 1.6
 
 
@@ -264,9 +269,14 @@ class Inference(_Model):
 class Solver(_Model):
     """``reaction``: exact field of the blocks plus the finite-element reaction of permeability
     and iron. ``direct``: the finite-element field as it is.
+
+    ``route`` is how a 3D reaction is computed: ``azimuthal_modes``, one (r, z) problem per mode,
+    for rotationally symmetric materials (sectors without gaps); ``edge_elements``, curl-curl in
+    3D, for any geometry; ``auto`` takes the first where it can, and ``direct`` by edge elements.
     """
 
     method: Literal["reaction", "direct"] = "reaction"
+    route: Literal["auto", "azimuthal_modes", "edge_elements"] = "auto"
 
 
 class Study(_Model):

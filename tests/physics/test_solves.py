@@ -11,7 +11,8 @@ from halbach_fe.errors import GetDPError, MeshError, StudyError
 from halbach_fe.exact_field import field_of, unit_field
 from halbach_fe.observation import observe
 from halbach_fe.response import response, verify_superposition
-from halbach_fe.solve import solve_nominal, solve_sources, source_number
+from halbach_fe.routes import solve_nominal
+from halbach_fe.solve import solve_sources, source_number
 from tests.conftest import circle
 
 SECTORS = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)
@@ -189,6 +190,15 @@ def test_stored_response_is_used_only_for_the_same_inputs(dipole, workshop):
     stored.write_bytes(b"damaged")
     np.testing.assert_array_equal(
         response(other, observe(other, points, measured), workshop).matrix, changed.matrix)
+
+
+@pytest.mark.parametrize("route", ["edge_elements", "azimuthal_modes"])
+def test_one_point_alone(short_dipole, workshop, route):
+    """GetDP's interpolation of a table of one line gives nothing; a study of one point works."""
+    study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03)
+    points = in_bore(5)
+    alone = solve_nominal(study, points[:1], workshop)
+    np.testing.assert_allclose(alone[0], solve_nominal(study, points, workshop)[0], atol=1e-5)
 
 
 def test_points_in_magnet_or_far_outside_are_refused(dipole, workshop):

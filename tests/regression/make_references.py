@@ -10,7 +10,8 @@ from pathlib import Path
 
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.getdp import find_getdp
-from halbach_fe.solve import Workshop, solve_nominal
+from halbach_fe.routes import solve_nominal
+from halbach_fe.solve import Workshop
 from tests.regression.cases import CASES, FOLDER, points_of_case
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.field_map import read_map
-from halbach_fe.solve import solve_nominal
+from halbach_fe.routes import solve_nominal
 from halbach_fe.study import parse_study
 from tests.conftest import changed
 from tests.regression.cases import CASES, FOLDER, TOLERANCE, difference, points_of_case

@@ -20,7 +20,7 @@ from halbach_fe.getdp import (
     _check_log,
     declared_constants,
     find_getdp,
-    read_flux_density,
+    read_vectors,
     run,
 )
 from halbach_fe.mesh import build_mesh, verify_mesh
@@ -51,7 +51,7 @@ def test_a_sound_run_passes(getdp, staged):
     folder, job = staged
     log = run(getdp, job, folder)
     assert any("SOURCE 0" in line for line in log)
-    field = read_flux_density(folder / FLUX_DENSITY_FILE, POINTS, 1)
+    field = read_vectors(folder / FLUX_DENSITY_FILE, POINTS, 1)
     assert field.shape == (1, 5, 3)
     assert (folder / "getdp.log").read_text().startswith("magnetostatics_2d.pro -msh mesh.msh")
 
@@ -159,7 +159,7 @@ def test_point_outside_the_mesh(getdp, dipole, tmp_path):
     job = stage(study, mesh, points, folder)
     with pytest.raises(GetDPError, match=r"point outside the mesh|outside"):
         run(getdp, job, folder)
-        read_flux_density(folder / FLUX_DENSITY_FILE, points, 1)
+        read_vectors(folder / FLUX_DENSITY_FILE, points, 1)
 
 
 def rows(values):
@@ -180,10 +180,10 @@ def rows(values):
 def test_bad_tables_are_refused(tmp_path, text, said):
     path = tmp_path / "flux_density.txt"
     path.write_text(rows(["1 2 3"] * 5))
-    assert read_flux_density(path, POINTS, 1)[0, 0].tolist() == [1, 2, 3]
+    assert read_vectors(path, POINTS, 1)[0, 0].tolist() == [1, 2, 3]
     path.write_text(text)
     with pytest.raises(GetDPError, match=said):
-        read_flux_density(path, POINTS, 1)
+        read_vectors(path, POINTS, 1)
 
 
 def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
@@ -196,7 +196,7 @@ def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
     mesh = verify_mesh(build_mesh(study, folder / "mesh"))
     job = stage(study, mesh, POINTS, folder)
     run(getdp, job, folder)
-    read_flux_density(folder / FLUX_DENSITY_FILE, POINTS, 1)
+    read_vectors(folder / FLUX_DENSITY_FILE, POINTS, 1)
 
 
 def test_an_over_long_name_is_refused(getdp, staged):

@@ -1,0 +1,128 @@
+"""The (r, z) half-plane of a rotationally symmetric magnet, in second-order quadrangles.
+
+For the solver that takes one azimuthal mode at a time: x is r, y is z; a ring of blocks is one
+region, whatever the blocks' angles.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import gmsh
+import numpy as np
+
+from halbach_fe import regions as tags
+from halbach_fe.blocks import Floats, array_half_length, iron_half_length, ring_limits
+from halbach_fe.geo.cross_section import magnet_radius
+from halbach_fe.geo.session import gmsh_session, write_mesh
+from halbach_fe.regions import BlockRegion, Regions
+from halbach_fe.study import Study
+
+BOUNDARY_RATIO = 20.0
+"""Boundary over magnet radius; geometric growth makes far away cheap. See `boundary_radius`."""
+
+LINE3, QUADRANGLE9 = 8, 10  # Gmsh's element types
+_GROWTH = 1.35
+
+
+def mesh_meridian(study: Study, size: float, mesh_path: Path) -> Regions:
+    """Mesh the half-plane with elements of ``size`` (m) at the magnet; return its regions."""
+    r, z = _radii(study, size), _heights(study, size)
+    with gmsh_session(study.name):
+        _build(study, r, z)
+        write_mesh(mesh_path)
+    return Regions(
+        study=study.name, dimension=2, air=tags.AIR_TAG,
+        iron=None if study.iron_ring is None else tags.IRON_TAG,
+        outer_boundary=tags.OUTER_BOUNDARY_TAG, axis=tags.AXIS_TAG,
+        blocks=tuple(BlockRegion(name=f"r{ring:02d}", ring=ring, slot=0,
+                                 tag=tags.FIRST_BLOCK_TAG + ring - 1)
+                     for ring in range(1, study.array.rings + 1)))
+
+
+def _radii(study: Study, size: float) -> Floats:
+    array, iron = study.array, study.iron_ring
+    stops = [0.0, array.inner_radius_m, array.outer_radius_m]
+    if iron is not None:
+        stops += [iron.inner_radius_m, iron.outer_radius_m]
+    return np.array([*_uniform(stops, size), *_growing(
+        stops[-1], size, BOUNDARY_RATIO * magnet_radius(study))])
+
+
+def _heights(study: Study, size: float) -> Floats:
+    end = max(array_half_length(study), iron_half_length(study))
+    stops = {limit for ring in ring_limits(study) for limit in ring} | {-end, end}
+    stops |= {-iron_half_length(study), iron_half_length(study)} if study.iron_ring else set()
+    # the fringe is as important as the body: one bore radius of uniform elements beyond the ends
+    uniform = end + 2 * study.array.inner_radius_m
+    outside = _growing(uniform, size, end + BOUNDARY_RATIO * magnet_radius(study))
+    inside = _uniform(sorted(stops | {-uniform, uniform}), size)
+    return np.array([*(-value for value in reversed(outside)), *inside, *outside])
+
+
+def _uniform(stops: list[float], size: float) -> list[float]:
+    """Subdivide between stops, all included; stops nearer than 1e-9 m are one."""
+    result = [stops[0]]
+    for start, stop in pairwise(stops):
+        if stop - start > 1e-9:
+            count = int(np.ceil((stop - start) / size - 1e-6))
+            result += list(np.linspace(start, stop, count + 1)[1:])
+    return result
+
+
+def _growing(start: float, size: float, stop: float) -> list[float]:
+    """Positions after ``start`` whose distances grow geometrically up to ``stop``."""
+    result, position = [], start
+    while position < stop:
+        size *= _GROWTH
+        position = stop if stop - position < 1.5 * size else position + size
+        result.append(position)
+    return result
+
+
+def _build(study: Study, r: Floats, z: Floats) -> None:
+    """Tensor grid of nine-node quadrangles as discrete Gmsh entities."""
+    r_nodes, z_nodes = _with_middles(r), _with_middles(z)
+    columns, rows = len(r_nodes), len(z_nodes)
+    points = np.zeros((columns * rows, 3))
+    points[:, 0] = np.repeat(r_nodes, rows)
+    points[:, 1] = np.tile(z_nodes, columns)
+    i, j = (index.ravel() for index in np.meshgrid(
+        np.arange(len(r) - 1), np.arange(len(z) - 1), indexing="ij"))
+    pattern = np.array([(0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1), (1, 1)])
+    cells = ((2 * i[:, None] + pattern[:, 0]) * rows + 2 * j[:, None] + pattern[:, 1])
+    material = _materials(study, (r[i] + r[i + 1]) / 2, (z[j] + z[j + 1]) / 2)
+
+    k, h = 2 * np.arange(len(z) - 1), 2 * np.arange(len(r) - 1) * rows
+    axis = np.column_stack([k, k + 2, k + 1])
+    rim = [axis + (columns - 1) * rows] + [
+        np.column_stack([h, h + 2 * rows, h + rows]) + level for level in (0, rows - 1)]
+    model = gmsh.model
+    model.addDiscreteEntity(2, 1)
+    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
+    for tag in np.unique(material).tolist():
+        if tag != 1:
+            model.addDiscreteEntity(2, tag)
+        model.mesh.addElementsByType(tag, QUADRANGLE9, [], (cells[material == tag] + 1).ravel())
+        model.addPhysicalGroup(2, [tag], tag)
+    for tag, lines in ((tags.AXIS_TAG, axis), (tags.OUTER_BOUNDARY_TAG, np.vstack(rim))):
+        model.addDiscreteEntity(1, tag)
+        model.mesh.addElementsByType(tag, LINE3, [], (lines + 1).ravel())
+        model.addPhysicalGroup(1, [tag], tag)
+
+
+def _with_middles(x: Floats) -> Floats:
+    return np.sort(np.concatenate([x, (x[1:] + x[:-1]) / 2]))
+
+
+def _materials(study: Study, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    result = np.full(len(r), tags.AIR_TAG)
+    array, iron = study.array, study.iron_ring
+    magnet = (r > array.inner_radius_m) & (r < array.outer_radius_m)
+    for ring, (low, high) in enumerate(ring_limits(study)):
+        result[magnet & (z > low) & (z < high)] = tags.FIRST_BLOCK_TAG + ring
+    if iron is not None:
+        result[(r > iron.inner_radius_m) & (r < iron.outer_radius_m)
+               & (np.abs(z) < iron_half_length(study))] = tags.IRON_TAG
+    return result

@@ -1,0 +1,152 @@
+"""Azimuthal modes against the exact field, against edge elements, and against a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe import azimuthal
+from halbach_fe.analytic import ideal_sectors, layered_bore_field
+from halbach_fe.blocks import blocks_of
+from halbach_fe.errors import StudyError
+from halbach_fe.exact_field import field_of, unit_field
+from halbach_fe.mesh import build_meridian, verify_mesh
+from halbach_fe.observation import observe
+from halbach_fe.response import response
+from halbach_fe.routes import choose_route, finite_element_part, solve_nominal
+from tests.conftest import circle
+
+IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
+POINTS = np.vstack([circle(0.05, 7, z, 0.2 + z) for z in (-0.12, -0.03, 0.0, 0.05, 0.11)])
+AXIS = np.column_stack([np.zeros((5, 2)), np.linspace(-0.2, 0.2, 5)])
+
+
+@pytest.fixture
+def modes(short_dipole):
+    """A study that takes azimuthal modes, with changes."""
+    return lambda **changes: short_dipole(
+        **{"mesh__meridian_size_m": 0.012, "solver__route": "azimuthal_modes"} | changes)
+
+
+def columns_in_vacuum(study, points):
+    return np.concatenate([np.moveaxis(unit_field(block, points), 2, 0)
+                           for block in blocks_of(study)])
+
+
+def test_every_column_against_its_exact_field(modes, workshop):
+    """Without permeability B itself, by modes, is the exact field: place, sign, all axes.
+
+    Second-order elements: measured 1.5 % of the largest value of each column's own axis, rms 0.3 %.
+    """
+    study = modes(array__recoil_permeability=1.0, solver__method="direct")
+    points = np.vstack([POINTS, AXIS])
+    found = azimuthal.mode_fields(study, points, workshop)[1:]
+    exact = columns_in_vacuum(study, points)
+    scale = np.abs(exact).max(axis=(1, 2))
+    error = np.abs(found - exact).max(axis=(1, 2)) / scale
+    assert error.max() < 0.03
+    wrong = np.roll(exact, 3, axis=0)  # negative control: neighbours exchanged
+    assert (np.abs(found - wrong).max(axis=(1, 2)) / scale).min() > 0.1
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_a_missing_mode_is_seen(modes, workshop, monkeypatch, missing):
+    """Negative control: drop one mode of the sum and the columns are wrong."""
+    study = modes(array__recoil_permeability=1.0, solver__method="direct")
+    arrange = azimuthal._arrange
+
+    def incomplete(*arguments):
+        result = arrange(*arguments)
+        result.rings[missing] = 0
+        return result
+
+    monkeypatch.setattr(azimuthal, "_arrange", incomplete)
+    found = azimuthal.mode_fields(study, POINTS, workshop)[1:]
+    exact = columns_in_vacuum(study, POINTS)
+    assert np.abs(found - exact).max() / np.abs(exact).max() > 0.05
+
+
+def test_reaction_against_edge_elements(modes, workshop):
+    """Two formulations, two meshes: they agree to what edge elements can do, 15 % of the reaction
+    rms on a fine enough mesh. A reaction of the wrong sign would be 200 % away.
+    """
+    changes = {"mesh__block_size_m": 0.016, "mesh__layers_per_ring": 4}
+    fast, slow = modes(**changes), modes(solver__route="edge_elements", **changes)
+    sources = (0, 0)
+    one = finite_element_part(fast, POINTS, sources, workshop)[0]
+    two = finite_element_part(slow, POINTS, sources, workshop)[0]
+    scale = np.sqrt(np.mean(one**2))
+    assert np.sqrt(np.mean((one - two) ** 2)) < 0.15 * scale
+    assert np.sqrt(np.mean((one + two) ** 2)) > 1.5 * scale
+
+
+@pytest.mark.parametrize("iron", [None, IRON], ids=["air", "iron"])
+def test_middle_of_a_long_array_against_closed_form(modes, workshop, iron):
+    """2.4 m long, the ends change the middle by some 1e-5; measured error 4e-5 and 7e-5."""
+    study = modes(array__rings=16, array__ring_length_m=0.15, iron_ring=iron)
+    points = circle(0.07, 9, 0.01)
+    tube = None if iron is None else (0.19, 0.2, 1000.0)
+    expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
+                                  1.05, points[:, :2], tube)
+    found = solve_nominal(study, points, workshop)
+    assert np.abs(found[:, :2] - expected).max() < 2e-4 * np.abs(expected).max()
+    assert np.abs(found[:, 2]).max() < 2e-4 * np.abs(expected).max()
+
+
+def test_refinement_converges(modes, workshop):
+    """The nominal field with iron on three meshes: each step is at least twice smaller."""
+    fields = [solve_nominal(modes(iron_ring=IRON, mesh__meridian_size_m=size), POINTS, workshop)
+              for size in (0.04, 0.02, 0.01)]
+    steps = [np.abs(b - a).max() for a, b in zip(fields, fields[1:], strict=False)]
+    assert steps[1] < steps[0] / 2
+    assert steps[1] < 3e-4 * np.abs(fields[-1]).max()
+
+
+def test_superposition_of_rings(modes, workshop):
+    """Columns add up to the nominal array, which was solved with all rings at once."""
+    study = modes(iron_ring=IRON)
+    built = response(study, observe(study, POINTS, np.ones((len(POINTS), 3), bool)), workshop)
+    assert built.superposition_error < 1e-9
+
+
+def test_ring_gaps_and_turned_arrays(modes, workshop):
+    """A gap between rings is still symmetric; first angles need not be multiples of the pitch."""
+    study = modes(array__ring_gap_m=0.01, array__recoil_permeability=1.0, solver__method="direct",
+                  array__first_block_angle_deg=17.0, array__first_magnetization_angle_deg=71.0)
+    found = azimuthal.mode_fields(study, POINTS, workshop, columns=False)[0]
+    exact = field_of(blocks_of(study), POINTS)
+    assert np.abs(found - exact).max() < 0.02 * np.abs(exact).max()
+
+
+def test_routes_are_chosen_by_symmetry(short_dipole, dipole):
+    far = POINTS
+    assert choose_route(short_dipole(), far) == "azimuthal_modes"
+    assert choose_route(short_dipole(solver__method="direct"), far) == "edge_elements"
+    gaps = {"shape": "sector", "angular_gap_deg": 1.0}
+    trapezoids = {"shape": "trapezoid"}
+    for block in (gaps, trapezoids):
+        assert choose_route(short_dipole(array__block=block), far) == "edge_elements"
+        with pytest.raises(StudyError, match=r"solver\.route"):
+            choose_route(short_dipole(array__block=block, solver__route="azimuthal_modes"), far)
+    assert choose_route(dipole(), circle(0.07)) == "edge_elements"
+    near = circle(0.1035)
+    assert choose_route(short_dipole(), near) == "edge_elements"
+
+
+def test_few_modes_on_the_axis_many_near_the_blocks(short_dipole):
+    study = short_dipole()
+    counts = [azimuthal.modes_needed(study, circle(r)) for r in (1e-6, 0.05, 0.075, 0.09)]
+    assert counts == sorted(counts)
+    assert counts[0] == 1
+    assert azimuthal.modes_needed(study, circle(0.4)) < counts[-1]
+
+
+def test_meridian_mesh_is_verified(short_dipole, tmp_path):
+    """Unknowns: nodes off the boundary, and off the axis for modes above 0."""
+    study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.03)
+    mesh = verify_mesh(build_meridian(study, tmp_path))
+    assert mesh.axis_nodes > 0
+    assert mesh.unknowns < mesh.nodes
+    assert mesh.radius > 10 * 0.2
+    again = build_meridian(study, tmp_path / "again")
+    assert again.mesh.read_bytes() == mesh.path.read_bytes()
