@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import signal
-import sys
-import traceback
 from collections.abc import Sequence
 from importlib import metadata
 
-from halbach_fe.cli import doctor, infer, schema, solve
+from halbach_fe.cli import common, doctor, infer, schema, solve
 
-from halbach_fe.errors import EXIT_CODES, HalbachError
+from halbach_fe.errors import EXIT_CODES
 
 VERBS = {"solve": solve, "infer": infer, "doctor": doctor, "schema": schema}
 
@@ -35,20 +32,4 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; return its exit code (`halbach_fe.errors.EXIT_CODES`)."""
     arguments = parser().parse_args(argv)
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return int(VERBS[arguments.verb].run(arguments))
-    except HalbachError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return error.exit_code
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        return 130
-    except BrokenPipeError:
-        return 0
-    except Exception:
-        traceback.print_exc()
-        sys.stderr.write("error: this is a bug in halbach-fe; please report it with the above.\n")
-        return 1
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+    return common.guarded(lambda: VERBS[arguments.verb].run(arguments))

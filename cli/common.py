@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from halbach_fe.errors import HalbachError
 from halbach_fe.getdp import find_getdp
 from halbach_fe.solve import Workshop
 
@@ -51,6 +54,32 @@ def positive(text: str) -> int:
     return value
 
 
+def guarded(run: Callable[[], int]) -> int:
+    """Run something and return its exit code; errors become one sentence on stderr.
+
+    A closed terminal and SIGTERM end it like Ctrl-C: GetDP is stopped, nothing is left half-made.
+    """
+    signals = (signal.SIGTERM, signal.SIGHUP)
+    previous = [signal.signal(number, signal.default_int_handler) for number in signals]
+    try:
+        return run()
+    except HalbachError as error:
+        say(f"error: {error}")
+        return error.exit_code
+    except KeyboardInterrupt:
+        say("interrupted")
+        return 130
+    except BrokenPipeError:
+        return 0
+    except Exception:
+        traceback.print_exc()
+        say("error: this is a bug in halbach-fe; please report it with the above.")
+        return 1
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)
+
+
 @contextmanager
 def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
     """A workshop in the output folder; shows progress on a terminal's stderr."""
@@ -68,7 +97,7 @@ def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
 
 def print_json(value: object) -> None:
     """Print machine-readable results on stdout."""
-    sys.stdout.write(json.dumps(value, indent=1) + "\n")
+    sys.stdout.write(json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import platform
 import tempfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from halbach_fe.cli import common
 
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
-from halbach_fe.errors import CheckFailedError
+from halbach_fe.errors import CheckFailedError, GetDPNotFoundError
 from halbach_fe.getdp import GetDP, find_getdp
 from halbach_fe.routes import solve_nominal
 from halbach_fe.solve import Workshop
@@ -35,22 +36,32 @@ def run(arguments: argparse.Namespace) -> int:
     findings = {"halbach-fe": metadata.version("halbach-fe"),
                 "python": platform.python_version(), "system": platform.platform()}
     findings |= {name: metadata.version(name) for name in PACKAGES}
-    getdp = find_getdp(arguments.getdp)
+    try:
+        getdp = find_getdp(arguments.getdp)
+    except GetDPNotFoundError:
+        _show(findings | {"getdp": "not found"}, arguments.json)
+        raise
     findings |= {"getdp": f"{getdp.version} ({getdp.executable})", "petsc": getdp.petsc,
                  "getdp build": " ".join(getdp.build_options)}
     errors = {method: solve_error(getdp, method) for method in TOLERANCE}
     findings |= {f"2D {method} solve, error": f"{error:.1e} of the bore field"
                  for method, error in errors.items()}
-    if arguments.json:
-        common.print_json(findings | {"errors": errors, "tolerances": TOLERANCE})
-    else:
-        common.print_table([{"what": key, "found": value} for key, value in findings.items()])
+    extra = {"errors": errors, "tolerances": TOLERANCE} if arguments.json else {}
+    _show(findings | extra, arguments.json)
     for method, error in errors.items():
         if not error <= TOLERANCE[method]:
             raise CheckFailedError(
                 f"The {method} solve differs from the closed form by {error:.1e} of the bore "
                 f"field, where {TOLERANCE[method]:.0e} is allowed. Reinstall GetDP.")
     return 0
+
+
+def _show(findings: Mapping[str, object], as_json: bool) -> None:
+    if as_json:
+        common.print_json(findings)
+    else:
+        common.print_table([{"what": key, "found": str(value)}
+                            for key, value in findings.items()])
 
 
 def solve_error(getdp: GetDP, method: str) -> float:

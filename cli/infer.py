@@ -29,6 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     with common.workshop(arguments) as workshop:
         update = infer(study, data, workshop)
+    if update.response.reused:
+        common.say("The response matrix of an earlier run in this folder fits and was reused.")
     write_update(update, arguments.output)
     write_report(update, arguments.output)
     if arguments.json:

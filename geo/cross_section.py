@@ -80,10 +80,22 @@ def draw(study: Study, blocks: tuple[MagnetBlock, ...]) -> dict[int, list[int]]:
          if not len(gmsh.model.getAdjacencies(*point)[0])])
     surfaces = {tag: [entity for _, entity in pieces]
                 for (tag, _), pieces in zip(drawn, children[1:], strict=True)}
+    _check_shared(surfaces)
     solid = {entity for pieces in surfaces.values() for entity in pieces}
     surfaces[tags.AIR_TAG] = [entity for _, entity in children[0] if entity not in solid]
     _set_sizes(study)
     return surfaces
+
+
+def _check_shared(surfaces: dict[int, list[int]]) -> None:
+    """No piece of the cross-section may belong to two parts."""
+    owner: dict[int, int] = {}
+    for tag, pieces in surfaces.items():
+        for piece in pieces:
+            if owner.setdefault(piece, tag) != tag:
+                raise StudyError(
+                    f"Input `array.block` of study must leave neighbours apart; instead regions "
+                    f"{owner[piece]} and {tag} overlap. Reduce the block's width.")
 
 
 def outer_curves(study: Study) -> list[int]:
@@ -127,18 +139,26 @@ def _surface(outline: Outline) -> int:
 
 
 def _set_sizes(study: Study) -> None:
-    """Element size: the bore's, the blocks', then growing linearly towards the boundary."""
+    """Element size: the bore's, the blocks', then growing linearly towards the boundary.
+
+    As fields of Gmsh's own: a Python callback would swallow Ctrl-C in the midst of meshing.
+    """
     block_size = study.mesh.block_size_m
     bore_size = study.mesh.bore_size_m or block_size
-    bore, magnet = study.array.inner_radius_m, magnet_radius(study)
-    rise = study.mesh.growth - 1
-
-    def size(_dim: int, _tag: int, x: float, y: float, _z: float, _lc: float) -> float:
-        radius = float(np.hypot(x, y))
-        if radius < bore * (1 - 1e-9):
-            return bore_size
-        return block_size + rise * max(0.0, radius - magnet)
-
+    rise, magnet = study.mesh.growth - 1, magnet_radius(study)
+    field = gmsh.model.mesh.field
+    constant, growing, bore = field.add("MathEval"), field.add("MathEval"), field.add("Cylinder")
+    field.setString(constant, "F", f"{block_size:.17g}")
+    field.setString(growing, "F",
+                    f"{block_size:.17g} + {rise:.17g} * (sqrt(x^2 + y^2) - {magnet:.17g})")
+    outside = field.add("Max")
+    field.setNumbers(outside, "FieldsList", [constant, growing])
+    finer = bore_size < block_size
+    for name, value in (("Radius", study.array.inner_radius_m * (1 - 1e-9)), ("ZAxis", 1.0),
+                        ("VIn", bore_size), ("VOut", 1e22 if finer else 0.0)):
+        field.setNumber(bore, name, value)
+    size = field.add("Min" if finer else "Max")
+    field.setNumbers(size, "FieldsList", [bore, outside])
+    field.setAsBackgroundMesh(size)
     for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
         gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)
-    gmsh.model.mesh.setSizeCallback(size)

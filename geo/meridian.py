@@ -11,11 +11,11 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
+from halbach_fe.geo.cross_section import magnet_radius
+from halbach_fe.geo.session import gmsh_session, write_mesh
 
 from halbach_fe import regions as tags
 from halbach_fe.blocks import Floats, array_half_length, iron_half_length, ring_limits
-from halbach_fe.geo.cross_section import magnet_radius
-from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
 

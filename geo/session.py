@@ -22,11 +22,12 @@ def gmsh_session(name: str) -> Iterator[None]:
     MeshError
         In place of Gmsh's bare exceptions.
     """
-    on_termination = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, on_termination)  # Gmsh resets it
+            for number, handler in handlers.items():
+                signal.signal(number, handler)  # Gmsh resets them
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("General.NumThreads", 1)  # the same mesh on every machine
         gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)  # the newest that GetDP reads here

@@ -131,7 +131,7 @@ def _task(
             numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
                      "COLUMNS": columns},
             unknowns=mesh.unknowns - (mesh.axis_nodes if span[0] > 0 else 0),
-            time_limit_s=workshop.time_limit_s)
+            solves=count, time_limit_s=workshop.time_limit_s)
 
     return Task(
         name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{span[0]}", stage=stage,

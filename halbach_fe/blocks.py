@@ -294,19 +294,40 @@ def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
 
 
 def _check_overlaps(outlines: list[Outline]) -> None:
-    """Refuse outlines that overlap: some sample of one's boundary lies well inside another.
+    """Refuse outlines that overlap: one holds a point of another, or their edges cross.
 
-    Shared faces are allowed; samples are drawn slightly inwards so that rounding decides nothing.
+    Shared faces are allowed; outlines are drawn in by 1e-6 so that rounding decides nothing.
     """
     t = np.linspace(0.0, 1.0, 9)
-    for i, outline in enumerate(outlines):
+    drawn_in = []
+    for outline in outlines:
+        boundary = np.vstack([edge.at(t)[0][:-1] for edge in outline])
         centre = np.mean([edge.start for edge in outline], axis=0)
-        samples = np.vstack([edge.at(t)[0] for edge in outline])
-        samples = np.vstack([centre + (1 - 1e-6) * (samples - centre), centre])
+        drawn_in.append(centre + (1 - 1e-6) * (boundary - centre))
+    for i, polygon in enumerate(drawn_in):
+        samples = np.vstack([polygon, polygon.mean(axis=0)])
         for j, other in enumerate(outlines):
-            if i != j and outline_contains(other, samples).any():
+            if i != j and (outline_contains(other, samples).any()
+                           or _cross(polygon, drawn_in[j])):
                 raise StudyError(
                     f"Input `array.block` of study must leave neighbours apart; instead blocks "
                     f"{i + 1} and {j + 1} of a ring overlap. Reduce the block's width, or place "
                     "the blocks on a larger radius."
                 )
+
+
+def _cross(one: Floats, two: Floats) -> bool:
+    """Tell whether any side of one closed polygon crosses any of another."""
+    a, b = one[:, None], np.roll(one, -1, axis=0)[:, None]
+    c, d = two[None], np.roll(two, -1, axis=0)[None]
+
+    def side(p: Floats, q: Floats, x: Floats) -> Floats:
+        return ((q[..., 0] - p[..., 0]) * (x[..., 1] - p[..., 1])
+                - (q[..., 1] - p[..., 1]) * (x[..., 0] - p[..., 0]))
+
+    def apart(x: Floats, y: Floats) -> NDArray[np.bool_]:
+        """Clearly on two sides: sides of aligned blocks are collinear but for rounding."""
+        return (np.minimum(x, y) < -tiny) & (np.maximum(x, y) > tiny)
+
+    tiny = 1e-9 * float(np.ptp(one)) ** 2
+    return bool((apart(side(a, b, c), side(a, b, d)) & apart(side(c, d, a), side(c, d, b))).any())

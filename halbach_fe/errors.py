@@ -34,6 +34,10 @@ class MeshError(HalbachError):
     exit_code = 5
 
 
+class PointsOutsideError(MeshError):
+    """Points lie outside the meshed region."""
+
+
 class GetDPNotFoundError(HalbachError):
     """No usable GetDP executable."""
 

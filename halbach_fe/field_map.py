@@ -7,7 +7,8 @@ A map is an `xarray.Dataset` with
 * optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
 * attributes: provenance, free text by key.
 
-HDF5 and CSV hold all of it and read back equal; VTU is for looking at it.
+HDF5 and CSV hold all of it and read back equal. VTU, for ParaView, has no place for scans and
+attributes; the rest reads back equal too.
 """
 
 from __future__ import annotations
@@ -69,10 +70,7 @@ def write_map(data: xr.Dataset, path: Path) -> None:
         Unknown suffix, or a file that cannot be written.
     """
     writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
-        ".h5": lambda d, p: d.to_netcdf(p, engine="h5netcdf"),
-        ".csv": _write_csv,
-        ".vtu": _write_vtu,
-    }
+        ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
@@ -81,7 +79,7 @@ def write_map(data: xr.Dataset, path: Path) -> None:
 
 
 def read_map(path: str | Path) -> xr.Dataset:
-    """Read and validate a map from CSV or HDF5 (.h5, .hdf5, .nc).
+    """Read and validate a map from CSV, HDF5 (.h5, .hdf5, .nc) or VTU.
 
     CSV: ``# key: value`` comments are attributes; the header names the columns x_m, y_m, z_m and
     some of Bx_T, By_T, Bz_T in any order, optionally sigma_T or sigma_Bx_T ..., time_s, scan. An
@@ -101,9 +99,18 @@ def read_map(path: str | Path) -> xr.Dataset:
     if not raw.strip():
         raise MeasurementError(must_be("content", f"map {path}", "a table of readings",
                                        "an empty file"))
-    data = _read_hdf5(path) if path.suffix in (".h5", ".hdf5", ".nc") else _read_csv(raw, path)
+    if path.suffix in (".h5", ".hdf5", ".nc"):
+        data = _read_hdf5(path)
+    else:
+        data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
     _check(data, path)
     return data
+
+
+def write_hdf5(data: xr.Dataset, path: Path) -> None:
+    """Write any labelled data as HDF5, whole or not at all; raise OutputError."""
+    with atomic(path) as temporary:
+        _write_bytes(_hdf5(data), temporary)
 
 
 @contextmanager
@@ -133,6 +140,17 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def _write_bytes(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def _hdf5(data: xr.Dataset) -> bytes:
+    """HDF5 in memory: the library crashes when a disk fills up under its open file."""
+    buffer = io.BytesIO()
+    data.to_netcdf(buffer, engine="h5netcdf")
+    return buffer.getvalue()
+
+
 def _write_csv(data: xr.Dataset, path: Path) -> None:
     columns: dict[str, NDArray[np.generic]] = {name: data[name].values
                                                for name in POSITION_COLUMNS}
@@ -158,9 +176,7 @@ def _cell(value: object) -> str:
 def _write_vtu(data: xr.Dataset, path: Path) -> None:
     points = points_of(data)
     cells = [("vertex", np.arange(len(points))[:, None])]
-    values = {"B_T": np.nan_to_num(data["B_T"].values)}
-    if "sigma_T" in data:
-        values["sigma_T"] = np.nan_to_num(data["sigma_T"].values)
+    values = {name: data[name].values for name in ("B_T", "sigma_T", "time_s") if name in data}
     meshio.write(path, meshio.Mesh(points, cells, point_data=values), file_format="vtu")
 
 
@@ -179,6 +195,32 @@ def _read_hdf5(path: Path) -> xr.Dataset:
             data.get("component", xr.DataArray([])).values) != list(COMPONENTS):
         raise MeasurementError(must_be("`B_T`", where, "labelled (point, component = x, y, z)",
                                        f"dimensions {data['B_T'].dims}"))
+    if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
+        data["sigma_T"] = data["sigma_T"].broadcast_like(data["B_T"]).transpose(
+            "point", "component")
+    expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), ("point",))
+    expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
+    for name, dims in expected.items():
+        if name not in data.variables:
+            continue
+        numeric = name == "scan" or np.issubdtype(data[name].dtype, np.floating) or (
+            np.issubdtype(data[name].dtype, np.integer))
+        if data[name].dims != dims or not numeric:
+            raise MeasurementError(must_be(f"`{name}`", where, f"numbers labelled {dims}",
+                                           f"{data[name].dtype} labelled {data[name].dims}"))
+    return data
+
+
+def _read_vtu(path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    try:
+        mesh = meshio.read(path)
+        data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
+        if "time_s" in mesh.point_data:
+            data["time_s"] = ("point", mesh.point_data["time_s"])
+    except (Exception, SystemExit) as error:  # meshio raises, or exits on, whatever it meets
+        raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
+                                       f"'{error}'")) from None
     return data
 
 
@@ -198,7 +240,7 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
             if comment[1]:
                 attributes[comment[1]] = comment[2].strip()
         elif line.strip():
-            rows.append((number, [cell.strip() for cell in next(csv.reader(io.StringIO(line)))]))
+            rows.append((number, _cells(line, number, where)))
     if not rows:
         raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
     header = rows[0][1]
@@ -231,6 +273,14 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     if scans:
         data["scan"] = ("point", scans)
     return data
+
+
+def _cells(line: str, number: int, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise MeasurementError(must_be(f"line {number}", where, "comma-separated values",
+                                       f"'{error}'")) from None
 
 
 def _check_header(header: list[str], where: str) -> None:
@@ -268,6 +318,8 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
 def _check(data: xr.Dataset, path: Path) -> None:
     """Refuse what cannot be a reading."""
     where = f"map {path}"
+    if not data.sizes["point"]:
+        raise MeasurementError(must_be("content", where, "at least one reading", "none"))
     points, values = points_of(data), data["B_T"].values
     if np.isinf(values).any() or not np.isfinite(points).all():
         row = int(np.argmax(np.isinf(values).any(axis=1) | ~np.isfinite(points).all(axis=1)))

@@ -84,6 +84,8 @@ class Job:
         Files that the run must write.
     unknowns : int or None
         Number of unknowns that the system must have; None where it cannot be foretold.
+    solves : int
+        Linear solves that the log must show, each with its residuals.
     options : tuple of str
         Further PETSc options.
     time_limit_s : float
@@ -98,6 +100,7 @@ class Job:
     outputs: tuple[str, ...]
     numbers: Mapping[str, float] = field(default_factory=dict)
     unknowns: int | None = None
+    solves: int = 1
     options: tuple[str, ...] = SOLVER_OPTIONS
     time_limit_s: float = 3600.0
     threads: int = 1
@@ -193,7 +196,8 @@ def read_vectors(path: Path, points: Floats, sources: int) -> Floats:
                        "mesh looks like this, and so does a full disk", where) from None
     if table.shape != (sources * len(points), 6):
         raise _failure(f"{path.name} holds {table.shape[0]} rows of {table.shape[1]} columns in "
-                       f"place of {sources * len(points)} of 6; is the disk full?", where)
+                       f"place of {sources * len(points)} of 6; a point outside the mesh looks "
+                       "like this, and so does a full disk", where)
     table = table.reshape(sources, len(points), 6)
     scale = max(1e-9, float(np.abs(points).max()))
     if not np.allclose(table[:, :, :3], points, rtol=0, atol=1e-9 * scale):
@@ -317,12 +321,15 @@ def _check_log(lines: list[str], job: Job, folder: Path) -> None:
         raise _failure(
             f"the system has {sizes[0]} unknowns where the mesh gives {job.unknowns}: a boundary "
             "condition, a gauge or a region is missing", folder)
-    _check_residuals(lines, folder)
+    found = _check_residuals(lines, folder)
+    if found < job.solves:
+        raise _failure(f"its log shows the residuals of {found} of {job.solves} solves", folder)
 
 
-def _check_residuals(lines: list[str], folder: Path) -> None:
-    """Every linear solve must have brought its residual down."""
+def _check_residuals(lines: list[str], folder: Path) -> int:
+    """Every linear solve must have brought its residual down; return how many there were."""
     first: float | None = None
+    found = 0
     last = np.nan
     for line in [*lines, "  0 KSP Residual norm 0"]:
         match = re.search(r"(\d+) KSP Residual norm (\S+)", line)
@@ -332,9 +339,11 @@ def _check_residuals(lines: list[str], folder: Path) -> None:
             if first is not None and not last <= MAX_RELATIVE_RESIDUAL * first:
                 raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
                                "linear solver did not converge", folder)
-            first = last = float(match[2])
+            found += first is not None
+            first, last = float(match[2]), np.inf
         else:
             last = float(match[2])
+    return found
 
 
 def _name_of(text: str, otherwise: str) -> str:

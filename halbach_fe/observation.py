@@ -150,7 +150,9 @@ def noise_regions(noise: Noise, z: Floats) -> NDArray[np.int64]:
     """
     region = np.full(len(z), -1)
     for number, window in reversed(list(enumerate(noise.regions))):
-        region[(z >= window.z_min_m) & (z <= window.z_max_m)] = number
+        low = -np.inf if window.z_min_m is None else window.z_min_m
+        high = np.inf if window.z_max_m is None else window.z_max_m
+        region[(z >= low) & (z <= high)] = number
     if (region < 0).any():
         raise StudyError(
             f"Input `noise.regions` of study must cover every reading; instead z = "

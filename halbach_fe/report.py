@@ -17,9 +17,10 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.field_map import atomic
-from halbach_fe.update import COVERAGE_Z, Update, write_text
+from halbach_fe.update import COVERAGE_Z, HELD_OUT, Update, write_text
 
 # Okabe and Ito's colours, told apart by every kind of colour vision
+NOTHING = "–"
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 
 
@@ -51,8 +52,9 @@ def score_table(update: Update, published: Published | None = None) -> list[dict
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "prior": _percent(score.median_relative_error_prior),
             "posterior": _percent(score.median_relative_error_posterior),
-            "95 % band holds": f"{score.coverage95_posterior:.0%}",
-            "chi²/reading": f"{score.chi2_posterior:.3g}",
+            "95 % band holds": _percent(score.coverage95_posterior),
+            "chi²/reading": NOTHING if score.chi2_posterior is None
+            else f"{score.chi2_posterior:.3g}",
         }
         if published is not None:
             inside = np.isin(np.round(published.z, 6), np.round(_z_of(
@@ -99,25 +101,23 @@ def write_report(
 
 
 def _conflict(update: Update) -> str:
-    """Say so when the model cannot describe even the readings that it was given."""
-    bad = [score for score in update.scores
-           if score.part == "training" and score.chi2_posterior > 3]
-    if not bad:
+    """Say so when prior, model and readings cannot all be right."""
+    if update.prior_conflict <= update.conflict_limit:
         return ""
-    said = ", ".join(f"{score.chi2_posterior:.0f} in the {score.region} region" for score in bad)
     shift = float(np.max(np.abs(update.posterior.mean - update.prior.mean) / update.prior.sd))
-    return (f"The model does not describe the readings that it was fitted to: chi² per reading is "
-            f"{said}, where 1 is expected, and the largest change of a block is {shift:.1f} prior "
-            "standard deviations. Something is missing from the model (geometry, position of the "
-            "readings, iron, ...), so its error bars are too small.")
+    return (f"Prior, model and readings cannot all be right: chi² per reading is "
+            f"{update.prior_conflict:.3g}, where 1 is expected and {update.conflict_limit:.2g} "
+            f"would be rare, and the largest change of a block is {shift:.1f} prior standard "
+            "deviations. Something is missing from the model (geometry, position of the readings, "
+            "iron, ...), so its error bars are too small.")
 
 
-def _percent(value: float) -> str:
-    return f"{100 * value:.3g}\u00a0%"
+def _percent(value: float | None) -> str:
+    return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
 
 
 def _z_of(update: Update, region: str, part: str) -> Floats:
-    mask = (np.array(update.regions) == region) & (update.held_out == (part == "held out"))
+    mask = (np.array(update.regions) == region) & (update.held_out == (part == HELD_OUT))
     return update.observation.positions[mask, 2]
 
 

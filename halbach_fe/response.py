@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from importlib import metadata
+from importlib import metadata, resources
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +19,16 @@ import xarray as xr
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import GetDPError
 from halbach_fe.exact_field import field_of, unit_field
-from halbach_fe.field_map import atomic
+from halbach_fe.field_map import write_hdf5
 from halbach_fe.observation import Observation
 from halbach_fe.routes import check_points, finite_element_part
 from halbach_fe.solve import Workshop, source_number
 from halbach_fe.study import COMPONENTS, MU_0, Study
 
 SUPERPOSITION_TOLERANCE = 1e-8
-"""Of the largest reading. The problem is linear and the solver direct: what remains is rounding
-and the 16 digits of GetDP's text, about 1e-12; a wrong or missing column shows at 1e-3."""
+"""Of the largest sum of the columns' magnitudes. The problem is linear and the solver direct: what
+remains is rounding and the 16 digits of GetDP's text, about 1e-12; a wrong or missing column shows
+at 1e-3."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,16 @@ class Response:
     nominal : ndarray, shape (parameters,), in A/m
         The study's nominal magnetization.
     superposition_error : float
-        Largest difference between H times nominal and a direct solve, relative to the largest
-        reading.
+        Largest difference between H times nominal and a direct solve, see `verify_superposition`.
+    reused : bool
+        Whether it was taken from an earlier run with the same inputs.
     """
 
     matrix: Floats
     parameters: tuple[str, ...]
     nominal: Floats
     superposition_error: float
+    reused: bool = False
 
 
 def parameter_names(study: Study) -> tuple[str, ...]:
@@ -91,8 +94,11 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
 
 
 def verify_superposition(matrix: Floats, nominal: Floats, direct: Floats) -> float:
-    """Return max |H p - q| / max |q| for a directly solved q; raise GetDPError if too large."""
-    error = float(np.abs(matrix @ nominal - direct).max() / np.abs(direct).max())
+    """Return the largest |H p - q| for a directly solved q, relative to the sum of the columns'
+    magnitudes (readings may vanish by symmetry); raise GetDPError if it is too large.
+    """
+    scale = (np.abs(matrix) @ np.abs(nominal)).max()
+    error = float(np.abs(matrix @ nominal - direct).max() / scale)
     if not error <= SUPERPOSITION_TOLERANCE:
         raise GetDPError(
             f"The columns of the response do not add up to the directly solved field: the largest "
@@ -106,8 +112,12 @@ def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
     relevant = study.model_dump(
         mode="json", include={"dimension", "array", "iron_ring", "mesh", "open_boundary", "solver"})
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
-    digest.update(metadata.version("halbach-fe").encode())
-    digest.update(f"{workshop.getdp.version} {workshop.getdp.petsc}".encode())
+    versions = [metadata.version(name) for name in ("halbach-fe", "gmsh")]
+    digest.update(f"{versions} {workshop.getdp.version} {workshop.getdp.petsc}".encode())
+    for package in ("halbach_fe", "halbach_fe.geo", "halbach_fe.pro"):  # a changed formula counts
+        for source in sorted(resources.files(package).iterdir(), key=lambda path: path.name):
+            if source.name.endswith((".py", ".pro", ".j2")):
+                digest.update(source.read_bytes())
     digest.update(np.ascontiguousarray(observation.points).tobytes())
     operator = observation.operator.tocoo()
     for part in (*operator.coords, operator.data):
@@ -121,8 +131,7 @@ def _write(path: Path, key: str, built: Response) -> None:
          "nominal": ("parameter", built.nominal, {"units": "A/m"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error})
-    with atomic(path) as temporary:
-        data.to_netcdf(temporary, engine="h5netcdf")
+    write_hdf5(data, path)
 
 
 def _read(path: Path, key: str) -> Response | None:
@@ -132,6 +141,7 @@ def _read(path: Path, key: str) -> Response | None:
             if data.attrs["key"] != key:
                 return None
             return Response(data["H"].values, tuple(map(str, data["parameter"].values)),
-                            data["nominal"].values, float(data.attrs["superposition_error"]))
+                            data["nominal"].values, float(data.attrs["superposition_error"]),
+                            reused=True)
     except (OSError, KeyError, ValueError, RuntimeError):
         return None

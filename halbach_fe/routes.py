@@ -71,6 +71,11 @@ def choose_route(study: Study, points: Floats) -> str:
 
 def check_points(study: Study, points: Floats) -> None:
     """Refuse points inside magnet or iron, where the field is not what a probe can read."""
+    if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
+        raise StudyError(
+            f"Input `observation.positions` of study {study.name} must lie in one plane, since it "
+            f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
+            "one circle, or a 3D study.")
     inside = points_in_material(study, points)
     if inside.any():
         x, y, z = points[np.argmax(inside)]

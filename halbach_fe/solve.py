@@ -18,7 +18,7 @@ import numpy as np
 
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.errors import GetDPError, MeshError, OutputError
+from halbach_fe.errors import GetDPError, OutputError, PointsOutsideError
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
 from halbach_fe.study import MU_0, Study
@@ -80,6 +80,8 @@ def solve_sources(
     """
     first, last = sources
     count = last - first + 1
+    if study.dimension == 2:
+        points = points * [1, 1, 0]  # the mesh's plane stands for every other
     folder = make_folder(workshop.folder)
     mesh = verify_mesh(build_mesh(study, folder))
     check_inside(mesh, points)
@@ -87,8 +89,8 @@ def solve_sources(
     parts = max(1, min(count, workshop.jobs // len(variants)))
     limits = np.linspace(first, last + 1, parts + 1).astype(int)
     ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
-    tasks = [_task(study, mesh, points, part, vacuum, workshop)
-             for vacuum in variants for part in ranges]
+    tasks = [_task(study, mesh, points, part, vacuum, workshop, f"-{number}" if number else "")
+             for vacuum in variants for number, part in enumerate(ranges)]
     results = run_tasks(tasks, workshop)
     fields = [np.concatenate(results[i * parts:(i + 1) * parts]) for i in range(len(variants))]
     return fields[0] if len(fields) == 1 else fields[0] - fields[1]
@@ -160,11 +162,11 @@ class _Counter:
 
 def _task(
     study: Study, mesh: VerifiedMesh, points: Floats, sources: tuple[int, int], vacuum: bool,
-    workshop: Workshop,
+    workshop: Workshop, suffix: str,
 ) -> Task:
     count = sources[1] - sources[0] + 1
     return Task(
-        name=f"getdp-{'vacuum' if vacuum else 'real'}" + (f"-{sources[0]}" if sources[0] else ""),
+        name=f"getdp-{'vacuum' if vacuum else 'real'}{suffix}",
         stage=lambda folder: stage(study, mesh, points, folder, sources, vacuum,
                                    workshop.time_limit_s),
         read=lambda folder: runner.read_vectors(folder / FLUX_DENSITY_FILE, points, count),
@@ -187,7 +189,8 @@ def stage(
     return Job(
         problem=problem, mesh=MESH_NAME, resolution="Magnetostatics",
         numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]},
-        outputs=(FLUX_DENSITY_FILE,), unknowns=mesh.unknowns, time_limit_s=time_limit_s)
+        outputs=(FLUX_DENSITY_FILE,), unknowns=mesh.unknowns,
+        solves=sources[1] - sources[0] + 1, time_limit_s=time_limit_s)
 
 
 @contextmanager
@@ -217,6 +220,7 @@ def _replace(folder: Path, kept: Path) -> None:
 
 
 def make_folder(folder: Path) -> Path:
+    """Make a folder and its parents if need be; raise OutputError if that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -225,11 +229,12 @@ def make_folder(folder: Path) -> Path:
 
 
 def check_inside(mesh: VerifiedMesh, points: Floats) -> None:
+    """Refuse points outside the mesh, where GetDP would print zeros."""
     radius = np.hypot(points[:, 0], points[:, 1])
     outside = (radius > mesh.radius) | (np.abs(points[:, 2]) > mesh.half_length)
     if outside.any():
         x, y, z = points[np.argmax(outside)]
-        raise MeshError(
+        raise PointsOutsideError(
             f"Input `observation.positions` of study {mesh.regions.study} must lie within the "
             f"meshed region (radius {mesh.radius:g} m, half length {mesh.half_length:g} m); "
             f"instead {outside.sum()} points lie outside, the first at ({x:g}, {y:g}, {z:g}) m. "

@@ -31,7 +31,8 @@ MIN_LENGTH_M = 1e-4
 # The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
 Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
 Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
-Coordinate = Annotated[float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M)]
+Coordinate = Annotated[
+    float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M, allow_inf_nan=False)]
 Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -221,12 +222,21 @@ Observation = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="
 
 
 class NoiseRegion(_Model):
-    """A z window with one standard deviation per reading. The first region that fits is used."""
+    """A z window with one standard deviation per reading. The first region that fits is used.
 
-    name: Annotated[str, Field(min_length=1)]
-    z_min_m: float = -math.inf
-    z_max_m: float = math.inf
+    A limit that is left out is none.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    z_min_m: Coordinate | None = None
+    z_max_m: Coordinate | None = None
     sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> NoiseRegion:
+        if self.z_min_m is not None and self.z_max_m is not None and self.z_min_m >= self.z_max_m:
+            raise ValueError(f"z_min_m ({self.z_min_m}) must be below z_max_m ({self.z_max_m})")
+        return self
 
 
 class Noise(_Model):
@@ -301,6 +311,10 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        for name, size in self.mesh:
+            if name.endswith("size_m") and size is not None and size > self.array.outer_radius_m:
+                raise ValueError(f"mesh.{name} ({size}) must not be larger than the array "
+                                 f"({self.array.outer_radius_m}); is it in millimetres?")
         return self
 
 

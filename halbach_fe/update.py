@@ -6,6 +6,8 @@ prior and by the posterior, with error bars, and compared region by region.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,9 +17,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, points_in_material
-from halbach_fe.errors import MeasurementError, must_be
-from halbach_fe.field_map import atomic, points_of
-from halbach_fe.inference.linear import chi2_per_reading, posterior, predict
+from halbach_fe.errors import MeasurementError, PointsOutsideError, must_be
+from halbach_fe.field_map import atomic, points_of, write_hdf5
+from halbach_fe.inference.linear import chi2_per_reading, posterior, predict, prior_conflict
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.observation import (
     Observation,
@@ -33,6 +35,7 @@ from halbach_fe.study import Study
 ALL_READINGS = "all"
 """The one region of a study without noise regions."""
 
+TRAINING, HELD_OUT = "training", "held out"
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
 
@@ -49,19 +52,20 @@ class Prediction:
 class RegionScore:
     """How prior and posterior predict the readings of one region.
 
-    Relative errors are ``|measured - predicted| / |measured|``; coverage is the fraction of
-    readings within the 95 % band of prediction and noise; chi2 is per reading.
+    Relative errors are ``|measured - predicted| / |measured|``, of readings above their noise;
+    coverage is the fraction of readings within the 95 % band of prediction and noise; chi2 is per
+    reading. Both are None for training readings, which the posterior has seen.
     """
 
     region: str
     part: str
     readings: int
-    median_relative_error_prior: float
-    median_relative_error_posterior: float
-    coverage95_prior: float
-    coverage95_posterior: float
-    chi2_prior: float
-    chi2_posterior: float
+    median_relative_error_prior: float | None
+    median_relative_error_posterior: float | None
+    coverage95_prior: float | None
+    coverage95_posterior: float | None
+    chi2_prior: float | None
+    chi2_posterior: float | None
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ class Update:
     posterior: Gaussian
     prediction_prior: Prediction
     prediction_posterior: Prediction
+    prior_conflict: float
 
     @property
     def scores(self) -> tuple[RegionScore, ...]:
@@ -88,26 +93,36 @@ class Update:
         return tuple(
             self._score(region, part, chosen)
             for region in dict.fromkeys(names)
-            for part, mask in (("training", ~self.held_out), ("held out", self.held_out))
+            for part, mask in ((TRAINING, ~self.held_out), (HELD_OUT, self.held_out))
             if (chosen := mask & (np.array(self.regions) == region)).any())
 
+    @property
+    def conflict_limit(self) -> float:
+        """`prior_conflict` beyond which chance is no explanation: five standard deviations."""
+        return 1 + 5 * float(np.sqrt(2 / np.sum(~self.held_out)))
+
     def relative_error(self, prediction: Prediction) -> Floats:
-        """|measured - predicted| / |measured| of every reading."""
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.abs((self.readings - prediction.mean) / self.readings))
+        """|measured - predicted| / |measured| of every reading; NaN for those below their noise."""
+        above = np.abs(self.readings) > self.sigma
+        return np.asarray(np.abs(self.readings - prediction.mean)
+                          / np.where(above, np.abs(self.readings), np.nan))
 
     def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
-        figures = {}
+        figures: dict[str, float | None] = {}
         for name, model, prediction in (
                 ("prior", self.prior, self.prediction_prior),
                 ("posterior", self.posterior, self.prediction_posterior)):
+            errors = self.relative_error(prediction)[chosen]
+            errors = errors[~np.isnan(errors)]
+            figures[f"median_relative_error_{name}"] = (
+                float(np.median(errors)) if len(errors) else None)
+            unseen = part == HELD_OUT
             total = np.hypot(prediction.sd, self.sigma)[chosen]
-            error = (self.readings - prediction.mean)[chosen]
-            figures[f"median_relative_error_{name}"] = float(
-                np.median(self.relative_error(prediction)[chosen]))
-            figures[f"coverage95_{name}"] = float(np.mean(np.abs(error) <= COVERAGE_Z * total))
+            inside = np.abs(self.readings - prediction.mean)[chosen] <= COVERAGE_Z * total
+            figures[f"coverage95_{name}"] = float(np.mean(inside)) if unseen else None
             figures[f"chi2_{name}"] = chi2_per_reading(
-                self.response.matrix[chosen], self.readings[chosen], self.sigma[chosen], model)
+                self.response.matrix[chosen], self.readings[chosen], self.sigma[chosen],
+                model) if unseen else None
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 
@@ -145,6 +160,11 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
     observation = observe(study, points, measured)
     sigma = standard_deviations(study, observation, data)
     keep = held_out(study, observation.positions[:, 2])
+    if study.inference.held_out is not None and not keep.any():
+        raise MeasurementError(must_be(
+            "readings", "map", "at enough z positions for the study to hold some out",
+            f"{len(np.unique(observation.positions[:, 2]))} positions",
+            "Remove inference.held_out, or make its window smaller."))
     if keep.all():
         raise MeasurementError(must_be(
             "readings", "map", "enough for the study to leave some for the update",
@@ -156,7 +176,10 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         regions = tuple(names[i] for i in noise_regions(study.noise,
                                                         observation.positions[:, 2]))
     readings = observation.apply(np.nan_to_num(data["B_T"].values))
-    model = response(study, observation, workshop)
+    try:
+        model = response(study, observation, workshop)
+    except PointsOutsideError as error:
+        raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
     before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                          study.prior.direction_sd_deg, study.prior.common_mode_sd)
     after = posterior(model.matrix[~keep], readings[~keep], sigma[~keep], before)
@@ -164,7 +187,8 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         study=study, observation=observation, readings=readings, sigma=sigma, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=Prediction(*predict(model.matrix, before)),
-        prediction_posterior=Prediction(*predict(model.matrix, after)))
+        prediction_posterior=Prediction(*predict(model.matrix, after)),
+        prior_conflict=prior_conflict(model.matrix[~keep], readings[~keep], sigma[~keep], before))
 
 
 def write_update(update: Update, folder: Path) -> None:
@@ -180,8 +204,7 @@ def write_update(update: Update, folder: Path) -> None:
         coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
     magnetization["posterior_covariance"] = (("parameter", "parameter_2"),
                                              update.posterior.covariance, {"units": "A2/m2"})
-    with atomic(folder / "posterior.h5") as temporary:
-        magnetization.to_netcdf(temporary, engine="h5netcdf")
+    write_hdf5(magnetization, folder / "posterior.h5")
     x, y, z = update.observation.positions.T
     columns = {
         "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
@@ -190,10 +213,13 @@ def write_update(update: Update, folder: Path) -> None:
         "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
         "posterior_mean_T": update.prediction_posterior.mean,
         "posterior_sd_T": update.prediction_posterior.sd}
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    text = "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows), ""])
-    write_text(folder / "prediction.csv", text)
-    write_text(folder / "summary.json", json.dumps(summary(update), indent=1) + "\n")
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+    write_text(folder / "prediction.csv", table.getvalue())
+    text = json.dumps(summary(update), indent=1, allow_nan=False)
+    write_text(folder / "summary.json", text + "\n")
 
 
 def summary(update: Update) -> dict[str, object]:
@@ -205,6 +231,8 @@ def summary(update: Update) -> dict[str, object]:
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
         "superposition_error": update.response.superposition_error,
+        "prior_conflict": update.prior_conflict,
+        "prior_conflict_limit": update.conflict_limit,
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
         "scores": [asdict(score) for score in update.scores],

@@ -24,27 +24,29 @@ if command -v dpkg >/dev/null 2>&1; then
 fi
 if [ -n "$missing" ]; then
     if ! command -v apt-get >/dev/null 2>&1; then
-        echo "This system has no apt-get. Please install by hand, then run again:" >&2
-        echo "  GetDP 3.2 or later with PETSc and MUMPS, from https://getdp.info; then" >&2
-        echo "    export HALBACH_FE_GETDP=/path/to/getdp" >&2
-        echo "  Python 3.11 or later with venv" >&2
+        echo "This system has no apt-get. Unpack a GetDP with PETSc and MUMPS from" >&2
+        echo "https://getdp.info, have Python 3.11 or later with venv, and run" >&2
+        echo "  export HALBACH_FE_GETDP=/path/to/getdp PYTHON=/path/to/python3" >&2
+        echo "  make demo" >&2
         exit 1
     fi
+    by_hand() {
+        echo "$1 Please have these two commands run as root, then run again:" >&2
+        echo "  apt-get update" >&2
+        echo "  apt-get install -y --no-install-recommends$(printf ' %s' $missing)" >&2
+        exit 1
+    }
     as_root=""
     if [ "$(id -u)" -ne 0 ]; then
-        if command -v sudo >/dev/null 2>&1; then
-            as_root="sudo"
-        else
-            echo "Neither root nor sudo here. Please have these two commands run as root, then run again:" >&2
-            echo "  apt-get update" >&2
-            echo "  apt-get install -y --no-install-recommends$(printf ' %s' $missing)" >&2
-            exit 1
-        fi
+        command -v sudo >/dev/null 2>&1 || by_hand "Neither root nor sudo here."
+        as_root="sudo"
     fi
     echo "Installing from the distribution:$(printf ' %s' $missing)"
-    $as_root apt-get update -qq
+    $as_root apt-get update -qq || by_hand "Installing did not work."
     # shellcheck disable=SC2086
-    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq --no-install-recommends $missing >/dev/null
+    $as_root env DEBIAN_FRONTEND=noninteractive \
+        apt-get install -y -qq --no-install-recommends $missing >/dev/null ||
+        by_hand "Installing did not work."
 fi
 if ! "$python" -c "$usable" >/dev/null 2>&1; then
     echo "Python 3.11 or later with venv is needed, but $python is $("$python" --version 2>&1)." >&2

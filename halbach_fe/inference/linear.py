@@ -34,15 +34,32 @@ def posterior(matrix: Floats, readings: Floats, sigma: Floats, prior: Gaussian) 
     Gaussian
         With a root of as many columns as the prior's.
     """
-    n, k = len(readings), prior.root.shape[1]
-    whitened = (matrix @ prior.root) / sigma[:, None]
-    residual = (readings - matrix @ prior.mean) / sigma
-    stacked = np.vstack([whitened, np.eye(k)])
-    q, r = linalg.qr(stacked, mode="economic")
-    z = linalg.solve_triangular(r, q[:n].T @ residual)
+    q, r, residual = _factorize(matrix, readings, sigma, prior)
+    z = linalg.solve_triangular(r, q.T @ residual)
     # cov(z) = (R'R)^-1, so R^-1 is a root of it
     root = linalg.solve_triangular(r, prior.root.T, trans="T").T
     return Gaussian(prior.mean + prior.root @ z, root)
+
+
+def prior_conflict(matrix: Floats, readings: Floats, sigma: Floats, prior: Gaussian) -> float:
+    """How far readings lie from what prior and noise foretell: mean of chi-squared, 1 if all is
+    well, with a standard deviation of sqrt(2/n).
+
+    This is ``r' (I + G G')^-1 r / n``, the squared Mahalanobis distance from the prior predictive;
+    it equals the minimum of the least squares problem, so the QR gives it for nothing.
+    """
+    q, _, residual = _factorize(matrix, readings, sigma, prior)
+    explained = q.T @ residual
+    return float((residual @ residual - explained @ explained) / len(readings))
+
+
+def _factorize(
+    matrix: Floats, readings: Floats, sigma: Floats, prior: Gaussian
+) -> tuple[Floats, Floats, Floats]:
+    """QR of [G; I], Q's rows of G only, and the whitened residual of the prior mean."""
+    whitened = (matrix @ prior.root) / sigma[:, None]
+    q, r = linalg.qr(np.vstack([whitened, np.eye(prior.root.shape[1])]), mode="economic")
+    return q[:len(readings)], r, (readings - matrix @ prior.mean) / sigma
 
 
 def predict(matrix: Floats, parameters: Gaussian) -> tuple[Floats, Floats]:
@@ -52,6 +69,9 @@ def predict(matrix: Floats, parameters: Gaussian) -> tuple[Floats, Floats]:
 
 
 def chi2_per_reading(matrix: Floats, readings: Floats, sigma: Floats, model: Gaussian) -> float:
-    """Mean squared error over the variance of prediction and noise, about 1 if all is well."""
+    """Mean squared error over the variance of prediction and noise, about 1 if all is well.
+
+    For readings that the model has not seen; those that it was fitted to lie nearer.
+    """
     mean, sd = predict(matrix, model)
     return float(np.mean((readings - mean) ** 2 / (sd**2 + sigma**2)))

@@ -59,7 +59,7 @@ def measured(tmp_path):
     return path
 
 
-def test_solve_writes_maps(study, tmp_path, capsys):
+def test_solve_writes_maps(study, tmp_path, capsys, getdp):
     out = tmp_path / "out"
     assert main(["solve", str(study), "-o", str(out), "--json"]) == 0
     shown = capsys.readouterr()
@@ -74,9 +74,9 @@ def test_solve_writes_maps(study, tmp_path, capsys):
     assert summary["max_B_T"] == pytest.approx(0.55, abs=0.05)
     assert not [name for name in names if name.startswith(".")]
     # the run folder can be run by hand
-    done = subprocess.run(["getdp", "magnetostatics_2d.pro", "-msh", "mesh.msh", "-solve",
-                           "Magnetostatics"], cwd=out / "getdp-real", capture_output=True,
-                          check=False)
+    by_hand = [getdp.executable, "magnetostatics_2d.pro", "-msh", "mesh.msh", "-solve",
+               "Magnetostatics"]
+    done = subprocess.run(by_hand, cwd=out / "getdp-real", capture_output=True, check=False)
     assert done.returncode == 0
 
 
@@ -150,6 +150,14 @@ def test_bad_maps(study, measured, tmp_path, capsys):
     assert "finite number" in sentence
 
 
+def test_doctor_without_getdp_still_tells_the_rest(capsys):
+    assert main(["doctor", "--getdp", "/nowhere"]) == 6
+    shown = capsys.readouterr()
+    assert "not found" in shown.out
+    assert "numpy" in shown.out
+    assert "apt-get" in shown.err
+
+
 def test_no_getdp(study, tmp_path, capsys):
     code, sentence = refused(["solve", study, "-o", tmp_path / "out", "--getdp", "/nowhere"],
                              capsys)
@@ -216,7 +224,18 @@ def test_full_disk(study, small_disk, capsys):
     assert not list(small_disk.rglob(".field_map*"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("small_disk", [16, 32], indirect=True)
+def test_full_disk_while_writing_results(study, small_disk, capsys):
+    """HDF5 must not crash the process when its file finds no room."""
+    study.write_text(STUDY.replace("recoil_permeability = 1.05", "recoil_permeability = 1.0")
+                     .replace("angles = 10", "angles = 2000"))
+    code, sentence = refused(["solve", study, "-o", small_disk / "out"], capsys)
+    assert code == 8
+    assert "No space left" in sentence
+    assert not list(small_disk.rglob("*field_map*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interruption_ends_getdp_too(study, tmp_path, number):
     out = tmp_path / "out"
     marker = tmp_path / "pid"

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from halbach_fe.errors import StudyError
-from halbach_fe.inference.linear import chi2_per_reading, posterior, predict
+from halbach_fe.inference.linear import (
+    chi2_per_reading,
+    posterior,
+    predict,
+    prior_conflict,
+)
 from halbach_fe.inference.prior import Gaussian, block_prior
 
 
@@ -115,6 +120,25 @@ def test_prediction_and_chi2(generator):
     # sd of chi2/n over 400 readings is 0.07
     assert chi2_per_reading(matrix, readings, sigma, certain) == pytest.approx(1.0, abs=0.3)
     assert chi2_per_reading(matrix, readings + 3 * sigma, sigma, certain) > 3
+
+
+def test_prior_conflict_is_the_prior_predictive_distance(generator):
+    matrix, readings, sigma, prior = problem(generator)
+    covariance = matrix @ prior.covariance @ matrix.T + np.diag(sigma**2)
+    residual = readings - matrix @ prior.mean
+    expected = residual @ np.linalg.solve(covariance, residual) / len(readings)
+    assert prior_conflict(matrix, readings, sigma, prior) == pytest.approx(expected)
+
+
+def test_prior_conflict_sees_noise_that_was_understated(generator):
+    """Even with more parameters than readings, where every fit is perfect."""
+    matrix, _, _, prior = problem(generator, 40, 200)
+    sigma = np.full(40, 5.0)
+    truth = prior.sample(1, generator)[0]
+    noise = sigma * generator.standard_normal(40)
+    # 40 readings: sd 0.22
+    assert prior_conflict(matrix, matrix @ truth + noise, sigma, prior) < 1.9
+    assert prior_conflict(matrix, matrix @ truth + 10 * noise, sigma, prior) > 1.9
 
 
 def test_block_prior_along_and_across(generator):

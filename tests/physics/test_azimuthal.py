@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -97,7 +99,7 @@ def test_refinement_converges(modes, workshop):
     """The nominal field with iron on three meshes: each step is at least twice smaller."""
     fields = [solve_nominal(modes(iron_ring=IRON, mesh__meridian_size_m=size), POINTS, workshop)
               for size in (0.04, 0.02, 0.01)]
-    steps = [np.abs(b - a).max() for a, b in zip(fields, fields[1:], strict=False)]
+    steps = [np.abs(b - a).max() for a, b in pairwise(fields)]
     assert steps[1] < steps[0] / 2
     assert steps[1] < 3e-4 * np.abs(fields[-1]).max()
 

@@ -73,6 +73,13 @@ def test_overlapping_cuboids_are_refused(dipole):
             "shape": "cuboid", "width_m": 0.0825, "orientation": "magnetization"}))
 
 
+def test_crossing_cuboids_are_refused(dipole):
+    """Thin cuboids that cross like swords hold no corner or centre of each other."""
+    with pytest.raises(StudyError, match="overlap"):
+        blocks_of(dipole(array__inner_radius_m=0.1, array__outer_radius_m=0.2, array__block={
+            "shape": "cuboid", "width_m": 0.002, "orientation": "magnetization"}))
+
+
 def test_iron_and_blocks_are_material_air_is_not(short_dipole):
     study = short_dipole(iron_ring={"inner_radius_m": 0.19, "outer_radius_m": 0.2,
                                     "relative_permeability": 100.0, "length_m": 0.1})

@@ -42,6 +42,15 @@ def test_vtu_reads_back(tmp_path):
     mesh = meshio.read(tmp_path / "map.vtu")
     np.testing.assert_allclose(mesh.points, np.eye(3))
     np.testing.assert_allclose(mesh.point_data["B_T"], data["B_T"].values)
+    data["B_T"].values[1, 1] = np.nan
+    data["sigma_T"] = (("point", "component"), np.full((3, 3), 1e-4))
+    write_map(data, tmp_path / "map.vtu")
+    again = read_map(tmp_path / "map.vtu")
+    for name in ("B_T", "sigma_T", "x_m", "y_m", "z_m"):
+        np.testing.assert_array_equal(again[name].values, data[name].values)
+    (tmp_path / "map.vtu").write_text("<VTKFile")
+    with pytest.raises(MeasurementError, match="VTU"):
+        read_map(tmp_path / "map.vtu")
 
 
 def test_columns_in_any_order_and_missing_components(tmp_path):
@@ -76,6 +85,7 @@ def test_columns_in_any_order_and_missing_components(tmp_path):
     (HEADER + "0,0,0,.1,.1,.1\n0,0,1,.1,.1,.1\n0,0,0,.2,.1,.1\n", "reading 3"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,0\n", "sigma"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,-1\n", "sigma"),
+    (HEADER + "0,0,0,1,1," + "1" * 200_000 + "\n", "line 2"),
 ])
 def test_bad_csv_is_refused_by_name(tmp_path, text, said):
     path = tmp_path / "map.csv"
@@ -109,6 +119,34 @@ def test_bad_files_are_refused(tmp_path, damage):
         write_map(field_map(np.eye(3), np.full((3, 3), np.inf)), path)
     with pytest.raises(MeasurementError, match=path.name):
         read_map(path)
+
+
+@pytest.mark.parametrize(("name", "value", "said"), [
+    ("B_T", (("point", "component"), np.full((3, 3), "a")), "`B_T`"),
+    ("time_s", ("point", np.array(["2026-01-01"] * 3, "datetime64[s]")), "`time_s`"),
+    ("x_m", ((), 1.0), "`x_m`"),
+    ("sigma_T", (("point", "other"), np.ones((3, 2))), "`sigma_T`"),
+])
+def test_hdf5_of_another_make_is_refused(tmp_path, name, value, said):
+    data = field_map(np.eye(3), np.ones((3, 3))).drop_vars([name], errors="ignore")
+    data[name] = value
+    data.to_netcdf(tmp_path / "map.h5", engine="h5netcdf")
+    with pytest.raises(MeasurementError, match=said):
+        read_map(tmp_path / "map.h5")
+
+
+def test_hdf5_sigma_for_all_components_at_once(tmp_path):
+    data = field_map(np.eye(3), np.ones((3, 3)))
+    data["sigma_T"] = ("point", [1e-4, 2e-4, 3e-4])
+    data.to_netcdf(tmp_path / "map.h5", engine="h5netcdf")
+    assert read_map(tmp_path / "map.h5")["sigma_T"].values[:, 2].tolist() == [1e-4, 2e-4, 3e-4]
+
+
+def test_hdf5_without_readings_is_refused(tmp_path):
+    field_map(np.zeros((0, 3)), np.zeros((0, 3))).to_netcdf(tmp_path / "map.h5",
+                                                            engine="h5netcdf")
+    with pytest.raises(MeasurementError, match="at least one reading"):
+        read_map(tmp_path / "map.h5")
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):

@@ -110,6 +110,8 @@ def test_residual_that_stays_large_is_caught_without_petscs_help(tmp_path):
     job_log = ["Info : System 1/1: 10 Dofs", "  0 KSP Residual norm 1e5",
                "  1 KSP Residual norm 1e-7"]
     job = Job("a.pro", "m.msh", "R", ())
+    with pytest.raises(GetDPError, match="residuals of 0 of 1 solves"):
+        _check_log(job_log[:1], job, tmp_path)
     _check_log(job_log, job, tmp_path)
     for bad in ("1e2", "nan"):
         with pytest.raises(GetDPError, match="did not converge"):

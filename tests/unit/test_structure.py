@@ -13,8 +13,8 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 
 # Later rooms may import earlier ones, never the other way round.
 ORDER = ["errors", "analytic", "study", "blocks", "regions", "exact_field", "geo", "mesh",
-         "field_map", "getdp", "inference", "solve", "azimuthal", "routes", "observation", "response", "update", "report",
-         "cli"]
+         "field_map", "getdp", "inference", "solve", "azimuthal", "routes", "observation",
+         "response", "update", "report", "cli"]
 
 
 def imports(path):

@@ -48,6 +48,11 @@ def test_studies_are_frozen(dipole):
         "kind": "circles", "radius_m": 0.07, "angles": 16}}}, "more than 16 angles"),
     ({"iron_ring": {"inner_radius_m": 0.3, "outer_radius_m": 0.2, "relative_permeability": 100}},
      "`iron_ring`"),
+    ({"noise": {"regions": [{"name": "a", "z_min_m": -430, "z_max_m": 420, "sigma_T": 1e-4}]}},
+     "Was it meant in millimetres?"),
+    ({"noise": {"regions": [{"name": "a", "z_min_m": 0.4, "z_max_m": 0.1, "sigma_T": 1e-4}]}},
+     "must be below z_max_m"),
+    ({"mesh__block_size_m": 8.0}, "is it in millimetres?"),
     ({"noise": {"regions": [{"name": "all", "sigma_T": -1e-4}]}}, "`noise.regions[0].sigma_T`"),
 ])
 def test_bad_values_are_refused_by_name(changes, said):
