@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; fail if GetDP is missing or its solve is wrong."""
-    findings = {"halbach-fe": metadata.version("halbach-fe"),
+    findings: dict[str, object] = {"halbach-fe": metadata.version("halbach-fe"),
                 "python": platform.python_version(), "system": platform.platform()}
     findings |= {name: metadata.version(name) for name in PACKAGES}
     try:

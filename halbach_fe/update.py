@@ -52,7 +52,7 @@ class Prediction:
 class RegionScore:
     """How prior and posterior predict the readings of one region.
 
-    Relative errors are ``|measured - predicted| / |measured|``, of readings above their noise;
+    Relative errors are ``|measured - predicted| / |measured|``, of readings that are not 0;
     coverage is the fraction of readings within the 95 % band of prediction and noise; chi2 is per
     reading. Both are None for training readings, which the posterior has seen.
     """
@@ -102,10 +102,9 @@ class Update:
         return 1 + 5 * float(np.sqrt(2 / np.sum(~self.held_out)))
 
     def relative_error(self, prediction: Prediction) -> Floats:
-        """|measured - predicted| / |measured| of every reading; NaN for those below their noise."""
-        above = np.abs(self.readings) > self.sigma
-        return np.asarray(np.abs(self.readings - prediction.mean)
-                          / np.where(above, np.abs(self.readings), np.nan))
+        """|measured - predicted| / |measured| of every reading; NaN for a reading of exactly 0."""
+        measured = np.where(self.readings != 0, np.abs(self.readings), np.nan)
+        return np.asarray(np.abs(self.readings - prediction.mean) / measured)
 
     def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
         figures: dict[str, float | None] = {}
