@@ -198,9 +198,9 @@ def _read_hdf5(path: Path) -> xr.Dataset:
     if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
         data["sigma_T"] = data["sigma_T"].broadcast_like(data["B_T"]).transpose(
             "point", "component")
-    expected: dict[str, tuple[str, ...]] = {
-        "B_T": ("point", "component"), "sigma_T": ("point", "component"), "time_s": ("point",),
-        "scan": ("point",)} | {name: ("point",) for name in POSITION_COLUMNS}
+    by_point: tuple[str, ...] = ("point",)
+    expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), by_point)
+    expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
     for name, dims in expected.items():
         if name not in data.variables:
             continue
