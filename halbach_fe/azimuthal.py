@@ -130,7 +130,7 @@ def _task(
             problem=PROBLEM, mesh=mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
             numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
                      "COLUMNS": columns},
-            unknowns=mesh.unknowns - (mesh.axis_nodes if span[0] > 0 else 0),
+            unknowns=mesh.inner_nodes - (mesh.axis_nodes if span[0] > 0 else 0),
             solves=count, time_limit_s=workshop.time_limit_s)
 
     return Task(

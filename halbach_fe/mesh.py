@@ -49,12 +49,23 @@ class MeshFiles:
 
 @dataclass(frozen=True)
 class VerifiedMesh:
-    """A mesh that holds every region, and how many unknowns the curl-curl problem has on it."""
+    """A mesh that holds every region, and what the number of unknowns follows from.
+
+    Attributes
+    ----------
+    inner_nodes, inner_edges : int
+        Off the outer boundary; edges of a 3D mesh only.
+    axis_nodes : int
+        Of the inner nodes, those on the axis of a half-plane.
+    radius, half_length : float
+        Extent in m.
+    """
 
     path: Path
     regions: Regions
     nodes: int
-    unknowns: int
+    inner_nodes: int
+    inner_edges: int
     axis_nodes: int
     radius: float
     half_length: float
@@ -125,6 +136,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
             f"Mesh {files.mesh} lacks its outer boundary (region {regions.outer_boundary}); GetDP "
             "would solve without a boundary condition. Mesh the study again."
         )
+    inner_nodes, inner_edges = _count_inner(mesh, physical, regions)
     extent = np.abs(mesh.points).max(axis=0)
     if regions.axis is not None:  # x is r, y is z
         radius, half_length = float(extent[0]), float(extent[1])
@@ -133,7 +145,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
         half_length = float(extent[2]) if regions.dimension == 3 else np.inf
     return VerifiedMesh(
         path=files.mesh, regions=regions, nodes=len(mesh.points),
-        unknowns=_count_unknowns(mesh, physical, regions),
+        inner_nodes=inner_nodes, inner_edges=inner_edges,
         axis_nodes=_count_axis_nodes(mesh, physical, regions),
         radius=radius, half_length=half_length,
     )
@@ -158,24 +170,20 @@ def _read(path: Path) -> meshio.Mesh:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
 
 
-def _count_unknowns(mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions) -> int:
-    """Number of unknowns that a right set-up must have.
-
-    2D: one A_z per node off the boundary. 3D: one circulation per edge off the boundary that is
-    not in the tree of the gauge; the tree, started on the boundary, has one edge per node off it.
-    """
+def _count_inner(
+    mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions
+) -> tuple[int, int]:
+    """Nodes, and in 3D edges, that are not on the outer boundary."""
     volume = [c for c in mesh.cells if _DIMENSION[c.type] == regions.dimension]
-    boundary = [c.data[tags == regions.outer_boundary]
-                for c, tags in zip(mesh.cells, physical, strict=True)
-                if _DIMENSION[c.type] == regions.dimension - 1]
-    inner_nodes = (len(np.unique(np.concatenate([c.data.ravel() for c in volume])))
-                   - len(np.unique(np.concatenate([b.ravel() for b in boundary]))))
-    if regions.dimension == 2:
-        return inner_nodes
     faces = [(c.type, c.data[tags == regions.outer_boundary])
-             for c, tags in zip(mesh.cells, physical, strict=True) if _DIMENSION[c.type] == 2]
+             for c, tags in zip(mesh.cells, physical, strict=True)
+             if _DIMENSION[c.type] == regions.dimension - 1]
+    nodes = (len(np.unique(np.concatenate([c.data.ravel() for c in volume])))
+             - len(np.unique(np.concatenate([data.ravel() for _, data in faces]))))
+    if regions.dimension == 2:
+        return nodes, 0
     edges = _count_edges([(c.type, c.data) for c in volume], len(mesh.points))
-    return edges - _count_edges(faces, len(mesh.points)) - inner_nodes
+    return nodes, edges - _count_edges(faces, len(mesh.points))
 
 
 def _count_axis_nodes(mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions) -> int:

@@ -8,8 +8,19 @@ from halbach_fe import azimuthal
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
 from halbach_fe.errors import StudyError
 from halbach_fe.exact_field import field_of
-from halbach_fe.solve import NOMINAL_SOURCE, Workshop, solve_sources
+from halbach_fe.solve import (
+    CROSS_SECTION,
+    EDGE_ELEMENTS,
+    NOMINAL_SOURCE,
+    SCALAR_POTENTIAL,
+    Workshop,
+    solve_sources,
+)
 from halbach_fe.study import Study
+
+
+FORMULATIONS = {"cross_section": CROSS_SECTION, "edge_elements": EDGE_ELEMENTS,
+                "scalar_potential": SCALAR_POTENTIAL}
 
 
 def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
@@ -43,10 +54,11 @@ def finite_element_part(
     vacuum = study.array.recoil_permeability == 1.0 and study.iron_ring is None
     if study.solver.method == "reaction" and vacuum:
         return np.zeros((last - first + 1, len(points), 3))
-    if choose_route(study, points) == "azimuthal_modes":
+    route = choose_route(study, points)
+    if route == "azimuthal_modes":
         fields = azimuthal.mode_fields(study, points, workshop, columns=last > NOMINAL_SOURCE)
         return fields[first:last + 1]
-    return solve_sources(study, points, sources, workshop)
+    return solve_sources(study, points, sources, workshop, FORMULATIONS[route])
 
 
 def choose_route(study: Study, points: Floats) -> str:
@@ -57,15 +69,18 @@ def choose_route(study: Study, points: Floats) -> str:
     StudyError
         If azimuthal modes are asked for where they do not apply.
     """
+    if study.dimension == 2:
+        return "cross_section"
     asked, suits = study.solver.route, azimuthal.suits(study, points)
     if asked == "azimuthal_modes" and not suits:
         raise StudyError(
-            f"Input `solver.route` of study {study.name} must be `edge_elements` or `auto` here; "
-            "instead received azimuthal_modes, which needs a 3D study of sectors without angular "
-            "gaps, and points that are not too near to the blocks.")
+            f"Input `solver.route` of study {study.name} must be another than "
+            "azimuthal_modes here, which needs sectors without angular gaps, and points that are "
+            "not too near to the blocks. Leave it out.")
     if asked == "auto":
-        fast = suits and study.solver.method == "reaction"
-        return "azimuthal_modes" if fast else "edge_elements"
+        if study.solver.method == "direct":
+            return "edge_elements"
+        return "azimuthal_modes" if suits else "edge_elements"
     return asked
 
 

@@ -59,8 +59,27 @@ def source_number(study: Study, block: int, component: int) -> int:
     return study.dimension * block + component + 1
 
 
+@dataclass(frozen=True)
+class Formulation:
+    """A problem file, how many unknowns it must have on a mesh, and what solves it."""
+
+    problem: str
+    unknowns: Callable[[VerifiedMesh], int]
+    options: tuple[str, ...] = runner.DIRECT_SOLVER
+
+
+CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda mesh: mesh.inner_nodes)
+EDGE_ELEMENTS = Formulation(
+    # the tree of the gauge, started on the boundary, has one edge per node off it
+    "magnetostatics_3d.pro", lambda mesh: mesh.inner_edges - mesh.inner_nodes)
+SCALAR_POTENTIAL = Formulation(
+    "scalar_potential_3d.pro", lambda mesh: mesh.inner_nodes + mesh.inner_edges,
+    runner.CONJUGATE_GRADIENTS)
+
+
 def solve_sources(
-    study: Study, points: Floats, sources: tuple[int, int], workshop: Workshop
+    study: Study, points: Floats, sources: tuple[int, int], workshop: Workshop,
+    formulation: Formulation,
 ) -> Floats:
     """Finite-element part of the field for a range of sources.
 
@@ -89,7 +108,8 @@ def solve_sources(
     parts = max(1, min(count, workshop.jobs // len(variants)))
     limits = np.linspace(first, last + 1, parts + 1).astype(int)
     ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
-    tasks = [_task(study, mesh, points, part, vacuum, workshop, f"-{number}" if number else "")
+    tasks = [_task(study, mesh, points, part, vacuum, workshop, formulation,
+                   f"-{number}" if number else "")
              for vacuum in variants for number, part in enumerate(ranges)]
     results = run_tasks(tasks, workshop)
     fields = [np.concatenate(results[i * parts:(i + 1) * parts]) for i in range(len(variants))]
@@ -162,35 +182,35 @@ class _Counter:
 
 def _task(
     study: Study, mesh: VerifiedMesh, points: Floats, sources: tuple[int, int], vacuum: bool,
-    workshop: Workshop, suffix: str,
+    workshop: Workshop, formulation: Formulation, suffix: str,
 ) -> Task:
     count = sources[1] - sources[0] + 1
     return Task(
         name=f"getdp-{'vacuum' if vacuum else 'real'}{suffix}",
-        stage=lambda folder: stage(study, mesh, points, folder, sources, vacuum,
-                                   workshop.time_limit_s),
+        stage=lambda folder: stage(study, mesh, points, folder, formulation, sources,
+                                   vacuum, workshop.time_limit_s),
         read=lambda folder: runner.read_vectors(folder / FLUX_DENSITY_FILE, points, count),
         solves=count)
 
 
 def stage(
-    study: Study, mesh: VerifiedMesh, points: Floats, folder: Path,
+    study: Study, mesh: VerifiedMesh, points: Floats, folder: Path, formulation: Formulation,
     sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE), vacuum: bool = False,
     time_limit_s: float = 3600.0,
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there."""
-    problem = f"magnetostatics_{study.dimension}d.pro"
-    for name in (problem, *PROBLEM_INCLUDES):
+    for name in (formulation.problem, *PROBLEM_INCLUDES):
         text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
         (folder / name).write_bytes(text)
     (folder / "case.pro").write_text(render("case.pro.j2", study=study, regions=mesh.regions,
                                             points=points.tolist()), encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
     return Job(
-        problem=problem, mesh=MESH_NAME, resolution="Magnetostatics",
+        problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
         numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]},
-        outputs=(FLUX_DENSITY_FILE,), unknowns=mesh.unknowns,
-        solves=sources[1] - sources[0] + 1, time_limit_s=time_limit_s)
+        outputs=(FLUX_DENSITY_FILE,), unknowns=formulation.unknowns(mesh),
+        solves=sources[1] - sources[0] + 1, options=formulation.options,
+        time_limit_s=time_limit_s)
 
 
 @contextmanager

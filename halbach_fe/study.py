@@ -282,11 +282,12 @@ class Solver(_Model):
 
     ``route`` is how a 3D reaction is computed: ``azimuthal_modes``, one (r, z) problem per mode,
     for rotationally symmetric materials (sectors without gaps); ``edge_elements``, curl-curl in
-    3D, for any geometry; ``auto`` takes the first where it can, and ``direct`` by edge elements.
+    3D, for any geometry; ``scalar_potential``, its dual, of second order, for any geometry too.
+    ``auto`` takes the first where it can, edge elements elsewhere and for ``direct``.
     """
 
     method: Literal["reaction", "direct"] = "reaction"
-    route: Literal["auto", "azimuthal_modes", "edge_elements"] = "auto"
+    route: Literal["auto", "azimuthal_modes", "edge_elements", "scalar_potential"] = "auto"
 
 
 class Study(_Model):

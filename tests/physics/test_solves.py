@@ -12,7 +12,7 @@ from halbach_fe.exact_field import field_of, unit_field
 from halbach_fe.observation import observe
 from halbach_fe.response import response, verify_superposition
 from halbach_fe.routes import solve_nominal
-from halbach_fe.solve import solve_sources, source_number
+from halbach_fe.solve import EDGE_ELEMENTS, solve_sources, source_number
 from tests.conftest import circle
 
 SECTORS = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)
@@ -120,7 +120,7 @@ def test_3d_one_block_all_components(short_dipole, workshop):
     study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"})
     points, number = in_bore(), 5
     first = source_number(study, number, 0)
-    found = solve_sources(study, points, (first, first + 2), workshop)
+    found = solve_sources(study, points, (first, first + 2), workshop, EDGE_ELEMENTS)
     exact = np.moveaxis(unit_field(blocks_of(study)[number], points), 2, 0)
     for axis in range(3):
         scale = np.abs(exact[axis]).max()
@@ -192,7 +192,7 @@ def test_stored_response_is_used_only_for_the_same_inputs(dipole, workshop):
         response(other, observe(other, points, measured), workshop).matrix, changed.matrix)
 
 
-@pytest.mark.parametrize("route", ["edge_elements", "azimuthal_modes"])
+@pytest.mark.parametrize("route", ["edge_elements", "scalar_potential", "azimuthal_modes"])
 def test_one_point_alone(short_dipole, workshop, route):
     """GetDP's interpolation of a table of one line gives nothing; a study of one point works."""
     study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03)

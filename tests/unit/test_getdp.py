@@ -24,7 +24,7 @@ from halbach_fe.getdp import (
     run,
 )
 from halbach_fe.mesh import build_mesh, verify_mesh
-from halbach_fe.solve import FLUX_DENSITY_FILE, stage
+from halbach_fe.solve import CROSS_SECTION, EDGE_ELEMENTS, FLUX_DENSITY_FILE, stage
 from tests.conftest import circle
 
 POINTS = circle(0.07, 5)
@@ -37,7 +37,7 @@ def staged(dipole, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
-    return folder, stage(study, mesh, POINTS, folder)
+    return folder, stage(study, mesh, POINTS, folder, CROSS_SECTION)
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -91,7 +91,7 @@ def test_missing_gauge(getdp, short_dipole, tmp_path):
     mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
     folder = tmp_path / "run"
     folder.mkdir()
-    job = stage(study, mesh, POINTS, folder)
+    job = stage(study, mesh, POINTS, folder, EDGE_ELEMENTS)
     gauge = ("{ NameOfCoef ae; EntityType EdgesOfTreeIn; EntitySubType StartingOn;\n"
              "        NameOfConstraint TreeGauge; }")
     edit(folder / job.problem, gauge, "")
@@ -101,7 +101,7 @@ def test_missing_gauge(getdp, short_dipole, tmp_path):
 
 def test_unconverged_krylov_solver(getdp, staged):
     folder, job = staged
-    options = ("-ksp_type", "cg", "-pc_type", "none", "-ksp_max_it", "3")
+    options = ("-petsc_prealloc", "100", "-ksp_type", "cg", "-pc_type", "none", "-ksp_max_it", "3")
     with pytest.raises(GetDPError, match="linear solver did not converge"):
         run(getdp, dataclasses.replace(job, options=options), folder)
 
@@ -158,7 +158,7 @@ def test_point_outside_the_mesh(getdp, dipole, tmp_path):
     points = np.vstack([POINTS, [[100.0, 0, 0]]])
     folder = tmp_path / "run"
     folder.mkdir()
-    job = stage(study, mesh, points, folder)
+    job = stage(study, mesh, points, folder, CROSS_SECTION)
     with pytest.raises(GetDPError, match=r"point outside the mesh|outside"):
         run(getdp, job, folder)
         read_vectors(folder / FLUX_DENSITY_FILE, points, 1)
@@ -196,7 +196,7 @@ def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
     folder.mkdir(parents=True)
     study = dipole(mesh__block_size_m=0.03)
     mesh = verify_mesh(build_mesh(study, folder / "mesh"))
-    job = stage(study, mesh, POINTS, folder)
+    job = stage(study, mesh, POINTS, folder, CROSS_SECTION)
     run(getdp, job, folder)
     read_vectors(folder / FLUX_DENSITY_FILE, POINTS, 1)
 
