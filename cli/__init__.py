@@ -6,11 +6,10 @@ import argparse
 from collections.abc import Sequence
 from importlib import metadata
 
-from halbach_fe.cli import common, doctor, infer, schema, solve
-
+from halbach_fe.cli import common, doctor, infer, schema, solve, verify
 from halbach_fe.errors import EXIT_CODES
 
-VERBS = {"solve": solve, "infer": infer, "doctor": doctor, "schema": schema}
+VERBS = {"solve": solve, "infer": infer, "verify": verify, "doctor": doctor, "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:

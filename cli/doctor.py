@@ -10,9 +10,9 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from halbach_fe.cli import common
 
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
+from halbach_fe.cli import common
 from halbach_fe.errors import CheckFailedError, GetDPNotFoundError
 from halbach_fe.getdp import GetDP, find_getdp
 from halbach_fe.routes import solve_nominal

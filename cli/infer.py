@@ -9,7 +9,6 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
-
 from halbach_fe.field_map import read_map
 from halbach_fe.study import read_study
 from halbach_fe.update import infer, summary, write_update

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-
 from halbach_fe.study import Study
 
 

@@ -11,8 +11,8 @@ import time
 from importlib import metadata
 
 import numpy as np
-from halbach_fe.cli import common
 
+from halbach_fe.cli import common
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
 from halbach_fe.routes import solve_nominal

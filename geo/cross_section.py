@@ -6,67 +6,41 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
-from halbach_fe.geo.session import gmsh_session, write_mesh
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import MagnetBlock, Outline, array_outer_radius, blocks_of
+from halbach_fe.blocks import MagnetBlock, Outline, blocks_of
 from halbach_fe.errors import StudyError
+from halbach_fe.extent import boundary_radius, magnet_radius
+from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
-
-DEFAULT_BOUNDARY_RATIO = {2: 30.0, 3: 10.0}
-"""Boundary radius over the magnet's, by dimension: a block's far field falls as 1/r^2 and 1/r^3,
-and so does what the boundary changes; both leave 1e-3 of it."""
-
-
-def magnet_radius(study: Study) -> float:
-    """Radius in m of everything that is not air."""
-    radius = array_outer_radius(study)
-    if study.iron_ring is None:
-        return radius
-    if study.iron_ring.inner_radius_m < radius * (1 - 1e-9):
-        raise StudyError(
-            f"Input `iron_ring.inner_radius_m` of study must be at least {radius:.6g}, where the "
-            f"blocks end; instead received {study.iron_ring.inner_radius_m:g}. Enlarge the ring."
-        )
-    return study.iron_ring.outer_radius_m
-
-
-def boundary_radius(study: Study) -> float:
-    """Radius in m where the field is cut off."""
-    inside = magnet_radius(study)
-    default = DEFAULT_BOUNDARY_RATIO[study.dimension] * inside
-    radius = study.open_boundary.radius_m or default
-    if radius <= 1.2 * inside:
-        raise StudyError(
-            f"Input `open_boundary.radius_m` of study must be well beyond the magnet "
-            f"({inside:g} m); instead received {radius:g}. Leave it out for "
-            f"{default:g}."
-        )
-    return radius
 
 
 def mesh_2d(study: Study, mesh_path: Path) -> Regions:
     """Mesh the cross-section with curved second-order triangles and return its regions."""
     blocks = blocks_of(study)
     with gmsh_session(study.name):
-        surfaces = draw(study, blocks)
+        radius = boundary_radius(study, "cross_section")
+        surfaces = draw(study, blocks, radius)
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(2)
         for tag, entities in surfaces.items():
             gmsh.model.addPhysicalGroup(2, entities, tag)
-        gmsh.model.addPhysicalGroup(1, outer_curves(study), tags.OUTER_BOUNDARY_TAG)
+        gmsh.model.addPhysicalGroup(1, outer_curves(radius), tags.OUTER_BOUNDARY_TAG)
         write_mesh(mesh_path)
     return regions_of(study, blocks)
 
 
-def draw(study: Study, blocks: tuple[MagnetBlock, ...]) -> dict[int, list[int]]:
-    """Draw the first ring's cross-section; return physical tag -> surfaces (none empty).
+def draw(
+    study: Study, blocks: tuple[MagnetBlock, ...], radius: float
+) -> dict[int, list[int]]:
+    """Draw the first ring's cross-section in a disk of ``radius`` (m); return physical tag ->
+    surfaces (none empty).
 
     Sizes are set, nothing is meshed yet.
     """
     occ = gmsh.model.occ
-    disk = [(2, occ.addDisk(0, 0, 0, boundary_radius(study), boundary_radius(study)))]
+    disk = [(2, occ.addDisk(0, 0, 0, radius, radius))]
     drawn = [(tags.FIRST_BLOCK_TAG + i, (2, _surface(block.outline)))
              for i, block in enumerate(blocks) if block.ring == 1]
     if study.iron_ring is not None:
@@ -98,9 +72,8 @@ def _check_shared(surfaces: dict[int, list[int]]) -> None:
                     f"{owner[piece]} and {tag} overlap. Reduce the block's width.")
 
 
-def outer_curves(study: Study) -> list[int]:
+def outer_curves(radius: float) -> list[int]:
     """The curves of the outer boundary."""
-    radius = boundary_radius(study)
     found = []
     for _, curve in gmsh.model.getEntities(1):
         low, high = gmsh.model.getParametrizationBounds(1, curve)

@@ -12,19 +12,13 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
-from halbach_fe.geo.cross_section import (
-    DEFAULT_BOUNDARY_RATIO,
-    boundary_radius,
-    draw,
-    magnet_radius,
-    regions_of,
-)
-from halbach_fe.geo.session import gmsh_session, write_mesh
 from numpy.typing import NDArray
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, array_half_length, blocks_of, iron_half_length, ring_limits
-from halbach_fe.errors import StudyError
+from halbach_fe.blocks import Floats, blocks_of, iron_half_length, ring_limits
+from halbach_fe.extent import boundary_half_length, boundary_radius
+from halbach_fe.geo.cross_section import draw, regions_of
+from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
 
@@ -39,7 +33,7 @@ def mesh_3d(study: Study, mesh_path: Path) -> Regions:
     """Mesh a 3D study with hexahedra (and prisms where quadrangles failed); return its regions."""
     blocks = blocks_of(study)
     with gmsh_session(study.name):
-        surfaces = draw(study, blocks)
+        surfaces = draw(study, blocks, boundary_radius(study, "extruded"))
         gmsh.option.setNumber("Mesh.RecombineAll", 1)
         # Packing of parallelograms: the worst quadrangle stays convex by a wide margin, where
         # the other algorithms make slivers in which GetDP cannot locate points.
@@ -75,7 +69,7 @@ def layers(study: Study) -> Floats:
 
 
 def _outside_layers(start: float, thickness: float, study: Study) -> list[float]:
-    boundary = half_length(study)
+    boundary = boundary_half_length(study, "extruded")
     z, size = [], thickness
     position = start
     while position < boundary:
@@ -84,21 +78,6 @@ def _outside_layers(start: float, thickness: float, study: Study) -> list[float]
         position = boundary if boundary - position < 1.5 * size else position + size
         z.append(position)
     return z
-
-
-def half_length(study: Study) -> float:
-    """Half the length of the meshed cylinder in m."""
-    end = max(array_half_length(study), iron_half_length(study))
-    radius = magnet_radius(study)
-    default = end + DEFAULT_BOUNDARY_RATIO[study.dimension] * radius
-    half = study.open_boundary.half_length_m or default
-    if half <= end + 0.2 * radius:
-        raise StudyError(
-            f"Input `open_boundary.half_length_m` of study must be well beyond the magnet's end "
-            f"({end:g} m); instead received {half:g}. Leave it out for "
-            f"{default:g}."
-        )
-    return half
 
 
 def _plane_mesh(surfaces: dict[int, list[int]]) -> tuple[Floats, dict[int, tuple[Ints, Ints]]]:
@@ -146,7 +125,7 @@ def _stack(study: Study, points: Floats, cells: dict[int, tuple[Ints, Ints]], z:
                 volumes.setdefault(tag, {}).setdefault(_STACKED[kind], []).append(
                     prism[materials == tag])
         faces[kind] += [corners, corners + (levels - 1) * count]
-    rim = _rim(points, cells, boundary_radius(study))
+    rim = _rim(points, cells, boundary_radius(study, "extruded"))
     for level in range(levels - 1):
         lower, upper = rim + level * count, rim + (level + 1) * count
         faces[QUADRANGLE].append(np.hstack([lower, upper[:, ::-1]]))

@@ -11,16 +11,13 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
-from halbach_fe.geo.cross_section import magnet_radius
-from halbach_fe.geo.session import gmsh_session, write_mesh
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, array_half_length, iron_half_length, ring_limits
+from halbach_fe.blocks import Floats, iron_half_length, ring_limits
+from halbach_fe.extent import boundary_half_length, boundary_radius, magnet_half_length
+from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
-
-BOUNDARY_RATIO = 20.0
-"""Boundary over magnet radius; geometric growth makes far away cheap. See `boundary_radius`."""
 
 LINE3, QUADRANGLE9 = 8, 10  # Gmsh's element types
 _GROWTH = 1.35
@@ -47,16 +44,17 @@ def _radii(study: Study, size: float) -> Floats:
     if iron is not None:
         stops += [iron.inner_radius_m, iron.outer_radius_m]
     return np.array([*_uniform(stops, size), *_growing(
-        stops[-1], size, BOUNDARY_RATIO * magnet_radius(study))])
+        stops[-1], size, boundary_radius(study, "meridian"))])
 
 
 def _heights(study: Study, size: float) -> Floats:
-    end = max(array_half_length(study), iron_half_length(study))
+    end = magnet_half_length(study)
     stops = {limit for ring in ring_limits(study) for limit in ring} | {-end, end}
     stops |= {-iron_half_length(study), iron_half_length(study)} if study.iron_ring else set()
     # the fringe is as important as the body: one bore radius of uniform elements beyond the ends
-    uniform = end + 2 * study.array.inner_radius_m
-    outside = _growing(uniform, size, end + BOUNDARY_RATIO * magnet_radius(study))
+    boundary = boundary_half_length(study, "meridian")
+    uniform = min(end + 2 * study.array.inner_radius_m, 0.5 * (end + boundary))
+    outside = _growing(uniform, size, boundary)
     inside = _uniform(sorted(stops | {-uniform, uniform}), size)
     return np.array([*(-value for value in reversed(outside)), *inside, *outside])
 

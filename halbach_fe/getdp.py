@@ -40,8 +40,10 @@ DIRECT_SOLVER = (
 """The matrices are symmetric: Cholesky takes half the memory of LU. Rows longer than those
 preallocated make assembling many times slower; edges of hexahedra have 33 neighbours."""
 
-CONJUGATE_GRADIENTS = ("-petsc_prealloc", "400", "-ksp_type", "cg", "-pc_type", "icc", "-ksp_rtol", "1e-11",
-                       "-ksp_max_it", "5000")
+CONJUGATE_GRADIENTS = (
+    "-petsc_prealloc", "400",
+    "-ksp_type", "cg", "-pc_type", "icc", "-ksp_rtol", "1e-11", "-ksp_max_it", "5000",
+)
 """For the scalar potential of second order in 3D, whose factorization takes a minute."""
 
 _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}

@@ -85,16 +85,20 @@ def build_mesh(study: Study, folder: Path) -> MeshFiles:
     return files
 
 
+def meridian_size(study: Study) -> float:
+    """Element size in m of the half-plane at the magnet."""
+    thickness = study.array.outer_radius_m - study.array.inner_radius_m
+    return study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
+
+
 def build_meridian(study: Study, folder: Path) -> MeshFiles:
     """Mesh the (r, z) half-plane of a rotationally symmetric study into ``folder``."""
     from halbach_fe import geo
 
     files = MeshFiles(folder / f"{MERIDIAN}.msh", folder / f"{MERIDIAN}-regions.json")
-    size = study.mesh.meridian_size_m or (
-        study.array.outer_radius_m - study.array.inner_radius_m) / MERIDIAN_ELEMENTS
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        geo.mesh_meridian(study, size, files.mesh).write(files.regions)
+        geo.mesh_meridian(study, meridian_size(study), files.mesh).write(files.regions)
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files

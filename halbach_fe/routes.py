@@ -18,7 +18,6 @@ from halbach_fe.solve import (
 )
 from halbach_fe.study import Study
 
-
 FORMULATIONS = {"cross_section": CROSS_SECTION, "edge_elements": EDGE_ELEMENTS,
                 "scalar_potential": SCALAR_POTENTIAL}
 

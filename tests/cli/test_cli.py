@@ -11,8 +11,8 @@ import time
 
 import numpy as np
 import pytest
-from halbach_fe.cli import main, parser
 
+from halbach_fe.cli import main, parser
 from halbach_fe.errors import EXIT_CODES
 from halbach_fe.field_map import field_map, read_map, write_map
 from halbach_fe.study import Study

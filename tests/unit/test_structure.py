@@ -12,9 +12,9 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
          for path in (ROOT / folder).rglob("*.py")]
 
 # Later rooms may import earlier ones, never the other way round.
-ORDER = ["errors", "analytic", "study", "blocks", "regions", "exact_field", "geo", "mesh",
+ORDER = ["errors", "analytic", "study", "blocks", "extent", "regions", "exact_field", "geo", "mesh",
          "field_map", "getdp", "inference", "solve", "azimuthal", "routes", "observation",
-         "response", "update", "report", "cli"]
+         "response", "update", "verification", "report", "cli"]
 
 
 def imports(path):

@@ -1,0 +1,165 @@
+"""How wrong the solved field is: refinement, a farther boundary, and the dual formulation.
+
+Everything is judged on the full nominal array at the study's own positions, where the errors of
+blocks add up, in units of the largest field there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.extent import (
+    boundary_half_length,
+    boundary_radius,
+    magnet_half_length,
+)
+from halbach_fe.mesh import meridian_size
+from halbach_fe.observation import noise_regions, observe, points_from
+from halbach_fe.routes import choose_route, solve_nominal
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study
+
+REFINEMENT = 1.5
+MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
+          "edge_elements": "extruded", "scalar_potential": "extruded"}
+DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Largest difference of two solves over the largest field.
+
+    Attributes
+    ----------
+    what : str
+    pointwise : float
+        Of B at the points.
+    readings : float
+        Of the study's readings: the same, or Fourier coefficients.
+    by_region : dict
+        Pointwise, by noise region.
+    """
+
+    what: str
+    pointwise: float
+    readings: float
+    by_region: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What `verify` found.
+
+    Attributes
+    ----------
+    route : str
+    differences : tuple of Difference
+        Coarser to study, study to finer, nearer to farther boundary, and the dual route if any.
+    order : float
+        Observed order of convergence in the element size, between 0.5 and 4.
+    error_pointwise, error_readings : float
+        Estimated for the study's own mesh, relative to the largest field: the remaining series of
+        refinements, plus what the boundary changes.
+    main_field_T : float
+    """
+
+    route: str
+    differences: tuple[Difference, ...]
+    order: float
+    error_pointwise: float
+    error_readings: float
+    main_field_T: float
+
+
+def refined(study: Study, factor: float) -> Study:
+    """The study with all elements smaller by a factor."""
+    mesh = study.mesh
+    bore = mesh.bore_size_m or mesh.block_size_m
+    return study.model_copy(update={"mesh": mesh.model_copy(update={
+        "block_size_m": mesh.block_size_m / factor, "bore_size_m": bore / factor,
+        "meridian_size_m": meridian_size(study) / factor,
+        "layers_per_ring": max(1, round(mesh.layers_per_ring * factor)),
+        "growth": 1 + (mesh.growth - 1) / factor})})
+
+
+def farther(study: Study, mesh: str, factor: float) -> Study:
+    """The study with its boundary farther by a factor."""
+    end = magnet_half_length(study)
+    update = {"radius_m": factor * boundary_radius(study, mesh)}
+    if study.dimension == 3:
+        update["half_length_m"] = end + factor * (boundary_half_length(study, mesh) - end)
+    return study.model_copy(update={
+        "open_boundary": study.open_boundary.model_copy(update=update)})
+
+
+def verify(
+    study: Study, workshop: Workshop, say: Callable[[str], None] = lambda _: None
+) -> Verification:
+    """Solve the study on three meshes, with a farther boundary, and by the dual route if any.
+
+    ``say`` is told what is solved next.
+    """
+    points = points_from(study.observation.positions)
+    route = choose_route(study, points)
+
+    def solve(what: str, variant: Study) -> Floats:
+        say(what)
+        return solve_nominal(variant, points, workshop)
+
+    base = solve("the study's mesh", study)
+    coarse = solve("a coarser mesh", refined(study, 1 / REFINEMENT))
+    fine = solve("a finer mesh", refined(study, REFINEMENT))
+    far = solve("a farther boundary", farther(study, MESHES[route], REFINEMENT))
+    compare = _Comparison(study, points, base)
+    steps = [compare("coarser mesh to the study's", coarse, base),
+             compare("the study's mesh to a finer", base, fine),
+             compare("boundary to a farther", base, far)]
+    if route in DUAL:
+        dual = study.model_copy(update={
+            "solver": study.solver.model_copy(update={"route": DUAL[route]})})
+        steps.append(compare(f"dual route, {DUAL[route]}",
+                             base, solve(f"the dual route, {DUAL[route]}", dual)))
+    order = observed_order(steps[0].pointwise, steps[1].pointwise)
+    series = 1 / (1 - REFINEMENT**-order)
+    return Verification(
+        route=route, differences=tuple(steps), order=order,
+        error_pointwise=series * steps[1].pointwise + steps[2].pointwise,
+        error_readings=series * steps[1].readings + steps[2].readings,
+        main_field_T=compare.scale)
+
+
+def observed_order(first: float, second: float) -> float:
+    """Order of convergence from two successive changes, kept between 0.5 and 4.
+
+    The lower limit makes the estimate of a solve that does not converge large (5.4 times the last
+    change) but finite; the upper one keeps a lucky pair from looking exact.
+    """
+    if first <= 0 or second <= 0:
+        return 4.0 if second <= 0 else 0.5
+    return float(np.clip(np.log(first / second) / np.log(REFINEMENT), 0.5, 4.0))
+
+
+class _Comparison:
+    """Differences of fields at a study's points."""
+
+    def __init__(self, study: Study, points: Floats, field: Floats) -> None:
+        self.scale = float(np.linalg.norm(field, axis=1).max())
+        self._observation = observe(study, points, np.ones_like(field, bool))
+        self._regions = {"all": np.ones(len(points), bool)}
+        if study.noise is not None:
+            index = noise_regions(study.noise, points[:, 2])
+            self._regions = {region.name: index == number
+                             for number, region in enumerate(study.noise.regions)}
+
+    def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
+        change = np.linalg.norm(one - two, axis=1) / self.scale
+        readings = np.abs(self._observation.apply(one - two)) / self.scale
+        return Difference(
+            what=what, pointwise=float(change.max()), readings=float(readings.max()),
+            by_region={name: float(change[mask].max()) for name, mask in self._regions.items()
+                       if mask.any()})
+

@@ -1,0 +1,69 @@
+"""The stated error must cover the true one, where the truth is known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from halbach_fe.analytic import ideal_sectors, layered_bore_field
+from halbach_fe.cli import main
+from halbach_fe.observation import points_from
+from halbach_fe.routes import solve_nominal
+from halbach_fe.verification import observed_order, refined, verify
+
+IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
+
+
+@pytest.mark.parametrize("method", ["direct", "reaction"])
+@pytest.mark.parametrize("iron", [None, IRON], ids=["air", "iron"])
+def test_stated_error_covers_the_true_one(dipole, workshop, method, iron):
+    """In 2D the truth is a closed form. An estimate within a factor of 30 above is of use."""
+    study = dipole(iron_ring=iron, solver={"method": method}, mesh__block_size_m=0.012)
+    points = points_from(study.observation.positions)
+    tube = None if iron is None else (0.19, 0.2, 1000.0)
+    expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
+                                  1.05, points[:, :2], tube)
+    found = solve_nominal(study, points, workshop)[:, :2]
+    true = np.linalg.norm(found - expected, axis=1).max() / np.abs(expected).max()
+    stated = verify(study, workshop)
+    assert true < stated.error_pointwise < 30 * true
+
+
+def test_coarse_meshes_are_told_from_fine_ones(short_dipole, workshop):
+    """Negative control: an estimate that ignored the mesh would not grow with its size."""
+    observation = {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": 0.05, "angles": 5, "z_min_m": -0.1, "z_max_m": 0.1,
+        "count": 3}}
+    study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.012, observation=observation)
+    fine, coarse = verify(study, workshop), verify(refined(study, 0.4), workshop)
+    assert fine.route == "azimuthal_modes"
+    assert coarse.error_pointwise > 3 * fine.error_pointwise
+    assert fine.error_pointwise < 1e-3
+
+
+def test_other_geometries_get_the_dual_route(short_dipole, workshop):
+    study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04)
+    found = verify(study, workshop)
+    assert found.route == "edge_elements"
+    assert found.differences[-1].what == "dual route, scalar_potential"
+    assert 1e-5 < found.differences[-1].pointwise < 0.02
+
+
+def test_observed_order():
+    assert observed_order(1.5**2, 1.0) == pytest.approx(2.0)
+    assert observed_order(1.0, 1.0) == 0.5
+    assert observed_order(1.0, 3.0) == 0.5
+    assert observed_order(1.0, 0.0) == 4.0
+    assert observed_order(1e9, 1.0) == 4.0
+
+
+def test_verify_from_the_command_line(tmp_path, capsys):
+    from tests.cli.test_cli import STUDY
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    assert main(["verify", str(path), "-o", str(tmp_path / "out")]) == 0
+    assert "estimated error" in capsys.readouterr().out
+    stored = json.loads((tmp_path / "out" / "verification.json").read_text())
+    assert 0 < stored["error_pointwise"] < 0.1
