@@ -2,13 +2,17 @@
 # make test     all tests
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo test lint wheel-check setup setup-test clean
+.PHONY: demo test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
 
 test: setup-test
 	.venv/bin/python -m pytest
+
+# The figures of the README, ratios measured in one run.
+benchmark: setup-test
+	.venv/bin/python benchmarks/run.py
 
 lint: setup-test
 	.venv/bin/ruff check .
