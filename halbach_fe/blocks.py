@@ -105,11 +105,6 @@ class MagnetBlock:
         """Nominal M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
         return np.array(self.easy_axis) * self.remanence / (MU_0 * self.recoil_permeability)
 
-    @property
-    def corner_radius(self) -> float:
-        """Largest distance of the outline from the z axis in m."""
-        return max(edge.radius for edge in self.outline)
-
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m lie inside the block or on its end faces."""
         inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)

@@ -26,7 +26,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from halbach_fe.blocks import Edge, Floats, MagnetBlock, Outline
+from halbach_fe.blocks import Floats, MagnetBlock, Outline
 
 _ORDER = 12
 _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
@@ -148,5 +148,3 @@ def _difference_over_rho2(
     with np.errstate(divide="ignore"):
         return regular + np.where(between, 2 / rho2, 0.0)
 
-
-__all__ = ["Edge", "field_of", "quadrature", "unit_field"]

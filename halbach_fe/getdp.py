@@ -72,9 +72,6 @@ class GetDP:
     build_options: tuple[str, ...]
     petsc: str
 
-    def __str__(self) -> str:
-        return f"GetDP {self.version} ({self.executable}; PETSc {self.petsc or 'none'})"
-
 
 @dataclass(frozen=True)
 class Job:
@@ -95,7 +92,7 @@ class Job:
     solves : int
         Linear solves that the log must show, each with its residuals.
     options : tuple of str
-        Further PETSc options.
+        PETSc options of the linear solver.
     time_limit_s : float
         The run is ended after so many seconds.
     threads : int

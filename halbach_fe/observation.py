@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import MeasurementError, StudyError, must_be
-from halbach_fe.field_map import points_of
 from halbach_fe.study import COMPONENTS, FourierCoefficients, Noise, Positions, Study
 
 
@@ -184,7 +183,3 @@ def held_out(study: Study, z: Floats) -> NDArray[np.bool_]:
         return np.zeros(len(z), bool)
     _, rank = np.unique(np.round(z, 9), return_inverse=True)
     return np.asarray((rank // settings.window) % settings.every == settings.every - 1)
-
-
-__all__ = ["Observation", "circles", "held_out", "noise_regions", "observe", "points_from",
-           "points_of", "standard_deviations"]
