@@ -1,8 +1,9 @@
-"""3D arrays: the cross-section in quadrangles, stacked in layers of hexahedra along z.
+"""3D arrays: the cross-section in curved triangles, stacked in layers of tetrahedra along z.
 
 All blocks are prisms along z, so one plane mesh serves every ring; each layer decides which of
 its cells are magnet, iron or air. (Extruding a thousand volumes one by one takes Gmsh minutes;
-stacking the plane mesh takes a second.)
+stacking the plane mesh takes a second.) GetDP 3.2 knows curved elements and elements of second
+order in 3D as tetrahedra only, so every prism of the stack is cut into three.
 """
 
 from __future__ import annotations
@@ -24,25 +25,27 @@ from halbach_fe.study import Study
 
 Ints = NDArray[np.int64]
 
-TRIANGLE, QUADRANGLE, HEXAHEDRON, PRISM = 2, 3, 5, 6  # Gmsh's element types
-_CORNERS = {TRIANGLE: 3, QUADRANGLE: 4}
-_STACKED = {TRIANGLE: PRISM, QUADRANGLE: HEXAHEDRON}
+TRIANGLE6, TETRAHEDRON10 = 9, 11  # Gmsh's element types
+TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))
+TETRAHEDRON_EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3))  # Gmsh's order
+TURNED = [1, 0, 2, 3, 4, 6, 5, 9, 8, 7]  # a tetrahedron with its first two corners exchanged
+# A prism, by corner (of the triangle, sorted) and level. Diagonals of its sides rise towards the
+# larger index, on both sides of a face.
+CUTS = (((0, 0), (1, 0), (2, 0), (2, 1)), ((0, 0), (1, 0), (1, 1), (2, 1)),
+        ((0, 0), (0, 1), (1, 1), (2, 1)))
 
 
 def mesh_3d(study: Study, mesh_path: Path) -> Regions:
-    """Mesh a 3D study with hexahedra (and prisms where quadrangles failed); return its regions."""
+    """Mesh a 3D study with curved second-order tetrahedra and return its regions."""
     blocks = blocks_of(study)
     with gmsh_session(study.name):
         surfaces = draw(study, blocks, boundary_radius(study, "extruded"))
-        gmsh.option.setNumber("Mesh.RecombineAll", 1)
-        # Packing of parallelograms: the worst quadrangle stays convex by a wide margin, where
-        # the other algorithms make slivers in which GetDP cannot locate points.
-        gmsh.option.setNumber("Mesh.Algorithm", 9)
         gmsh.model.mesh.generate(2)
-        points, cells = _plane_mesh(surfaces)
+        gmsh.model.mesh.setOrder(2)
+        points, triangles, region = _plane_mesh(surfaces)
         z = layers(study)
         gmsh.model.add(f"{study.name}-3d")
-        _stack(study, points, cells, z)
+        _stack(study, points, triangles, region, z)
         write_mesh(mesh_path)
     return regions_of(study, blocks)
 
@@ -80,69 +83,97 @@ def _outside_layers(start: float, thickness: float, study: Study) -> list[float]
     return z
 
 
-def _plane_mesh(surfaces: dict[int, list[int]]) -> tuple[Floats, dict[int, tuple[Ints, Ints]]]:
-    """Return points (n, 2) and, per element type, corners (m, k) and region tags (m,)."""
+def _plane_mesh(surfaces: dict[int, list[int]]) -> tuple[Floats, Ints, Ints]:
+    """Return points (n, 2), six-node triangles (m, 6), counter-clockwise, and region tags (m,)."""
     node_tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    index = np.zeros(int(node_tags.max()) + 1, int)
     points = np.asarray(coordinates).reshape(-1, 3)[:, :2]
-    collected: dict[int, list[tuple[Ints, Ints]]] = {TRIANGLE: [], QUADRANGLE: []}
+    index = np.zeros(int(node_tags.max()) + 1, int)
     index[node_tags.astype(int)] = np.arange(len(node_tags))
+    collected: list[Ints] = []
+    region: list[Ints] = []
     for tag in sorted(surfaces):
         for surface in surfaces[tag]:
-            types, _, nodes = gmsh.model.mesh.getElements(2, surface)
-            for kind, flat in zip(types, nodes, strict=True):
-                corners = index[np.asarray(flat, int)].reshape(-1, _CORNERS[int(kind)])
-                collected[int(kind)].append((corners, np.full(len(corners), tag)))
-    cells = {kind: (np.vstack([c for c, _ in parts]), np.concatenate([t for _, t in parts]))
-             for kind, parts in collected.items() if parts}
-    used = np.unique(np.concatenate([corners.ravel() for corners, _ in cells.values()]))
-    renumber = np.zeros(len(points), int)
-    renumber[used] = np.arange(len(used))
-    return points[used], {kind: (_counter_clockwise(points, corners, renumber), region)
-                          for kind, (corners, region) in cells.items()}
+            _, nodes = gmsh.model.mesh.getElementsByType(TRIANGLE6, surface)
+            collected.append(index[np.asarray(nodes, int)].reshape(-1, 6))
+            region.append(np.full(len(collected[-1]), tag))
+    triangles = np.vstack(collected)
+    used, flat = np.unique(triangles, return_inverse=True)
+    triangles, points = flat.reshape(triangles.shape), points[used]
+    a, b, c = points[triangles[:, :3]].transpose(1, 2, 0)
+    clockwise = (b - a)[0] * (c - a)[1] < (b - a)[1] * (c - a)[0]
+    triangles[clockwise] = triangles[clockwise][:, [0, 2, 1, 5, 4, 3]]
+    return points, triangles, np.concatenate(region)
 
 
-def _counter_clockwise(points: Floats, corners: Ints, renumber: Ints) -> Ints:
-    """Orient cells so that the stacked elements have positive volume."""
-    x, y = points[corners].transpose(2, 0, 1)
-    area = np.sum(x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y, axis=1)
-    corners = renumber[corners]
-    corners[area < 0] = corners[area < 0, ::-1]
-    return corners
+def _stack(
+    study: Study, points: Floats, triangles: Ints, region: Ints, z: Floats
+) -> None:
+    """Build the 3D mesh as discrete Gmsh entities, one per region, ready to be written.
 
-
-def _stack(study: Study, points: Floats, cells: dict[int, tuple[Ints, Ints]], z: Floats) -> None:
-    """Build the 3D mesh as discrete Gmsh entities, one per region, ready to be written."""
+    Nodes stand on every level and half-way between: those of the triangles' edges half-way are
+    the middles of diagonals.
+    """
     count, levels = len(points), len(z)
-    nodes = np.column_stack([np.tile(points, (levels, 1)), np.repeat(z, count)])
-    volumes: dict[int, dict[int, list[Ints]]] = {}
-    faces: dict[int, list[Ints]] = {TRIANGLE: [], QUADRANGLE: []}
-    for kind, (corners, region) in cells.items():
-        for level in range(levels - 1):
-            materials = _layer_tags(study, region, (z[level] + z[level + 1]) / 2)
-            prism = np.hstack([corners + level * count, corners + (level + 1) * count])
-            for tag in np.unique(materials).tolist():
-                volumes.setdefault(tag, {}).setdefault(_STACKED[kind], []).append(
-                    prism[materials == tag])
-        faces[kind] += [corners, corners + (levels - 1) * count]
-    rim = _rim(points, cells, boundary_radius(study, "extruded"))
+    heights = np.sort(np.concatenate([z, (z[1:] + z[:-1]) / 2]))
+    nodes = np.column_stack([np.tile(points, (len(heights), 1)), np.repeat(heights, count)])
+    cells = _tetrahedra(triangles, count)
+    faces = [triangles, triangles + 2 * (levels - 1) * count]
+    rim = _rim(points, triangles, boundary_radius(study, "extruded"))
+    volumes: dict[int, list[Ints]] = {}
     for level in range(levels - 1):
-        lower, upper = rim + level * count, rim + (level + 1) * count
-        faces[QUADRANGLE].append(np.hstack([lower, upper[:, ::-1]]))
+        materials = np.repeat(_layer_tags(study, region, (z[level] + z[level + 1]) / 2), len(CUTS))
+        shifted = cells + 2 * level * count
+        for tag in np.unique(materials).tolist():
+            volumes.setdefault(tag, []).append(shifted[materials == tag])
+        faces.append(_side_faces(rim, count) + 2 * level * count)
 
     model = gmsh.model
     model.addDiscreteEntity(2, tags.OUTER_BOUNDARY_TAG)
     model.mesh.addNodes(2, tags.OUTER_BOUNDARY_TAG, np.arange(1, len(nodes) + 1), nodes.ravel())
-    for kind, parts in faces.items():
-        if parts:
-            model.mesh.addElementsByType(tags.OUTER_BOUNDARY_TAG, kind, [],
-                                         (np.vstack(parts) + 1).ravel())
+    model.mesh.addElementsByType(tags.OUTER_BOUNDARY_TAG, TRIANGLE6, [],
+                                 (np.vstack(faces) + 1).ravel())
     model.addPhysicalGroup(2, [tags.OUTER_BOUNDARY_TAG], tags.OUTER_BOUNDARY_TAG)
     for tag in sorted(volumes):
         model.addDiscreteEntity(3, tag)
-        for kind, parts in volumes[tag].items():
-            model.mesh.addElementsByType(tag, kind, [], (np.vstack(parts) + 1).ravel())
+        model.mesh.addElementsByType(tag, TETRAHEDRON10, [],
+                                     (np.vstack(volumes[tag]) + 1).ravel())
         model.addPhysicalGroup(3, [tag], tag)
+
+
+def _tetrahedra(triangles: Ints, count: int) -> Ints:
+    """Cut the prisms on the lowest layer; (3 triangles, 10) nodes, three cells a triangle."""
+    order = np.argsort(triangles[:, :3], axis=1)
+    corners = np.take_along_axis(triangles[:, :3], order, axis=1)
+    rank = np.argsort(order, axis=1)
+    middles = np.empty_like(corners)  # of the edge opposite to each sorted corner
+    for edge, (i, j) in enumerate(TRIANGLE_EDGES):
+        opposite = 3 - rank[:, i] - rank[:, j]
+        middles[np.arange(len(triangles)), opposite] = triangles[:, 3 + edge]
+    # sorting may have turned the triangle over, and the middle cut is turned by itself
+    odd = np.linalg.det(np.eye(3)[order]) < 0
+    cells = np.empty((len(triangles), len(CUTS), 10), int)
+    for number, cut in enumerate(CUTS):
+        for place, (corner, level) in enumerate(cut):
+            cells[:, number, place] = corners[:, corner] + 2 * level * count
+        for place, (i, j) in enumerate(TETRAHEDRON_EDGES, start=4):
+            (a, low), (b, high) = cut[i], cut[j]
+            plane = corners[:, a] if a == b else middles[:, 3 - a - b]
+            cells[:, number, place] = plane + (low + high) * count
+        turned = odd ^ (number == 1)
+        cells[turned, number] = cells[turned, number][:, TURNED]
+    return cells.reshape(-1, 10)
+
+
+def _side_faces(rim: Ints, count: int) -> Ints:
+    """Triangles (2 m, 6) of the lowest layer on the outer cylinder, cut as the tetrahedra are.
+
+    ``rim`` (m, 3) holds ends, the smaller index first, and middle of the outer edges.
+    """
+    a, b, middle = rim.T
+    up = 2 * count
+    lower = np.column_stack([a, b, b + up, middle, b + count, middle + count])
+    upper = np.column_stack([a, b + up, a + up, middle + count, middle + up, a + count])
+    return np.vstack([lower, upper])
 
 
 def _layer_tags(study: Study, region: Ints, z: float) -> Ints:
@@ -157,13 +188,12 @@ def _layer_tags(study: Study, region: Ints, z: float) -> Ints:
     return result
 
 
-def _rim(points: Floats, cells: dict[int, tuple[Ints, Ints]], radius: float) -> Ints:
-    """Edges (m, 2) of the plane mesh on the outer circle: those of one cell only."""
-    edges = np.vstack([
-        np.column_stack([corners[:, i], np.roll(corners, -1, axis=1)[:, i]])
-        for corners, _ in cells.values() for i in range(corners.shape[1])])
-    _, first, uses = np.unique(np.sort(edges, axis=1), axis=0, return_index=True,
-                               return_counts=True)
-    rim = edges[first[uses == 1]]
-    assert np.allclose(np.hypot(*points[rim.ravel()].T), radius), "the plane mesh has a hole"
-    return rim
+def _rim(points: Floats, triangles: Ints, radius: float) -> Ints:
+    """Ends, smaller index first, and middle (m, 3) of the plane mesh's edges on the outer
+    circle.
+    """
+    edges = np.vstack([triangles[:, [i, j, 3 + edge]]
+                       for edge, (i, j) in enumerate(TRIANGLE_EDGES)])
+    outer = edges[np.hypot(*points[edges[:, 2]].T) > radius * (1 - 1e-9)]
+    outer[:, :2].sort(axis=1)
+    return outer

@@ -1,4 +1,4 @@
-"""The (r, z) half-plane of a rotationally symmetric magnet, in second-order quadrangles.
+"""The (r, z) half-plane of a rotationally symmetric magnet, in rectangles.
 
 For the solver that takes one azimuthal mode at a time: x is r, y is z; a ring of blocks is one
 region, whatever the blocks' angles.
@@ -19,7 +19,7 @@ from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
 from halbach_fe.study import Study
 
-LINE3, QUADRANGLE9 = 8, 10  # Gmsh's element types
+LINE, QUADRANGLE = 1, 3  # Gmsh's element types
 _GROWTH = 1.35
 
 
@@ -80,38 +80,33 @@ def _growing(start: float, size: float, stop: float) -> list[float]:
 
 
 def _build(study: Study, r: Floats, z: Floats) -> None:
-    """Tensor grid of nine-node quadrangles as discrete Gmsh entities."""
-    r_nodes, z_nodes = _with_middles(r), _with_middles(z)
-    columns, rows = len(r_nodes), len(z_nodes)
+    """Tensor grid of rectangles as discrete Gmsh entities."""
+    columns, rows = len(r), len(z)
     points = np.zeros((columns * rows, 3))
-    points[:, 0] = np.repeat(r_nodes, rows)
-    points[:, 1] = np.tile(z_nodes, columns)
+    points[:, 0] = np.repeat(r, rows)
+    points[:, 1] = np.tile(z, columns)
     i, j = (index.ravel() for index in np.meshgrid(
-        np.arange(len(r) - 1), np.arange(len(z) - 1), indexing="ij"))
-    pattern = np.array([(0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1), (1, 1)])
-    cells = ((2 * i[:, None] + pattern[:, 0]) * rows + 2 * j[:, None] + pattern[:, 1])
+        np.arange(columns - 1), np.arange(rows - 1), indexing="ij"))
+    corner = i * rows + j
+    cells = np.column_stack([corner, corner + rows, corner + rows + 1, corner + 1])
     material = _materials(study, (r[i] + r[i + 1]) / 2, (z[j] + z[j + 1]) / 2)
 
-    k, h = 2 * np.arange(len(z) - 1), 2 * np.arange(len(r) - 1) * rows
-    axis = np.column_stack([k, k + 2, k + 1])
+    up, out = np.arange(rows - 1), np.arange(columns - 1) * rows
+    axis = np.column_stack([up, up + 1])
     rim = [axis + (columns - 1) * rows] + [
-        np.column_stack([h, h + 2 * rows, h + rows]) + level for level in (0, rows - 1)]
+        np.column_stack([out, out + rows]) + level for level in (0, rows - 1)]
     model = gmsh.model
     model.addDiscreteEntity(2, 1)
     model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
     for tag in np.unique(material).tolist():
         if tag != 1:
             model.addDiscreteEntity(2, tag)
-        model.mesh.addElementsByType(tag, QUADRANGLE9, [], (cells[material == tag] + 1).ravel())
+        model.mesh.addElementsByType(tag, QUADRANGLE, [], (cells[material == tag] + 1).ravel())
         model.addPhysicalGroup(2, [tag], tag)
     for tag, lines in ((tags.AXIS_TAG, axis), (tags.OUTER_BOUNDARY_TAG, np.vstack(rim))):
         model.addDiscreteEntity(1, tag)
-        model.mesh.addElementsByType(tag, LINE3, [], (lines + 1).ravel())
+        model.mesh.addElementsByType(tag, LINE, [], (lines + 1).ravel())
         model.addPhysicalGroup(1, [tag], tag)
-
-
-def _with_middles(x: Floats) -> Floats:
-    return np.sort(np.concatenate([x, (x[1:] + x[:-1]) / 2]))
 
 
 def _materials(study: Study, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

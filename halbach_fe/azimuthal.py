@@ -2,32 +2,43 @@
 
 Where recoil permeability and iron do not depend on the angle, the 3D problem of one block splits
 into one small (r, z) problem per mode m (see pro/azimuthal_modes.pro), and all blocks of a ring
-share it by rotation. Seconds to minutes where edge elements take minutes to hours, and more exact.
+share it by rotation. Seconds to minutes where 3D meshes take minutes to hours, and more exact.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
-from halbach_fe import getdp as runner
-from halbach_fe.blocks import (
-    Floats,
-    array_half_length,
-    blocks_of,
-    magnetization_angle_deg,
-    position_angle_deg,
-)
+from halbach_fe.blocks import Floats, MagnetBlock, array_half_length, blocks_of, position_angle_deg
+from halbach_fe.evaluation import Located, coordinates, locate, middles, nodal_operators
 from halbach_fe.getdp import Job
-from halbach_fe.mesh import VerifiedMesh, build_meridian, verify_mesh
-from halbach_fe.solve import Task, Workshop, check_inside, make_folder, render, run_tasks
+from halbach_fe.mesh import Entities, VerifiedMesh, build_meridian, verify_mesh
+from halbach_fe.solutions import Ints, read_solutions, read_unknowns
+from halbach_fe.solve import (
+    SOLUTIONS_FILE,
+    Task,
+    Workshop,
+    apply_to,
+    check_inside,
+    compare_printed,
+    make_folder,
+    render,
+    run_tasks,
+)
 from halbach_fe.study import Study
+from halbach_fe.symmetry import unique_points
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
+NOMINAL_SOURCES = 2
+"""Cosine and sine part of the nominal array."""
+
 MODE_TOLERANCE = 1e-4
 """Modes fall as (r / inner radius)^m. What is left out of one block's reaction, itself a few per
 cent of its field, is below 1e-5 of that field."""
@@ -36,28 +47,18 @@ MAX_MODES = 64
 AXIS_RADIUS = 1e-6
 """Points nearer to the axis than this fraction of the bore are moved there: psi/r needs r > 0."""
 
-
-@dataclass(frozen=True)
-class ModeGradients:
-    """d psi/dr, psi/r and d psi/dz of one variant of the materials, per T of remanence.
-
-    Attributes
-    ----------
-    rings : ndarray, shape (modes, 3, rings, points, 3)
-        By component of the remanence: along the block's middle, across it, axial.
-    together : ndarray, shape (modes, 2, points, 3)
-        All rings at once, along and across the middle.
-    """
-
-    rings: Floats
-    together: Floats
+NO_REMANENCE = 1e-12
+"""Of the largest mode: a mode of the nominal array below it is excluded by symmetry."""
 
 
 def suits(study: Study, points: Floats) -> bool:
     """Tell whether materials are rotationally symmetric and the points need few modes."""
     block = study.array.block
-    symmetric = block.shape == "sector" and block.angular_gap_deg == 0
-    return study.dimension == 3 and symmetric and modes_needed(study, points) <= MAX_MODES
+    if study.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
+        return False
+    permeability = np.array([b.recoil_permeability for b in blocks_of(study)])
+    by_ring = permeability.reshape(study.array.rings, -1)
+    return bool((by_ring == by_ring[:, :1]).all()) and modes_needed(study, points) <= MAX_MODES
 
 
 def modes_needed(study: Study, points: Floats) -> int:
@@ -73,126 +74,229 @@ def modes_needed(study: Study, points: Floats) -> int:
     return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
 
 
-def mode_fields(
-    study: Study, points: Floats, workshop: Workshop, columns: bool = True
+@dataclass(frozen=True)
+class _Ring:
+    """What case_modes.pro.j2 says of a ring; see there."""
+
+    recoil_permeability: float
+    rank: int
+    along: list[float]
+    across: list[float]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What all runs of a study have in common.
+
+    Attributes
+    ----------
+    weights : ndarray
+        Of the nominal array, see `_nominal_waves`.
+    solved : tuple of int
+        Rings, from 0, of the blocks that are solved for.
+    located, probes : Located
+        Where fields are wanted, and where GetDP prints some.
+    places : ndarray, shape (m, 3), in m
+        Of the probes.
+    """
+
+    study: Study
+    mesh: VerifiedMesh
+    weights: Floats
+    solved: tuple[int, ...]
+    located: Located
+    probes: Located
+    places: Floats
+
+    @property
+    def last_source(self) -> int:
+        return NOMINAL_SOURCES - 1 + 3 * len(self.solved)
+
+
+def solve_modes(
+    study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop
 ) -> Floats:
-    """Finite-element part of the field of every source, by the study's method: the reaction (real
-    materials minus vacuum), or B itself.
+    """Finite-element part of the field of the nominal array and of single blocks, as
+    `halbach_fe.solve.solve_sources` returns it: the reaction, or B itself, by the study's method.
 
     Parameters
     ----------
     points : ndarray, shape (n, 3), in m
-    columns : bool
-        Whether blocks are solved one by one too, or the nominal array only.
+    blocks : sequence of int
+        Numbers, from 0, of the blocks to solve for with 1 T along x, y and z. Blocks of one ring
+        cost no more than one.
 
     Returns
     -------
-    ndarray, shape (1 + 3 blocks, n, 3) or (1, n, 3), in T
-        Source 0 is the nominal array, solved with all rings at once; then 1 T of each block
-        along x, y, z, in block order.
+    ndarray, shape (1 + 3 len(blocks), n, 3), in T
     """
-    r = np.maximum(np.hypot(points[:, 0], points[:, 1]),
-                   AXIS_RADIUS * study.array.inner_radius_m)
-    meridian, where = np.unique(np.column_stack([r, points[:, 2], 0 * r]).round(12), axis=0,
-                                return_inverse=True)
+    array = study.array
+    r = np.maximum(np.hypot(points[:, 0], points[:, 1]), AXIS_RADIUS * array.inner_radius_m)
+    meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
     highest = modes_needed(study, points)
     mesh = verify_mesh(build_meridian(study, make_folder(workshop.folder)))
     check_inside(mesh, points)
+    located = locate(mesh, meridian)
+    solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
+    weights = _nominal_waves(study, highest)
+    case = _Case(study, mesh, weights, solved, located, *middles(mesh, located))
+    wanted = range(highest + 1)
+    if not blocks:
+        size = np.abs(weights).max(axis=(1, 2, 3))
+        wanted = [m for m in wanted if size[m] > NO_REMANENCE * size.max()]
     # mode 0 has another condition on the axis, so it is a run of its own
-    spans = [(0, 0), (1, highest)]
+    spans = [span for first in (True, False)
+             for span in _runs([m for m in wanted if (m == 0) == first])]
     variants = [False] if study.solver.method == "direct" else [False, True]
-    tasks = [_task(study, mesh, meridian, span, vacuum, columns, workshop)
+    tasks = [_task(case, span, vacuum, workshop)
              for span in reversed(spans) for vacuum in variants]
     results = run_tasks(tasks, workshop)
-    if study.solver.method == "reaction":
-        results = [results[0] - results[1], results[2] - results[3]]
-    upper, zero = results
-    rings = study.array.rings if columns else 0
-    modes = _arrange(rings, zero, upper, highest)
-    return _superpose(study, modes, points, where)
+    if len(variants) == 2:
+        results = [real - vacuum for real, vacuum in zip(results[::2], results[1::2], strict=True)]
+    modes = dict(zip([m for span in reversed(spans) for m in range(span[0], span[1] + 1)],
+                     np.concatenate(results), strict=True))
+    return _superpose(case, modes, points, where, blocks)
 
 
-def _task(
-    study: Study, mesh: VerifiedMesh, meridian: Floats, span: tuple[int, int], vacuum: bool,
-    columns: bool, workshop: Workshop,
-) -> Task:
-    rings = study.array.rings if columns else 0
-    count = (1 + 2 * rings) if span == (0, 0) else (span[1] - span[0] + 1) * (2 + 3 * rings)
-
-    def stage(folder: Path) -> Job:
-        text = resources.files("halbach_fe.pro").joinpath(PROBLEM).read_bytes()
-        (folder / PROBLEM).write_bytes(text)
-        case = render("case_modes.pro.j2", study=study, regions=mesh.regions,
-                      points=meridian.tolist())
-        (folder / "case.pro").write_text(case, encoding="utf-8")
-        (folder / mesh.path.name).write_bytes(mesh.path.read_bytes())
-        return Job(
-            problem=PROBLEM, mesh=mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
-            numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
-                     "COLUMNS": columns},
-            unknowns=mesh.inner_nodes - (mesh.axis_nodes if span[0] > 0 else 0),
-            solves=count, time_limit_s=workshop.time_limit_s)
-
-    return Task(
-        name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{span[0]}", stage=stage,
-        read=lambda folder: runner.read_vectors(folder / OUTPUT, meridian, count), solves=count)
+def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
+    """Spans (first, last) of consecutive modes."""
+    found = []
+    for _, group in groupby(enumerate(modes), lambda pair: pair[1] - pair[0]):
+        span = [mode for _, mode in group]
+        found.append((span[0], span[-1]))
+    return found
 
 
-def _arrange(rings: int, zero: Floats, upper: Floats, highest: int) -> ModeGradients:
-    """Sort the solves of mode 0 and of the others by mode, component and ring."""
-    points = zero.shape[1]
-    by_ring = np.zeros((highest + 1, 3, rings, points, 3))
-    together = np.zeros((highest + 1, 2, points, 3))
-    together[0, 0] = zero[0]
-    by_ring[0, [0, 2]] = zero[1:].reshape(2, rings, points, 3)  # nothing across the middle
-    upper = upper.reshape(highest, 2 + 3 * rings, points, 3)
-    together[1:] = upper[:, :2]
-    by_ring[1:] = upper[:, 2:].reshape(highest, 3, rings, points, 3)
-    return ModeGradients(by_ring, together)
+def _nominal_waves(study: Study, highest: int) -> Floats:
+    """Nominal remanence as waves, (modes, 2, rings, 2) in T: by what goes into cos(m theta) and
+    sin(m theta), ring, and along or across the blocks' middles.
+
+    A block at angle t with remanence A along and C across its middle has the potential
+    A psi_along cos(m (theta - t)) + C psi_across sin(m (theta - t)).
+    """
+    m = np.arange(highest + 1)
+    found = np.zeros((highest + 1, 2, study.array.rings, 2))
+    for block in blocks_of(study):
+        middle = _middle(study, block)
+        x, y = block.remanence * np.array(block.easy_axis[:2])
+        along = np.cos(middle) * x + np.sin(middle) * y
+        across = np.cos(middle) * y - np.sin(middle) * x
+        cosine, sine = np.cos(m * middle), np.sin(m * middle)
+        found[:, 0, block.ring - 1] += np.column_stack([along * cosine, -across * sine])
+        found[:, 1, block.ring - 1] += np.column_stack([along * sine, across * cosine])
+    return found
+
+
+def _middle(study: Study, block: MagnetBlock) -> float:
+    return float(np.radians(position_angle_deg(study.array, block.slot)))
+
+
+def _rings(case: _Case) -> list[_Ring]:
+    blocks = blocks_of(case.study)[::case.study.array.blocks_per_ring]
+    return [_Ring(block.recoil_permeability,
+                  case.solved.index(ring) + 1 if ring in case.solved else 0,
+                  case.weights[:, :, ring, 0].ravel().tolist(),
+                  case.weights[:, :, ring, 1].ravel().tolist())
+            for ring, block in enumerate(blocks)]
+
+
+def _task(case: _Case, span: tuple[int, int], vacuum: bool, workshop: Workshop) -> Task:
+    modes, sources = span[1] - span[0] + 1, case.last_source + 1
+
+    # one whose field does not vanish: a block's, or the larger part of the nominal array
+    printed = case.last_source if case.solved else int(
+        np.argmax(np.abs(case.weights[span[0]]).max(axis=(1, 2))))
+
+    def stage_run(folder: Path) -> Job:
+        return stage(case, folder, span, (0, case.last_source), printed, vacuum,
+                     workshop.time_limit_s)
+
+    def read(folder: Path) -> Floats:
+        return read_run(case, folder, modes, sources, printed)
+
+    return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{span[0]}", stage=stage_run,
+                read=read, solves=modes * sources)
+
+
+def stage(
+    case: _Case, folder: Path, span: tuple[int, int], sources: tuple[int, int], printed: int,
+    vacuum: bool, time_limit_s: float,
+) -> Job:
+    """Fill a run folder, and return the job to run there.
+
+    ``span`` and ``sources`` are the first and last mode and source, ``printed`` the source that
+    GetDP prints in the first mode.
+    """
+    text = resources.files("halbach_fe.pro").joinpath(PROBLEM).read_bytes()
+    (folder / PROBLEM).write_bytes(text)
+    text = render("case_modes.pro.j2", study=case.study, regions=case.mesh.regions,
+                  points=case.places.tolist(), rings=_rings(case), solved=max(1, len(case.solved)))
+    (folder / "case.pro").write_text(text, encoding="utf-8")
+    (folder / case.mesh.path.name).write_bytes(case.mesh.path.read_bytes())
+    return Job(
+        problem=PROBLEM, mesh=case.mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
+        solutions=SOLUTIONS_FILE,
+        numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
+                 "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
+                 "PRINTED_SOURCE": printed},
+        unknowns=_unknowns(case.mesh.inner) - (_unknowns(case.mesh.axis) if span[0] > 0 else 0),
+        solves=(span[1] - span[0] + 1) * (sources[1] - sources[0] + 1), time_limit_s=time_limit_s)
+
+
+def _unknowns(entities: Entities) -> int:
+    return entities.nodes + entities.edges + entities.faces
+
+
+def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) -> Floats:
+    """d psi/dr, psi/r and d psi/dz of a run's solutions, (modes, sources, points, 3)."""
+    unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.mesh.cell_type)
+    solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
+
+    def gradients(located: Located, chosen: Floats) -> Floats:
+        value, (along_r, along_z) = nodal_operators(case.mesh, located, unknowns)
+        r = coordinates(case.mesh, located)[:, 0]
+        return np.stack([apply_to(along_r, chosen), apply_to(value, chosen) / r,
+                         apply_to(along_z, chosen)], axis=2)
+
+    compare_printed(gradients(case.probes, solutions[printed:printed + 1])[0], folder / OUTPUT, case.places)
+    result = gradients(case.located, solutions)
+    (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
+    return result.reshape(modes, sources, *result.shape[1:])
 
 
 def _superpose(
-    study: Study, modes: ModeGradients, points: Floats, where: np.ndarray[tuple[int], np.dtype[
-        np.intp]],
+    case: _Case, modes: dict[int, Floats], points: Floats, where: Ints, blocks: Sequence[int]
 ) -> Floats:
-    """Sum modes, turned to every block's place, into fields at the points."""
-    array, count = study.array, len(points)
+    """Sum modes into the fields at the points, each block turned to its place."""
     phi = np.arctan2(points[:, 1], points[:, 0])
-    rings, slots = modes.rings.shape[2], array.blocks_per_ring
-    result = np.zeros((1 + 3 * rings * slots, count, 3))
-    columns = result[1:].reshape(rings, slots, 3, count, 3)
-    remanence = blocks_of(study)[0].remanence
-    for slot in range(1, slots + 1):
-        middle = np.radians(position_angle_deg(array, slot))
-        along, across, axial = _local_fields(modes.rings, phi - middle, where)
-        together, together_across = _local_fields(modes.together, phi - middle, where)
-        direction = np.radians(magnetization_angle_deg(array, slot)) - middle
-        nominal = remanence * (np.cos(direction) * together
-                               + np.sin(direction) * together_across)
-        result[0] += _to_cartesian(nominal, phi)
-        for axis, field in enumerate((np.cos(middle) * along - np.sin(middle) * across,
-                                      np.sin(middle) * along + np.cos(middle) * across, axial)):
-            columns[:, slot - 1, axis] = _to_cartesian(field, phi)
-    return result
+    everything = blocks_of(case.study)
+    result = np.zeros((1 + 3 * len(blocks), len(points), 3))
+    for part in range(NOMINAL_SOURCES):
+        result[0] += _field({m: g[part, where] for m, g in modes.items()}, phi, sine=part == 1)
+    rings = len(case.solved)
+    for number, block in enumerate(blocks):
+        middle = _middle(case.study, everything[block])
+        rank = case.solved.index(everything[block].ring - 1)
+        along, across, axial = (
+            _field({m: g[NOMINAL_SOURCES + component * rings + rank, where]
+                    for m, g in modes.items()}, phi - middle, sine=component == 1)
+            for component in range(3))
+        result[1 + 3 * number] = np.cos(middle) * along - np.sin(middle) * across
+        result[2 + 3 * number] = np.sin(middle) * along + np.cos(middle) * across
+        result[3 + 3 * number] = axial
+    return _to_cartesian(result, phi)
 
 
-def _local_fields(
-    gradients: Floats, theta: Floats, where: np.ndarray[tuple[int], np.dtype[np.intp]]
-) -> list[Floats]:
-    """B_r, B_theta, B_z of each component of the remanence, of a block at theta = 0.
-
-    ``gradients`` is (modes, components, ..., meridian points, 3); fields are (..., points, 3).
+def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
+    """B_r, B_theta, B_z (n, 3) of a potential in cos(m theta), or sin(m theta), from its
+    gradients (n, 3) by mode.
     """
-    fields = []
-    for component in range(gradients.shape[1]):
-        field = np.zeros((*gradients.shape[2:-2], len(theta), 3))
-        for m in range(gradients.shape[0]):
-            cosine, sine = np.cos(m * theta), np.sin(m * theta)
-            even, derivative = (sine, m * cosine) if component == 1 else (cosine, -m * sine)
-            wave = np.column_stack([even, derivative, even])
-            field -= gradients[m, component][..., where, :] * wave  # B = -grad psi
-        fields.append(field)
-    return fields
+    field = np.zeros((len(theta), 3))
+    for m, gradient in gradients.items():
+        cos, sin = np.cos(m * theta), np.sin(m * theta)
+        even, derivative = (sin, m * cos) if sine else (cos, -m * sin)
+        field -= gradient * np.column_stack([even, derivative, even])  # B = -grad psi
+    return field
 
 
 def _to_cartesian(field: Floats, phi: Floats) -> Floats:
@@ -201,4 +305,3 @@ def _to_cartesian(field: Floats, phi: Floats) -> Floats:
     radial, tangential = field[..., 0], field[..., 1]
     return np.stack([radial * cosine - tangential * sine, radial * sine + tangential * cosine,
                      field[..., 2]], axis=-1)
-

@@ -7,7 +7,7 @@ from the blocks listed here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,17 +147,32 @@ def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
     array = study.array
     outlines = [_outline(array, slot) for slot in range(1, array.blocks_per_ring + 1)]
     _check_overlaps(outlines)
-    blocks = []
-    for ring, (z_min, z_max) in enumerate(ring_limits(study), start=1):
-        for slot, outline in enumerate(outlines, start=1):
-            angle = np.radians(magnetization_angle_deg(array, slot))
-            block = MagnetBlock(
-                ring=ring, slot=slot, outline=outline, z_min=z_min, z_max=z_max,
-                easy_axis=(float(np.cos(angle)), float(np.sin(angle)), 0.0),
-                remanence=np.nan, recoil_permeability=array.recoil_permeability,
-            )
-            blocks.append(_with_remanence(block, array))
-    return tuple(blocks)
+    return tuple(
+        _block(array, ring, slot, outline, limits)
+        for ring, limits in enumerate(ring_limits(study), start=1)
+        for slot, outline in enumerate(outlines, start=1))
+
+
+def _block(
+    array: Array, ring: int, slot: int, outline: Outline, limits: tuple[float, float]
+) -> MagnetBlock:
+    """One block, as its array or an exception to it has it; the last exception counts."""
+    angle, permeability, remanence = (
+        magnetization_angle_deg(array, slot), array.recoil_permeability, array.remanence_T)
+    for exception in array.exceptions:
+        if exception.ring in (None, ring) and exception.slot in (None, slot):
+            if exception.magnetization_angle_deg is not None:
+                angle = exception.magnetization_angle_deg
+            permeability = exception.recoil_permeability or permeability
+            remanence = exception.remanence_T or remanence
+    direction = np.radians(angle)
+    block = MagnetBlock(
+        ring=ring, slot=slot, outline=outline, z_min=limits[0], z_max=limits[1],
+        easy_axis=(float(np.cos(direction)), float(np.sin(direction)), 0.0),
+        remanence=np.nan if remanence is None else remanence, recoil_permeability=permeability)
+    if remanence is not None:
+        return block
+    return replace(block, remanence=_remanence_of_moment(array, block))
 
 
 def position_angle_deg(array: Array, slot: int) -> float:
@@ -216,28 +231,22 @@ def points_in_material(study: Study, points: Floats) -> NDArray[np.bool_]:
     return inside
 
 
-def _with_remanence(block: MagnetBlock, array: Array) -> MagnetBlock:
-    """Fill in the remanence; a moment m means B_r = mu_0 m / V, m being the remanent moment.
+def _remanence_of_moment(array: Array, block: MagnetBlock) -> float:
+    """A moment m means B_r = mu_0 m / V, m being the remanent moment.
 
     (The moment that a Helmholtz coil shows of a lone block is smaller by the self-demagnetization
     1 + N (mu_r - 1), at most some 2 %; a nominal value does not know it.)
     """
-    remanence = array.remanence_T
-    if remanence is None:
-        assert array.block_moment_A_m2 is not None  # the study model guarantees both
-        assert array.ring_length_m is not None
-        remanence = MU_0 * array.block_moment_A_m2 / (block.area * array.ring_length_m)
-        if remanence > 2.0:
-            raise StudyError(
-                f"Input `array.block_moment_A_m2` of study must be a moment of a remanence up to "
-                f"2 T; instead received {array.block_moment_A_m2:g}, which is {remanence:.3g} T in "
-                f"this block. Check moment, radii and ring length."
-            )
-    return MagnetBlock(
-        ring=block.ring, slot=block.slot, outline=block.outline, z_min=block.z_min,
-        z_max=block.z_max, easy_axis=block.easy_axis, remanence=remanence,
-        recoil_permeability=block.recoil_permeability,
-    )
+    assert array.block_moment_A_m2 is not None  # the study model guarantees both
+    assert array.ring_length_m is not None
+    remanence = MU_0 * array.block_moment_A_m2 / (block.area * array.ring_length_m)
+    if remanence > 2.0:
+        raise StudyError(
+            f"Input `array.block_moment_A_m2` of study must be a moment of a remanence up to "
+            f"2 T; instead received {array.block_moment_A_m2:g}, which is {remanence:.3g} T in "
+            f"this block. Check moment, radii and ring length."
+        )
+    return remanence
 
 
 def _outline(array: Array, slot: int) -> Outline:

@@ -34,11 +34,11 @@ MAX_RELATIVE_RESIDUAL = 1e-8
 """A direct solve leaves 1e-13; 1e-8 of the source is still 1e-4 of the smallest error we state."""
 
 DIRECT_SOLVER = (
-    "-petsc_prealloc", "100",
+    "-petsc_prealloc", "200",
     "-ksp_type", "preonly", "-pc_type", "cholesky", "-pc_factor_mat_solver_type", "mumps",
 )
 """The matrices are symmetric: Cholesky takes half the memory of LU. Rows longer than those
-preallocated make assembling many times slower; edges of hexahedra have 33 neighbours."""
+preallocated make assembling many times slower."""
 
 CONJUGATE_GRADIENTS = (
     "-petsc_prealloc", "400",
@@ -87,6 +87,8 @@ class Job:
         ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
     outputs : tuple of str
         Files that the run must write.
+    solutions : str or None
+        File for every solution, see `halbach_fe.solutions`.
     unknowns : int or None
         Number of unknowns that the system must have; None where it cannot be foretold.
     solves : int
@@ -104,6 +106,7 @@ class Job:
     resolution: str
     outputs: tuple[str, ...]
     numbers: Mapping[str, float] = field(default_factory=dict)
+    solutions: str | None = None
     unknowns: int | None = None
     solves: int = 1
     options: tuple[str, ...] = DIRECT_SOLVER
@@ -161,18 +164,22 @@ def run(
     ]
     for name, value in job.numbers.items():
         arguments += ["-setnumber", name, f"{value:.17g}"]
-    for output in job.outputs:
+    written = job.outputs
+    if job.solutions is not None:
+        arguments += ["-ksp_view_solution", f"binary:{job.solutions}::append"]
+        written = (*written, job.solutions)
+    for output in written:
         (folder / output).unlink(missing_ok=True)  # GetDP would append to, or leave, a stale one
     lines = _execute(arguments, job, folder, on_line, cancel)
     _check_log(lines, job, folder)
-    for output in job.outputs:
+    for output in written:
         if not (folder / output).is_file() or not (folder / output).stat().st_size:
             raise _failure(f"it did not write {output}", folder)
     return lines
 
 
-def read_vectors(path: Path, points: Floats, sources: int) -> Floats:
-    """Read GetDP's SimpleTable of vectors at points, one block of rows per source; verify it.
+def read_vectors(path: Path, points: Floats) -> Floats:
+    """Read GetDP's SimpleTable of vectors at points, and verify it.
 
     Parameters
     ----------
@@ -180,12 +187,10 @@ def read_vectors(path: Path, points: Floats, sources: int) -> Floats:
         Rows ``x y z`` and three components.
     points : ndarray, shape (n, 3), in m
         Where the vector was asked for.
-    sources : int
-        How many blocks of rows there must be.
 
     Returns
     -------
-    ndarray, shape (sources, n, 3)
+    ndarray, shape (n, 3)
 
     Raises
     ------
@@ -199,20 +204,19 @@ def read_vectors(path: Path, points: Floats, sources: int) -> Floats:
     except (ValueError, OSError) as error:
         raise _failure(f"{path.name} is not a table of six columns ({error}); a point outside the "
                        "mesh looks like this, and so does a full disk", where) from None
-    if table.shape != (sources * len(points), 6):
+    if table.shape != (len(points), 6):
         raise _failure(f"{path.name} holds {table.shape[0]} rows of {table.shape[1]} columns in "
-                       f"place of {sources * len(points)} of 6; a point outside the mesh looks "
+                       f"place of {len(points)} of 6; a point outside the mesh looks "
                        "like this, and so does a full disk", where)
-    table = table.reshape(sources, len(points), 6)
     scale = max(1e-9, float(np.abs(points).max()))
-    if not np.allclose(table[:, :, :3], points, rtol=0, atol=1e-9 * scale):
+    if not np.allclose(table[:, :3], points, rtol=0, atol=1e-9 * scale):
         raise _failure(f"{path.name} was evaluated at other points than asked for", where)
-    vectors = table[:, :, 3:]
+    vectors = table[:, 3:]
     if not np.isfinite(vectors).all():
         raise _failure(f"{path.name} holds values that are not finite", where)
-    zero = np.argwhere(~vectors.any(axis=2))
+    zero = np.flatnonzero(~vectors.any(axis=1))
     if len(zero):
-        x, y, z = points[zero[0, 1]]
+        x, y, z = points[zero[0]]
         raise _failure(f"the field at ({x:g}, {y:g}, {z:g}) m is exactly zero, GetDP's sign for a "
                        f"point outside the mesh ({len(zero)} such values)", where)
     return vectors

@@ -13,30 +13,40 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.errors import MeshError, OutputError
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
+
+Ints = NDArray[np.int64]
 
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
 MERIDIAN = "meridian"
 """Prefix of the mesh of the (r, z) half-plane."""
 
-MERIDIAN_ELEMENTS = 8
+MERIDIAN_ELEMENTS = 12
 """Default number of elements across the blocks in the (r, z) half-plane."""
 
-# Edges of meshio's cells, by corner.
-_EDGES = {
-    "tetra": [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)],
-    "wedge": [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)],
-    "hexahedron": [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4),
-                   (0, 4), (1, 5), (2, 6), (3, 7)],
-    "triangle": [(0, 1), (1, 2), (2, 0)],
-    "quad": [(0, 1), (1, 2), (2, 3), (3, 0)],
-}
-_DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "quad": 2,
-              "quad9": 2, "tetra": 3, "wedge": 3, "hexahedron": 3}
+_DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad": 2, "tetra10": 3}
+# Corners of the parts of cells, by meshio's type; middles of edges do not count as corners.
+_CORNERS = {"line": 2, "line3": 2, "triangle6": 3, "quad": 4, "tetra10": 4}
+_EDGES = {"line": ((0, 1),), "line3": ((0, 1),), "triangle6": ((0, 1), (1, 2), (2, 0)),
+          "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
+          "tetra10": ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))}
+_FACES = {"line": (), "line3": (), "triangle6": ((0, 1, 2),), "quad": ((0, 1, 2, 3),),
+          "tetra10": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))}
+
+
+@dataclass(frozen=True)
+class Entities:
+    """Numbers of nodes, of those that are corners, of edges and of faces."""
+
+    nodes: int
+    corners: int
+    edges: int
+    faces: int
 
 
 @dataclass(frozen=True)
@@ -53,20 +63,29 @@ class VerifiedMesh:
 
     Attributes
     ----------
-    inner_nodes, inner_edges : int
-        Off the outer boundary; edges of a 3D mesh only.
-    axis_nodes : int
-        Of the inner nodes, those on the axis of a half-plane.
+    points : ndarray, shape (nodes, d), in m
+        In a half-plane x is r and y is z.
+    cells : ndarray, shape (elements, k)
+        Nodes of every element, in the order of the file, all of one type.
+    cell_type : str
+        meshio's name of it: ``triangle6``, ``quad`` or ``tetra10``.
+    in_air : ndarray of bool, shape (elements,)
+    inner : Entities
+        Off the outer boundary.
+    axis : Entities
+        Of these, those on the axis of a half-plane.
     radius, half_length : float
         Extent in m.
     """
 
     path: Path
     regions: Regions
-    nodes: int
-    inner_nodes: int
-    inner_edges: int
-    axis_nodes: int
+    points: NDArray[np.float64]
+    cells: Ints
+    cell_type: str
+    in_air: NDArray[np.bool_]
+    inner: Entities
+    axis: Entities
     radius: float
     half_length: float
 
@@ -140,7 +159,12 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
             f"Mesh {files.mesh} lacks its outer boundary (region {regions.outer_boundary}); GetDP "
             "would solve without a boundary condition. Mesh the study again."
         )
-    inner_nodes, inner_edges = _count_inner(mesh, physical, regions)
+    chosen = [_DIMENSION.get(c.type) == regions.dimension for c in mesh.cells]
+    cells = np.vstack([c.data for c, yes in zip(mesh.cells, chosen, strict=True) if yes])
+    kind = next(c.type for c, yes in zip(mesh.cells, chosen, strict=True) if yes)
+    material = np.concatenate([tags for tags, yes in zip(physical, chosen, strict=True) if yes])
+    edge, boundary = _on(mesh, physical, regions.outer_boundary)
+    axis = boundary[:0] if regions.axis is None else _on(mesh, physical, regions.axis)[1]
     extent = np.abs(mesh.points).max(axis=0)
     if regions.axis is not None:  # x is r, y is z
         radius, half_length = float(extent[0]), float(extent[1])
@@ -148,11 +172,11 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
         radius = float(np.hypot(*mesh.points[:, :2].T).max())
         half_length = float(extent[2]) if regions.dimension == 3 else np.inf
     return VerifiedMesh(
-        path=files.mesh, regions=regions, nodes=len(mesh.points),
-        inner_nodes=inner_nodes, inner_edges=inner_edges,
-        axis_nodes=_count_axis_nodes(mesh, physical, regions),
-        radius=radius, half_length=half_length,
-    )
+        path=files.mesh, regions=regions, points=mesh.points[:, :regions.dimension], cells=cells,
+        cell_type=kind, in_air=material == regions.air,
+        inner=_less(_count(cells, kind), _count(boundary, edge)),
+        axis=_less(_count(np.vstack([axis, boundary]), edge), _count(boundary, edge)),
+        radius=radius, half_length=half_length)
 
 
 def _read(path: Path) -> meshio.Mesh:
@@ -174,35 +198,33 @@ def _read(path: Path) -> meshio.Mesh:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
 
 
-def _count_inner(
-    mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions
-) -> tuple[int, int]:
-    """Nodes, and in 3D edges, that are not on the outer boundary."""
-    volume = [c for c in mesh.cells if _DIMENSION[c.type] == regions.dimension]
-    faces = [(c.type, c.data[tags == regions.outer_boundary])
-             for c, tags in zip(mesh.cells, physical, strict=True)
-             if _DIMENSION[c.type] == regions.dimension - 1]
-    nodes = (len(np.unique(np.concatenate([c.data.ravel() for c in volume])))
-             - len(np.unique(np.concatenate([data.ravel() for _, data in faces]))))
-    if regions.dimension == 2:
-        return nodes, 0
-    edges = _count_edges([(c.type, c.data) for c in volume], len(mesh.points))
-    return nodes, edges - _count_edges(faces, len(mesh.points))
+def _on(mesh: meshio.Mesh, physical: list[NDArray[np.int64]], tag: int) -> tuple[str, Ints]:
+    """Type and elements of a part of the boundary."""
+    parts = [(c.type, c.data[tags == tag]) for c, tags in zip(mesh.cells, physical, strict=True)
+             if (tags == tag).any()]
+    return parts[0][0], np.vstack([data for _, data in parts])
 
 
-def _count_axis_nodes(mesh: meshio.Mesh, physical: list[np.ndarray], regions: Regions) -> int:
-    """Nodes on the axis and off the outer boundary; 0 where the mesh has no axis."""
-    nodes = {
-        tag: np.unique(np.concatenate([
-            c.data[tags == tag].ravel() for c, tags in zip(mesh.cells, physical, strict=True)
-            if _DIMENSION[c.type] == regions.dimension - 1]))
-        for tag in (regions.axis, regions.outer_boundary) if tag is not None}
-    if regions.axis is None:
+def _count(cells: Ints, kind: str) -> Entities:
+    """How many different nodes, corners, edges and faces cells of one type have."""
+    corners = cells[:, :_CORNERS[kind]]
+    edges, faces = (np.vstack([corners[:, list(part)] for part in parts]) if parts else []
+                    for parts in (_EDGES[kind], _FACES[kind]))
+    return Entities(len(np.unique(cells)), len(np.unique(corners)), _different(edges),
+                    _different(faces))
+
+
+def _different(entities: Ints | list[int]) -> int:
+    """How many entities, by their corners in any order, differ."""
+    if not len(entities):
         return 0
-    return len(np.setdiff1d(nodes[regions.axis], nodes[regions.outer_boundary]))
+    ordered = np.sort(np.asarray(entities, np.int64), axis=1)
+    key = ordered[:, 0]
+    for column in ordered.T[1:]:
+        key = np.unique(key, return_inverse=True)[1] * (int(ordered.max()) + 1) + column
+    return len(np.unique(key))
 
 
-def _count_edges(cells: list[tuple[str, np.ndarray]], nodes: int) -> int:
-    pairs = np.vstack([data[:, list(pair)] for kind, data in cells for pair in _EDGES[kind]])
-    pairs = np.sort(pairs, axis=1).astype(np.int64)
-    return len(np.unique(pairs[:, 0] * nodes + pairs[:, 1]))
+def _less(all_: Entities, some: Entities) -> Entities:
+    return Entities(all_.nodes - some.nodes, all_.corners - some.corners,
+                    all_.edges - some.edges, all_.faces - some.faces)

@@ -18,11 +18,11 @@ import xarray as xr
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import GetDPError
-from halbach_fe.exact_field import field_of, unit_field
+from halbach_fe.exact_field import field_of, unit_fields
 from halbach_fe.field_map import write_hdf5
 from halbach_fe.observation import Observation
 from halbach_fe.routes import check_points, finite_element_part
-from halbach_fe.solve import Workshop, source_number
+from halbach_fe.solve import Workshop
 from halbach_fe.study import COMPONENTS, MU_0, Study
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -71,18 +71,18 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     check_points(study, observation.points)
     blocks = blocks_of(study)
     dimension = study.dimension
-    last = source_number(study, len(blocks) - 1, dimension - 1)
-    fields = finite_element_part(study, observation.points, (0, last), workshop)
-    check = fields[0]
+    parts = finite_element_part(study, observation.points, workshop)
+    check = parts.nominal
     exact = study.solver.method == "reaction"
+    vacuum = unit_fields(blocks, observation.points)
     columns = []
     for number, block in enumerate(blocks):
-        first = source_number(study, number, 0)
-        field = fields[first:first + dimension]  # (dimension, n, 3): per T of remanence
+        field = parts.block(number)
         if exact:
-            field = field + np.moveaxis(unit_field(block, observation.points), 2, 0)[:dimension]
+            field = field + next(vacuum)[:, :, :dimension]
         # B_r = mu_0 mu_r M turns per tesla into per A/m
-        columns.append(observation.apply(field * MU_0 * block.recoil_permeability).T)
+        columns.append(observation.apply(np.moveaxis(field, 2, 0) * MU_0
+                                         * block.recoil_permeability).T)
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     if exact:

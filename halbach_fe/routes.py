@@ -2,39 +2,60 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from halbach_fe import azimuthal
+from halbach_fe.azimuthal import solve_modes
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
 from halbach_fe.errors import StudyError
 from halbach_fe.exact_field import field_of
 from halbach_fe.solve import (
     CROSS_SECTION,
-    EDGE_ELEMENTS,
-    NOMINAL_SOURCE,
     SCALAR_POTENTIAL,
     Workshop,
+    edge_elements,
     solve_sources,
 )
 from halbach_fe.study import Study
+from halbach_fe.symmetry import no_symmetry, symmetry_of
 
-FORMULATIONS = {"cross_section": CROSS_SECTION, "edge_elements": EDGE_ELEMENTS,
-                "scalar_potential": SCALAR_POTENTIAL}
+BOUNDARY_NEAR = 0.5
+"""Of the way from the magnet to the boundary: readings beyond it are warned of."""
+
+
+@dataclass(frozen=True)
+class ElementFields:
+    """What finite elements contribute to B, by source.
+
+    Attributes
+    ----------
+    nominal : ndarray, shape (n, 3), in T
+        Of the whole array, solved for at once.
+    block : callable
+        Number of a block, from 0, to its contribution (n, 3, D), in T per T of remanence along
+        each axis. By symmetry several blocks share one solve.
+    """
+
+    nominal: Floats
+    block: Callable[[int], Floats]
 
 
 def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
     """Field of the nominal array at points (n, 3) in m, by the study's method; (n, 3) in T."""
     check_points(study, points)
-    field = finite_element_part(study, points, (NOMINAL_SOURCE, NOMINAL_SOURCE), workshop)[0]
+    field = finite_element_part(study, points, workshop, columns=False).nominal
     if study.solver.method == "direct":
         return field
     return field_of(blocks_of(study), points) + field
 
 
 def finite_element_part(
-    study: Study, points: Floats, sources: tuple[int, int], workshop: Workshop
-) -> Floats:
-    """What finite elements contribute to B for a range of sources, by the route that suits.
+    study: Study, points: Floats, workshop: Workshop, columns: bool = True
+) -> ElementFields:
+    """What finite elements contribute to B, by the route that suits.
 
     For the method ``direct`` that is B itself, for ``reaction`` the reaction of permeability and
     iron, to be added to the exact field in vacuum.
@@ -42,22 +63,44 @@ def finite_element_part(
     Parameters
     ----------
     points : ndarray, shape (n, 3), in m
-    sources : (first, last)
-        Both included; see `halbach_fe.solve.source_number`.
-
-    Returns
-    -------
-    ndarray, shape (last - first + 1, n, 3), in T
+    columns : bool
+        Whether single blocks are wanted too.
     """
-    first, last = sources
-    vacuum = study.array.recoil_permeability == 1.0 and study.iron_ring is None
+    blocks, size = blocks_of(study), study.dimension
+    vacuum = study.iron_ring is None and all(b.recoil_permeability == 1.0 for b in blocks)
     if study.solver.method == "reaction" and vacuum:
-        return np.zeros((last - first + 1, len(points), 3))
+        return ElementFields(np.zeros((len(points), 3)),
+                             lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)
+    if not columns:
+        return ElementFields(_solve(study, points, (), workshop, route)[0], _not_solved)
+    symmetry = symmetry_of(study) if study.solver.symmetry else no_symmetry(study)
+    places, index = symmetry.spread(points)
+    fields = _solve(study, places, symmetry.sources, workshop, route)
+    # the identity is among the placements: the first block is its own source, where it stands
+    here = index[symmetry.sources[0]]
+
+    def block(number: int) -> Floats:
+        placement = symmetry.placements[number]
+        first = 1 + size * symmetry.sources.index(placement.source)
+        seen = np.moveaxis(fields[first:first + size, index[number]], 0, 2)
+        return placement.from_source(seen)
+
+    return ElementFields(fields[0, here], block)
+
+
+def _not_solved(number: int) -> Floats:
+    raise AssertionError(f"block {number} was not solved for")
+
+
+def _solve(
+    study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop, route: str
+) -> Floats:
     if route == "azimuthal_modes":
-        fields = azimuthal.mode_fields(study, points, workshop, columns=last > NOMINAL_SOURCE)
-        return fields[first:last + 1]
-    return solve_sources(study, points, sources, workshop, FORMULATIONS[route])
+        return solve_modes(study, points, blocks, workshop)
+    formulation = {"cross_section": CROSS_SECTION, "scalar_potential": SCALAR_POTENTIAL}.get(
+        route) or edge_elements(study.solver.edge_order)
+    return solve_sources(study, points, blocks, workshop, formulation)
 
 
 def choose_route(study: Study, points: Floats) -> str:
@@ -74,12 +117,12 @@ def choose_route(study: Study, points: Floats) -> str:
     if asked == "azimuthal_modes" and not suits:
         raise StudyError(
             f"Input `solver.route` of study {study.name} must be another than "
-            "azimuthal_modes here, which needs sectors without angular gaps, and points that are "
-            "not too near to the blocks. Leave it out.")
+            "azimuthal_modes here, which needs sectors without angular gaps, of one permeability "
+            "in each ring, and points that are not too near to the blocks. Leave it out.")
     if asked == "auto":
         if study.solver.method == "direct":
             return "edge_elements"
-        return "azimuthal_modes" if suits else "edge_elements"
+        return "azimuthal_modes" if suits else "scalar_potential"
     return asked
 
 

@@ -5,26 +5,35 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import metadata, resources
 from itertools import pairwise
 from pathlib import Path
 
 import jinja2
 import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
 
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import GetDPError, OutputError, PointsOutsideError
+from halbach_fe.evaluation import Located, curl_operators, locate, middles, nodal_operators
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
+from halbach_fe.solutions import Unknowns, read_solutions, read_unknowns
 from halbach_fe.study import MU_0, Study
 
 NOMINAL_SOURCE = 0
 FLUX_DENSITY_FILE = "flux_density.txt"
+SOLUTIONS_FILE = "solutions.bin"
+SOLUTIONS_AT_ONCE = 32
+PRINTED_TOLERANCE = 1e-10
+"""Of the largest value. Both evaluate the same polynomials; points are found to 1e-13."""
+
 PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro")
 Progress = Callable[[int, int], None]
 """Called with the number of solves done and the number of all."""
@@ -54,34 +63,62 @@ class Workshop:
     progress: Progress | None = None
 
 
-def source_number(study: Study, block: int, component: int) -> int:
-    """Number of the source '1 T of block ``block`` along axis ``component``', both from 0."""
-    return study.dimension * block + component + 1
-
-
 @dataclass(frozen=True)
 class Formulation:
-    """A problem file, how many unknowns it must have on a mesh, and what solves it."""
+    """A problem file, what its unknowns are, and what solves it.
+
+    Attributes
+    ----------
+    problem : str
+    unknowns : callable
+        How many there must be on a mesh.
+    flux_density : callable
+        Mesh, located points and unknowns to the sparse operators of Bx, By, Bz there.
+    options : tuple of str
+        PETSc's.
+    numbers : mapping
+        Constants of the problem.
+    """
 
     problem: str
     unknowns: Callable[[VerifiedMesh], int]
+    flux_density: Callable[[VerifiedMesh, Located, Unknowns], list[sparse.csr_array]]
     options: tuple[str, ...] = runner.DIRECT_SOLVER
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
 
-CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda mesh: mesh.inner_nodes)
-EDGE_ELEMENTS = Formulation(
-    # the tree of the gauge, started on the boundary, has one edge per node off it
-    "magnetostatics_3d.pro", lambda mesh: mesh.inner_edges - mesh.inner_nodes)
-SCALAR_POTENTIAL = Formulation(
-    "scalar_potential_3d.pro", lambda mesh: mesh.inner_nodes + mesh.inner_edges,
-    runner.CONJUGATE_GRADIENTS)
+def _curl_of_axial(
+    mesh: VerifiedMesh, located: Located, unknowns: Unknowns
+) -> list[sparse.csr_array]:
+    _, (x, y) = nodal_operators(mesh, located, unknowns)
+    return [y, -x, 0 * x]
+
+
+def _minus_gradient(
+    mesh: VerifiedMesh, located: Located, unknowns: Unknowns
+) -> list[sparse.csr_array]:
+    return [-slope for slope in nodal_operators(mesh, located, unknowns)[1]]
+
+
+CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda mesh: mesh.inner.nodes, _curl_of_axial)
+SCALAR_POTENTIAL = Formulation("scalar_potential_3d.pro", lambda mesh: mesh.inner.nodes,
+                               _minus_gradient, runner.CONJUGATE_GRADIENTS)
+
+
+def edge_elements(order: int) -> Formulation:
+    """Edge elements of order 1 or 2."""
+    return Formulation(
+        # the tree of the gauge, started on the boundary, has one edge per corner off it
+        "magnetostatics_3d.pro", lambda mesh: mesh.inner.edges - mesh.inner.corners + (
+            2 * mesh.inner.faces if order == 2 else 0),
+        curl_operators, numbers={"ORDER": order})
 
 
 def solve_sources(
-    study: Study, points: Floats, sources: tuple[int, int], workshop: Workshop,
+    study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
     formulation: Formulation,
 ) -> Floats:
-    """Finite-element part of the field for a range of sources.
+    """Finite-element part of the field of the nominal array and of single blocks.
 
     For the method ``direct`` that is B itself. For ``reaction`` it is the difference of two
     solves on one mesh, real materials minus vacuum, to be added to the exact field in vacuum;
@@ -90,25 +127,26 @@ def solve_sources(
     Parameters
     ----------
     points : ndarray, shape (n, 3), in m
-    sources : (first, last)
-        Both included; see `source_number`, and `NOMINAL_SOURCE`.
+    blocks : sequence of int
+        Numbers, from 0, of the blocks to solve for with 1 T along each axis.
 
     Returns
     -------
-    ndarray, shape (last - first + 1, n, 3), in T
+    ndarray, shape (1 + D len(blocks), n, 3), in T
+        The nominal array, then block by block, axis by axis.
     """
-    first, last = sources
-    count = last - first + 1
+    last = study.dimension * len(blocks)
     if study.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
     folder = make_folder(workshop.folder)
     mesh = verify_mesh(build_mesh(study, folder))
     check_inside(mesh, points)
+    located = locate(mesh, points)
     variants = [False] if study.solver.method == "direct" else [False, True]
-    parts = max(1, min(count, workshop.jobs // len(variants)))
-    limits = np.linspace(first, last + 1, parts + 1).astype(int)
+    parts = max(1, min(last + 1, workshop.jobs // len(variants)))
+    limits = np.linspace(0, last + 1, parts + 1).astype(int)
     ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
-    tasks = [_task(study, mesh, points, part, vacuum, workshop, formulation,
+    tasks = [_task(study, mesh, located, blocks, part, vacuum, workshop, formulation,
                    f"-{number}" if number else "")
              for vacuum in variants for number, part in enumerate(ranges)]
     results = run_tasks(tasks, workshop)
@@ -161,7 +199,6 @@ def render(template: str, *, study: Study, **data: object) -> str:
         autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
     return environment.from_string(source).render(
         study=study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=blocks_of(study),
-        recoil_permeability=study.array.recoil_permeability,
         iron_permeability=study.iron_ring.relative_permeability if study.iron_ring else 1.0,
         **data)
 
@@ -181,36 +218,86 @@ class _Counter:
 
 
 def _task(
-    study: Study, mesh: VerifiedMesh, points: Floats, sources: tuple[int, int], vacuum: bool,
-    workshop: Workshop, formulation: Formulation, suffix: str,
+    study: Study, mesh: VerifiedMesh, located: Located, blocks: Sequence[int],
+    sources: tuple[int, int], vacuum: bool, workshop: Workshop, formulation: Formulation,
+    suffix: str,
 ) -> Task:
     count = sources[1] - sources[0] + 1
+    probes, places = middles(mesh, located)
+
+    def read(folder: Path) -> Floats:
+        unknowns = read_unknowns(folder / f"{Path(formulation.problem).stem}.pre", mesh.cell_type)
+        solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, count)
+
+        def field(located: Located, chosen: NDArray[np.floating]) -> Floats:
+            operators = formulation.flux_density(mesh, located, unknowns)
+            return np.stack([apply_to(operator, chosen) for operator in operators], axis=2)
+
+        compare_printed(field(probes, solutions[:1])[0], folder / FLUX_DENSITY_FILE, places)
+        result = field(located, solutions)
+        (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
+        return result
+
     return Task(
         name=f"getdp-{'vacuum' if vacuum else 'real'}{suffix}",
-        stage=lambda folder: stage(study, mesh, points, folder, formulation, sources,
+        stage=lambda folder: stage(study, mesh, places, folder, formulation, blocks, sources,
                                    vacuum, workshop.time_limit_s),
-        read=lambda folder: runner.read_vectors(folder / FLUX_DENSITY_FILE, points, count),
-        solves=count)
+        read=read, solves=count)
+
+
+def apply_to(operator: sparse.csr_array, solutions: NDArray[np.floating]) -> Floats:
+    """Rows of an operator (n, unknowns) on all solutions (k, unknowns), as (k, n)."""
+    result = np.empty((len(solutions), operator.shape[0]))
+    for first in range(0, len(solutions), SOLUTIONS_AT_ONCE):
+        part = slice(first, first + SOLUTIONS_AT_ONCE)
+        result[part] = (operator @ solutions[part].astype(float).T).T
+    return result
+
+
+def compare_printed(ours: Floats, printed: Path, places: Floats) -> None:
+    """Compare vectors (n, 3) at places (n, 3), by our evaluation of a solution, with what GetDP
+    itself printed of it.
+
+    Raises
+    ------
+    GetDPError
+        If they differ by more than the rounding of 16 printed digits.
+    """
+    theirs = runner.read_vectors(printed, places)
+    difference = np.abs(ours - theirs).max()
+    if not difference <= PRINTED_TOLERANCE * np.abs(theirs).max():
+        raise GetDPError(
+            f"GetDP's solution, evaluated here, is {difference:.1e} from what GetDP prints of it "
+            f"in {printed}: the unknowns of this GetDP are numbered in another way than expected. "
+            "Use GetDP 3.2.")
 
 
 def stage(
-    study: Study, mesh: VerifiedMesh, points: Floats, folder: Path, formulation: Formulation,
-    sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE), vacuum: bool = False,
-    time_limit_s: float = 3600.0,
+    study: Study, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
+    blocks: Sequence[int] = (), sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE),
+    vacuum: bool = False, time_limit_s: float = 3600.0,
 ) -> Job:
-    """Fill a run folder with everything that GetDP needs, and return the job to run there."""
+    """Fill a run folder with everything that GetDP needs, and return the job to run there.
+
+    ``places`` (n, 3) in m are where GetDP prints the first source's field; ``sources`` are the
+    first and last to solve for, 0 being the nominal array, the others the axes of ``blocks``.
+    """
     for name in (formulation.problem, *PROBLEM_INCLUDES):
         text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
         (folder / name).write_bytes(text)
-    (folder / "case.pro").write_text(render("case.pro.j2", study=study, regions=mesh.regions,
-                                            points=points.tolist()), encoding="utf-8")
+    ranks = np.zeros(len(mesh.regions.blocks), int)
+    ranks[list(blocks)] = np.arange(1, len(blocks) + 1)
+    (folder / "case.pro").write_text(
+        render("case.pro.j2", study=study, regions=mesh.regions, points=places.tolist(),
+               ranks=ranks.tolist()), encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
     return Job(
         problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
-        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]},
-        outputs=(FLUX_DENSITY_FILE,), unknowns=formulation.unknowns(mesh),
-        solves=sources[1] - sources[0] + 1, options=formulation.options,
-        time_limit_s=time_limit_s)
+        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]}
+        | dict(formulation.numbers),
+        outputs=(FLUX_DENSITY_FILE,), solutions=SOLUTIONS_FILE,
+        unknowns=formulation.unknowns(mesh), solves=sources[1] - sources[0] + 1,
+        options=formulation.options, time_limit_s=time_limit_s)
 
 
 @contextmanager

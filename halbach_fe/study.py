@@ -76,6 +76,16 @@ class CuboidBlock(_Model):
 Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminator="shape")]
 
 
+class BlockException(_Model):
+    """What is different in the blocks of one ring, or one slot, or both, from the array's."""
+
+    ring: Annotated[int, Field(ge=1)] | None = None
+    slot: Annotated[int, Field(ge=1)] | None = None
+    recoil_permeability: Annotated[float, Field(ge=1.0, le=2.0)] | None = None
+    remanence_T: Remanence | None = None
+    magnetization_angle_deg: Angle | None = None
+
+
 class Array(_Model):
     """The permanent-magnet array, in general: ``rings`` equal rings of ``blocks_per_ring`` blocks.
 
@@ -97,6 +107,7 @@ class Array(_Model):
     remanence_T: Remanence | None = None
     block_moment_A_m2: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
     block: Block
+    exceptions: tuple[BlockException, ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> Array:
@@ -109,6 +120,11 @@ class Array(_Model):
             raise ValueError("give exactly one of remanence_T and block_moment_A_m2")
         if self.block_moment_A_m2 is not None and self.ring_length_m is None:
             raise ValueError("block_moment_A_m2 needs ring_length_m, to know the block's volume")
+        for one in self.exceptions:
+            if (one.ring or 1) > self.rings or (one.slot or 1) > self.blocks_per_ring:
+                raise ValueError(
+                    f"an exception names ring {one.ring}, slot {one.slot} of an array of "
+                    f"{self.rings} rings of {self.blocks_per_ring} blocks")
         return self
 
 
@@ -134,7 +150,7 @@ class Mesh(_Model):
     """Element sizes. In 3D the cross-section is extruded in layers along z.
 
     ``meridian_size_m`` is that of the (r, z) half-plane, for rotationally symmetric materials
-    (default: an eighth of the blocks' radial thickness).
+    (default: a twelfth of the blocks' radial thickness).
     """
 
     block_size_m: Length
@@ -283,11 +299,15 @@ class Solver(_Model):
     ``route`` is how a 3D reaction is computed: ``azimuthal_modes``, one (r, z) problem per mode,
     for rotationally symmetric materials (sectors without gaps); ``edge_elements``, curl-curl in
     3D, for any geometry; ``scalar_potential``, its dual, of second order, for any geometry too.
-    ``auto`` takes the first where it can, edge elements elsewhere and for ``direct``.
+    ``auto`` takes the first where it can, the scalar potential elsewhere, and edge elements for
+    ``direct``. ``edge_order`` is the order of the edge elements. ``symmetry`` lets one block stand
+    for those that turning and mirroring the magnet puts in its place.
     """
 
     method: Literal["reaction", "direct"] = "reaction"
     route: Literal["auto", "azimuthal_modes", "edge_elements", "scalar_potential"] = "auto"
+    edge_order: Literal[1, 2] = 1
+    symmetry: bool = True
 
 
 class Study(_Model):

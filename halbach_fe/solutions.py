@@ -1,0 +1,105 @@
+"""What a GetDP run leaves on disk: the place of every unknown, and every solution.
+
+The ``.pre`` file lists the unknowns by basis function and mesh entity, and for edge elements
+which edges and faces every element has; PETSc writes the solutions as big-endian binary vectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import GetDPError
+
+Ints = NDArray[np.int64]
+
+_VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
+_UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Where the unknowns of a system live.
+
+    Attributes
+    ----------
+    count : int
+    functions : tuple of ndarray
+        For each kind of basis function, in the order of the problem file: index of the unknown by
+        entity number, -1 where there is none (fixed, or no such entity). Nodes are numbered as in
+        the mesh, edges and faces by GetDP.
+    edges, faces : ndarray, shape (elements, edges of one) and (elements, faces of one)
+        In the mesh's order; the sign of an edge tells its direction. Empty where the problem has
+        none.
+    """
+
+    count: int
+    functions: tuple[Ints, ...]
+    edges: Ints
+    faces: Ints
+
+
+# Edges and faces of an element, by meshio's name of its type.
+_PARTS = {"triangle6": (3, 1), "quad": (4, 1), "tetra10": (6, 4)}
+
+
+def read_unknowns(path: Path, cell_type: str) -> Unknowns:
+    """Read the ``.pre`` file of a mesh of one type of elements; raise GetDPError if it is none."""
+    edges, faces = _PARTS[cell_type]
+    try:
+        text = path.read_text(encoding="ascii")
+        rows = _section(text, "DofData", skip=5)
+        table = np.array([line.split()[:5] for line in rows], float).astype(int)
+        count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
+        functions = []
+        for kind in np.unique(table[:, 0]):
+            mine = table[table[:, 0] == kind]
+            index = np.full(np.abs(mine[:, 1]).max() + 1, -1)
+            solved = mine[mine[:, 3] == _UNKNOWN]
+            index[np.abs(solved[:, 1])] = solved[:, 4] - 1
+            functions.append(index)
+        return Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
+                        _entities(text, "ElementsXFacets", faces))
+    except (OSError, ValueError, IndexError) as error:
+        raise GetDPError(f"GetDP's list of unknowns {path} cannot be read ({error}).") from None
+
+
+def _section(text: str, name: str, skip: int) -> list[str]:
+    body = text.partition(f"${name}")[2].partition(f"$End{name}")[0]
+    return body.split("\n")[skip + 1:-1]
+
+
+def _entities(text: str, name: str, count: int) -> Ints:
+    """Entities of the elements that have ``count`` of them (others are faces of the boundary)."""
+    rows = [line.split() for line in _section(text, name, skip=1)]
+    wanted = [row[2:] for row in rows if row[1] == str(count)]
+    return np.array(wanted, int).reshape(-1, count)
+
+
+def read_solutions(path: Path, unknowns: int, solves: int) -> NDArray[np.floating]:
+    """Solutions in the order of their solves, (solves, unknowns), mapped from the file.
+
+    Raises
+    ------
+    GetDPError
+        If the file does not hold just these solves, or values that are not finite.
+    """
+    size = 8 + 8 * unknowns
+    try:
+        raw = np.memmap(path, np.uint8, "r")
+    except (OSError, ValueError) as error:
+        raise GetDPError(f"GetDP's solutions {path} cannot be read ({error}).") from None
+    if len(raw) != solves * size:
+        raise GetDPError(f"GetDP's file {path} holds {len(raw)} bytes in place of {solves} "
+                         f"solutions of {unknowns} unknowns; a full disk looks like this.")
+    heads = raw.reshape(solves, size)[:, :8].copy().view(">i4")
+    if not (heads == [_VECTOR, unknowns]).all():
+        raise GetDPError(f"GetDP's file {path} does not hold {solves} PETSc vectors.")
+    solutions = np.ndarray((solves, unknowns), ">f8", raw, offset=8, strides=(size, 8))
+    if not all(np.isfinite(solution).all() for solution in solutions):
+        raise GetDPError(f"GetDP's file {path} holds values that are not finite.")
+    return solutions
