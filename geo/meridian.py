@@ -13,7 +13,7 @@ import gmsh
 import numpy as np
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, iron_half_length, ring_limits
+from halbach_fe.blocks import Floats, array_half_length, iron_half_length, ring_limits
 from halbach_fe.extent import boundary_half_length, boundary_radius, magnet_half_length
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import BlockRegion, Regions
@@ -21,6 +21,7 @@ from halbach_fe.study import Study
 
 LINE, QUADRANGLE = 1, 3  # Gmsh's element types
 _GROWTH = 1.35
+_GRADING, _LEVELS = 0.3, 2  # ratio of neighbours towards a corner, and how many of them
 
 
 def mesh_meridian(study: Study, size: float, mesh_path: Path) -> Regions:
@@ -43,8 +44,8 @@ def _radii(study: Study, size: float) -> Floats:
     stops = [0.0, array.inner_radius_m, array.outer_radius_m]
     if iron is not None:
         stops += [iron.inner_radius_m, iron.outer_radius_m]
-    return np.array([*_uniform(stops, size), *_growing(
-        stops[-1], size, boundary_radius(study, "meridian"))])
+    r = [*_uniform(stops, size), *_growing(stops[-1], size, boundary_radius(study, "meridian"))]
+    return _graded(r, stops[1:])
 
 
 def _heights(study: Study, size: float) -> Floats:
@@ -56,7 +57,24 @@ def _heights(study: Study, size: float) -> Floats:
     uniform = min(end + 2 * study.array.inner_radius_m, 0.5 * (end + boundary))
     outside = _growing(uniform, size, boundary)
     inside = _uniform(sorted(stops | {-uniform, uniform}), size)
-    return np.array([*(-value for value in reversed(outside)), *inside, *outside])
+    z = [*(-value for value in reversed(outside)), *inside, *outside]
+    iron_end = iron_half_length(study) if study.iron_ring else end
+    ends = {array_half_length(study), iron_end}
+    return _graded(z, [side * value for value in ends for side in (-1, 1)])
+
+
+def _graded(positions: list[float], corners: list[float]) -> Floats:
+    """Cut the elements beside corners of materials, where the field is singular, into ever smaller
+    ones.
+    """
+    x = np.array(positions)
+    added = []
+    for corner in corners:
+        i = int(np.argmin(np.abs(x - corner)))
+        for neighbour in (i - 1, i + 1):
+            step = x[neighbour] - x[i]
+            added += [x[i] + step * _GRADING**level for level in range(1, _LEVELS + 1)]
+    return np.unique(np.concatenate([x, added]))
 
 
 def _uniform(stops: list[float], size: float) -> list[float]:

@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, MagnetBlock, array_half_length, blocks_of, position_angle_deg
 from halbach_fe.evaluation import Located, coordinates, locate, middles, nodal_operators
@@ -44,8 +45,8 @@ MODE_TOLERANCE = 1e-4
 cent of its field, is below 1e-5 of that field."""
 
 MAX_MODES = 64
-AXIS_RADIUS = 1e-6
-"""Points nearer to the axis than this fraction of the bore are moved there: psi/r needs r > 0."""
+AXIS_RADIUS = 1e-8
+"""Points nearer to the axis than this fraction of the bore are on it, where psi/r is a limit."""
 
 NO_REMANENCE = 1e-12
 """Of the largest mode: a mode of the nominal array below it is excluded by symmetry."""
@@ -131,7 +132,8 @@ def solve_modes(
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
     """
     array = study.array
-    r = np.maximum(np.hypot(points[:, 0], points[:, 1]), AXIS_RADIUS * array.inner_radius_m)
+    r = np.hypot(points[:, 0], points[:, 1])
+    r[r < AXIS_RADIUS * array.inner_radius_m] = 0.0
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
     highest = modes_needed(study, points)
     mesh = verify_mesh(build_meridian(study, make_folder(workshop.folder)))
@@ -140,7 +142,7 @@ def solve_modes(
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
     weights = _nominal_waves(study, highest)
     case = _Case(study, mesh, weights, solved, located, *middles(mesh, located))
-    wanted = range(highest + 1)
+    wanted = list(range(highest + 1))
     if not blocks:
         size = np.abs(weights).max(axis=(1, 2, 3))
         wanted = [m for m in wanted if size[m] > NO_REMANENCE * size.max()]
@@ -155,6 +157,8 @@ def solve_modes(
         results = [real - vacuum for real, vacuum in zip(results[::2], results[1::2], strict=True)]
     modes = dict(zip([m for span in reversed(spans) for m in range(span[0], span[1] + 1)],
                      np.concatenate(results), strict=True))
+    for m, gradient in modes.items():
+        _limit_on_axis(m, gradient, meridian[:, 0] == 0)
     return _superpose(case, modes, points, where, blocks)
 
 
@@ -227,8 +231,8 @@ def stage(
     ``span`` and ``sources`` are the first and last mode and source, ``printed`` the source that
     GetDP prints in the first mode.
     """
-    text = resources.files("halbach_fe.pro").joinpath(PROBLEM).read_bytes()
-    (folder / PROBLEM).write_bytes(text)
+    problem = resources.files("halbach_fe.pro").joinpath(PROBLEM).read_bytes()
+    (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", study=case.study, regions=case.mesh.regions,
                   points=case.places.tolist(), rings=_rings(case), solved=max(1, len(case.solved)))
     (folder / "case.pro").write_text(text, encoding="utf-8")
@@ -252,16 +256,31 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.mesh.cell_type)
     solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
 
-    def gradients(located: Located, chosen: Floats) -> Floats:
+    def gradients(located: Located, chosen: NDArray[np.floating]) -> Floats:
         value, (along_r, along_z) = nodal_operators(case.mesh, located, unknowns)
         r = coordinates(case.mesh, located)[:, 0]
+        r[r < AXIS_RADIUS * case.study.array.inner_radius_m] = np.inf  # see _limit_on_axis
         return np.stack([apply_to(along_r, chosen), apply_to(value, chosen) / r,
                          apply_to(along_z, chosen)], axis=2)
 
-    compare_printed(gradients(case.probes, solutions[printed:printed + 1])[0], folder / OUTPUT, case.places)
+    compare_printed(gradients(case.probes, solutions[printed:printed + 1])[0], folder / OUTPUT,
+                    case.places)
     result = gradients(case.located, solutions)
     (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
     return result.reshape(modes, sources, *result.shape[1:])
+
+
+def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None:
+    """Put what d psi/dr, psi/r, d psi/dz (..., points, 3) are on the axis: psi is like r^m there,
+    and elements are not.
+    """
+    if m == 1:
+        gradient[..., on_axis, 1] = gradient[..., on_axis, 0]
+        gradient[..., on_axis, 2] = 0
+    else:
+        gradient[..., on_axis, :2] = 0
+        if m > 1:
+            gradient[..., on_axis, 2] = 0
 
 
 def _superpose(

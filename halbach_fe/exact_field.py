@@ -28,7 +28,7 @@ from dataclasses import replace
 import numpy as np
 
 from halbach_fe.blocks import Edge, Floats, MagnetBlock, Outline
-from halbach_fe.symmetry import Frame, frame_of, turn_matrix, unique_points
+from halbach_fe.symmetry import Frame, Ints, frame_of, turn_matrix, unique_points
 
 _ORDER = 12
 _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
@@ -79,7 +79,8 @@ def _fields_of_some(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     groups: dict[tuple[object, ...], list[int]] = {}
     for number, frame in enumerate(frames):
         groups.setdefault(frame.shape, []).append(number)
-    fields, places = {}, {}
+    fields: dict[tuple[object, ...], Floats] = {}
+    places: dict[int, Ints] = {}
     for shape, members in groups.items():
         seen = np.vstack([frames[number].local(points)[0] for number in members])
         union, inverse = unique_points(seen)

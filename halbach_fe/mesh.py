@@ -208,17 +208,16 @@ def _on(mesh: meshio.Mesh, physical: list[NDArray[np.int64]], tag: int) -> tuple
 def _count(cells: Ints, kind: str) -> Entities:
     """How many different nodes, corners, edges and faces cells of one type have."""
     corners = cells[:, :_CORNERS[kind]]
-    edges, faces = (np.vstack([corners[:, list(part)] for part in parts]) if parts else []
-                    for parts in (_EDGES[kind], _FACES[kind]))
-    return Entities(len(np.unique(cells)), len(np.unique(corners)), _different(edges),
-                    _different(faces))
+    return Entities(len(np.unique(cells)), len(np.unique(corners)),
+                    _different(corners, _EDGES[kind]), _different(corners, _FACES[kind]))
 
 
-def _different(entities: Ints | list[int]) -> int:
-    """How many entities, by their corners in any order, differ."""
-    if not len(entities):
+def _different(corners: Ints, parts: tuple[tuple[int, ...], ...]) -> int:
+    """How many parts of cells, by their corners in any order, differ."""
+    if not parts or not len(corners):
         return 0
-    ordered = np.sort(np.asarray(entities, np.int64), axis=1)
+    ordered = np.sort(np.vstack([corners[:, list(part)] for part in parts]), axis=1)
+    ordered = ordered.astype(np.int64)
     key = ordered[:, 0]
     for column in ordered.T[1:]:
         key = np.unique(key, return_inverse=True)[1] * (int(ordered.max()) + 1) + column

@@ -21,14 +21,13 @@ from halbach_fe.errors import GetDPError
 from halbach_fe.exact_field import field_of, unit_fields
 from halbach_fe.field_map import write_hdf5
 from halbach_fe.observation import Observation
-from halbach_fe.routes import check_points, finite_element_part
+from halbach_fe.routes import (
+    SUPERPOSITION_TOLERANCE,
+    check_points,
+    finite_element_part,
+)
 from halbach_fe.solve import Workshop
 from halbach_fe.study import COMPONENTS, MU_0, Study
-
-SUPERPOSITION_TOLERANCE = 1e-8
-"""Of the largest sum of the columns' magnitudes. The problem is linear and the solver direct: what
-remains is rounding and the 16 digits of GetDP's text, about 1e-12; a wrong or missing column shows
-at 1e-3."""
 
 
 @dataclass(frozen=True)
@@ -88,21 +87,24 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     if exact:
         check = check + field_of(blocks, observation.points)
     built = Response(matrix, parameter_names(study), nominal,
-                     verify_superposition(matrix, nominal, observation.apply(check)))
+                     verify_superposition(matrix, nominal, observation.apply(check),
+                                          parts.superposition_tolerance))
     _write(path, key, built)
     return built
 
 
-def verify_superposition(matrix: Floats, nominal: Floats, direct: Floats) -> float:
+def verify_superposition(
+    matrix: Floats, nominal: Floats, direct: Floats, tolerance: float = SUPERPOSITION_TOLERANCE
+) -> float:
     """Return the largest |H p - q| for a directly solved q, relative to the sum of the columns'
     magnitudes (readings may vanish by symmetry); raise GetDPError if it is too large.
     """
     scale = (np.abs(matrix) @ np.abs(nominal)).max()
     error = float(np.abs(matrix @ nominal - direct).max() / scale)
-    if not error <= SUPERPOSITION_TOLERANCE:
+    if not error <= tolerance:
         raise GetDPError(
             f"The columns of the response do not add up to the directly solved field: the largest "
-            f"difference is {error:.1e} of it, where {SUPERPOSITION_TOLERANCE:.0e} is allowed. "
+            f"difference is {error:.1e} of it, where {tolerance:.0e} is allowed. "
             "A column is wrong; please report this with the study.")
     return error
 

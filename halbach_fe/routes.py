@@ -22,6 +22,17 @@ from halbach_fe.solve import (
 from halbach_fe.study import Study
 from halbach_fe.symmetry import no_symmetry, symmetry_of
 
+SUPERPOSITION_TOLERANCE = 1e-8
+"""The problem is linear and the solver direct: what remains is rounding, about 1e-12; a wrong or
+missing column shows at 1e-3."""
+
+ITERATED_TOLERANCE = 1e-6
+"""Conjugate gradients stop at 1e-10 of the residual; the field is off by some 1e-8."""
+
+PLACED_TOLERANCE = 1e-2
+"""Blocks placed by symmetry on a 3D mesh, which is not symmetric: what remains is the error of the
+mesh, which adds up over blocks. A wrong sign or place is of the order of 1."""
+
 BOUNDARY_NEAR = 0.5
 """Of the way from the magnet to the boundary: readings beyond it are warned of."""
 
@@ -32,6 +43,8 @@ class ElementFields:
 
     Attributes
     ----------
+    superposition_tolerance : float
+        How well blocks must add up to the nominal array, relative to the sum of their magnitudes.
     nominal : ndarray, shape (n, 3), in T
         Of the whole array, solved for at once.
     block : callable
@@ -39,6 +52,7 @@ class ElementFields:
         each axis. By symmetry several blocks share one solve.
     """
 
+    superposition_tolerance: float
     nominal: Floats
     block: Callable[[int], Floats]
 
@@ -69,12 +83,14 @@ def finite_element_part(
     blocks, size = blocks_of(study), study.dimension
     vacuum = study.iron_ring is None and all(b.recoil_permeability == 1.0 for b in blocks)
     if study.solver.method == "reaction" and vacuum:
-        return ElementFields(np.zeros((len(points), 3)),
+        return ElementFields(SUPERPOSITION_TOLERANCE, np.zeros((len(points), 3)),
                              lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)
     if not columns:
-        return ElementFields(_solve(study, points, (), workshop, route)[0], _not_solved)
-    symmetry = symmetry_of(study) if study.solver.symmetry else no_symmetry(study)
+        return ElementFields(np.nan, _solve(study, points, (), workshop, route)[0], _not_solved)
+    # in a cross-section there is little to save
+    placed = study.solver.symmetry and size == 3
+    symmetry = symmetry_of(study) if placed else no_symmetry(study)
     places, index = symmetry.spread(points)
     fields = _solve(study, places, symmetry.sources, workshop, route)
     # the identity is among the placements: the first block is its own source, where it stands
@@ -86,7 +102,10 @@ def finite_element_part(
         seen = np.moveaxis(fields[first:first + size, index[number]], 0, 2)
         return placement.from_source(seen)
 
-    return ElementFields(fields[0, here], block)
+    tolerance = {"azimuthal_modes": SUPERPOSITION_TOLERANCE}.get(route) or (
+        PLACED_TOLERANCE if placed else
+        ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE)
+    return ElementFields(tolerance, fields[0, here], block)
 
 
 def _not_solved(number: int) -> Floats:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats
 from halbach_fe.errors import GetDPError
 
 Ints = NDArray[np.int64]

@@ -157,7 +157,7 @@ class Mesh(_Model):
     bore_size_m: Length | None = None
     layers_per_ring: Annotated[int, Field(ge=1, le=100)] = 2
     meridian_size_m: Length | None = None
-    growth: Annotated[float, Field(gt=1.0, le=4.0)] = 1.6
+    growth: Annotated[float, Field(gt=1.0, le=4.0)] = 1.4
 
 
 class OpenBoundary(_Model):

@@ -103,8 +103,9 @@ def no_symmetry(study: Study) -> Symmetry:
 
 
 def symmetry_of(study: Study) -> Symmetry:
-    """The rotations by blocks, and the mirror in z = 0, that leave a study's materials as they
-    are. (The iron ring and the boundary are symmetric always.)
+    """Find the rotations by blocks, and the mirror in z = 0, that leave materials as they are.
+
+    The iron ring and the boundary are symmetric always.
     """
     blocks = blocks_of(study)
     slots, rings = study.array.blocks_per_ring, study.array.rings

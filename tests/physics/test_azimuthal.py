@@ -42,7 +42,7 @@ def test_every_column_against_its_exact_field(modes, workshop):
     """
     study = modes(array__recoil_permeability=1.0, solver__method="direct")
     points = np.vstack([POINTS, AXIS])
-    found = azimuthal.mode_fields(study, points, workshop)[1:]
+    found = azimuthal.solve_modes(study, points, range(32), workshop)[1:]
     exact = columns_in_vacuum(study, points)
     scale = np.abs(exact).max(axis=(1, 2))
     error = np.abs(found - exact).max(axis=(1, 2)) / scale
@@ -55,29 +55,26 @@ def test_every_column_against_its_exact_field(modes, workshop):
 def test_a_missing_mode_is_seen(modes, workshop, monkeypatch, missing):
     """Negative control: drop one mode of the sum and the columns are wrong."""
     study = modes(array__recoil_permeability=1.0, solver__method="direct")
-    arrange = azimuthal._arrange
+    superpose = azimuthal._superpose
 
-    def incomplete(*arguments):
-        result = arrange(*arguments)
-        result.rings[missing] = 0
-        return result
+    def incomplete(case, modes, *arguments):
+        return superpose(case, modes | {missing: 0 * modes[missing]}, *arguments)
 
-    monkeypatch.setattr(azimuthal, "_arrange", incomplete)
-    found = azimuthal.mode_fields(study, POINTS, workshop)[1:]
+    monkeypatch.setattr(azimuthal, "_superpose", incomplete)
+    found = azimuthal.solve_modes(study, POINTS, range(32), workshop)[1:]
     exact = columns_in_vacuum(study, POINTS)
     assert np.abs(found - exact).max() / np.abs(exact).max() > 0.05
 
 
-@pytest.mark.parametrize(("route", "cap"), [("edge_elements", 0.15), ("scalar_potential", 0.04)])
+@pytest.mark.parametrize(("route", "cap"), [("edge_elements", 0.1), ("scalar_potential", 0.015)])
 def test_reaction_against_3d_routes(modes, workshop, route, cap):
-    """Two formulations, two meshes: they agree to what the 3D ones can do, 15 % of the reaction
-    rms for edge elements, 4 % for the scalar potential. The wrong sign would be 200 % away.
+    """Two formulations, two meshes: they agree to what the 3D ones can do. Measured 5.6 % of the
+    reaction rms for edge elements, 0.7 % for the scalar potential; the wrong sign is 200 % away.
     """
-    changes = {"mesh__block_size_m": 0.016, "mesh__layers_per_ring": 4}
+    changes = {"mesh__block_size_m": 0.02, "mesh__layers_per_ring": 4, "mesh__growth": 1.4}
     fast, slow = modes(**changes), modes(solver__route=route, **changes)
-    sources = (0, 0)
-    one = finite_element_part(fast, POINTS, sources, workshop)[0]
-    two = finite_element_part(slow, POINTS, sources, workshop)[0]
+    one = finite_element_part(fast, POINTS, workshop, columns=False).nominal
+    two = finite_element_part(slow, POINTS, workshop, columns=False).nominal
     scale = np.sqrt(np.mean(one**2))
     assert np.sqrt(np.mean((one - two) ** 2)) < cap * scale
     assert np.sqrt(np.mean((one + two) ** 2)) > 1.5 * scale
@@ -116,7 +113,7 @@ def test_ring_gaps_and_turned_arrays(modes, workshop):
     """A gap between rings is still symmetric; first angles need not be multiples of the pitch."""
     study = modes(array__ring_gap_m=0.01, array__recoil_permeability=1.0, solver__method="direct",
                   array__first_block_angle_deg=17.0, array__first_magnetization_angle_deg=71.0)
-    found = azimuthal.mode_fields(study, POINTS, workshop, columns=False)[0]
+    found = azimuthal.solve_modes(study, POINTS, (), workshop)[0]
     exact = field_of(blocks_of(study), POINTS)
     assert np.abs(found - exact).max() < 0.02 * np.abs(exact).max()
 
@@ -128,12 +125,12 @@ def test_routes_are_chosen_by_symmetry(short_dipole, dipole):
     gaps = {"shape": "sector", "angular_gap_deg": 1.0}
     trapezoids = {"shape": "trapezoid"}
     for block in (gaps, trapezoids):
-        assert choose_route(short_dipole(array__block=block), far) == "edge_elements"
+        assert choose_route(short_dipole(array__block=block), far) == "scalar_potential"
         with pytest.raises(StudyError, match=r"solver\.route"):
             choose_route(short_dipole(array__block=block, solver__route="azimuthal_modes"), far)
     assert choose_route(dipole(), circle(0.07)) == "cross_section"
     near = circle(0.1035)
-    assert choose_route(short_dipole(), near) == "edge_elements"
+    assert choose_route(short_dipole(), near) == "scalar_potential"
 
 
 def test_few_modes_on_the_axis_many_near_the_blocks(short_dipole):
@@ -148,8 +145,8 @@ def test_meridian_mesh_is_verified(short_dipole, tmp_path):
     """Unknowns: nodes off the boundary, and off the axis for modes above 0."""
     study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.03)
     mesh = verify_mesh(build_meridian(study, tmp_path))
-    assert mesh.axis_nodes > 0
-    assert mesh.axis_nodes < mesh.inner_nodes < mesh.nodes
+    assert mesh.axis.nodes > 0
+    assert mesh.axis.nodes < mesh.inner.nodes < len(mesh.points)
     assert mesh.radius > 10 * 0.2
     again = build_meridian(study, tmp_path / "again")
     assert again.mesh.read_bytes() == mesh.path.read_bytes()

@@ -24,7 +24,7 @@ from halbach_fe.getdp import (
     run,
 )
 from halbach_fe.mesh import build_mesh, verify_mesh
-from halbach_fe.solve import CROSS_SECTION, EDGE_ELEMENTS, FLUX_DENSITY_FILE, stage
+from halbach_fe.solve import CROSS_SECTION, FLUX_DENSITY_FILE, edge_elements, stage
 from tests.conftest import circle
 
 POINTS = circle(0.07, 5)
@@ -51,8 +51,8 @@ def test_a_sound_run_passes(getdp, staged):
     folder, job = staged
     log = run(getdp, job, folder)
     assert any("SOURCE 0" in line for line in log)
-    field = read_vectors(folder / FLUX_DENSITY_FILE, POINTS, 1)
-    assert field.shape == (1, 5, 3)
+    field = read_vectors(folder / FLUX_DENSITY_FILE, POINTS)
+    assert field.shape == (5, 3)
     assert (folder / "getdp.log").read_text().startswith("magnetostatics_2d.pro -msh mesh.msh")
 
 
@@ -91,7 +91,7 @@ def test_missing_gauge(getdp, short_dipole, tmp_path):
     mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
     folder = tmp_path / "run"
     folder.mkdir()
-    job = stage(study, mesh, POINTS, folder, EDGE_ELEMENTS)
+    job = stage(study, mesh, POINTS, folder, edge_elements(1))
     gauge = ("{ NameOfCoef ae; EntityType EdgesOfTreeIn; EntitySubType StartingOn;\n"
              "        NameOfConstraint TreeGauge; }")
     edit(folder / job.problem, gauge, "")
@@ -161,7 +161,7 @@ def test_point_outside_the_mesh(getdp, dipole, tmp_path):
     job = stage(study, mesh, points, folder, CROSS_SECTION)
     with pytest.raises(GetDPError, match=r"point outside the mesh|outside"):
         run(getdp, job, folder)
-        read_vectors(folder / FLUX_DENSITY_FILE, points, 1)
+        read_vectors(folder / FLUX_DENSITY_FILE, points)
 
 
 def rows(values):
@@ -182,10 +182,10 @@ def rows(values):
 def test_bad_tables_are_refused(tmp_path, text, said):
     path = tmp_path / "flux_density.txt"
     path.write_text(rows(["1 2 3"] * 5))
-    assert read_vectors(path, POINTS, 1)[0, 0].tolist() == [1, 2, 3]
+    assert read_vectors(path, POINTS)[0].tolist() == [1, 2, 3]
     path.write_text(text)
     with pytest.raises(GetDPError, match=said):
-        read_vectors(path, POINTS, 1)
+        read_vectors(path, POINTS)
 
 
 def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
@@ -198,7 +198,7 @@ def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
     mesh = verify_mesh(build_mesh(study, folder / "mesh"))
     job = stage(study, mesh, POINTS, folder, CROSS_SECTION)
     run(getdp, job, folder)
-    read_vectors(folder / FLUX_DENSITY_FILE, POINTS, 1)
+    read_vectors(folder / FLUX_DENSITY_FILE, POINTS)
 
 
 def test_an_over_long_name_is_refused(getdp, staged):
