@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from halbach_fe.errors import HalbachError
+from halbach_fe.errors import HalbachError, HalbachWarning
 from halbach_fe.getdp import find_getdp
 from halbach_fe.solve import Workshop
 
@@ -62,7 +63,10 @@ def guarded(run: Callable[[], int]) -> int:
     signals = (signal.SIGTERM, signal.SIGHUP)
     previous = [signal.signal(number, signal.default_int_handler) for number in signals]
     try:
-        return run()
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", HalbachWarning)
+            warnings.showwarning = lambda message, *_: say(f"warning: {message}")
+            return run()
     except HalbachError as error:
         say(f"error: {error}")
         return error.exit_code

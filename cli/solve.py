@@ -7,15 +7,19 @@ study's observation, and the GetDP run folders, which can be run by hand.
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
+from dataclasses import replace
 from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.discretization import reading_errors
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
-from halbach_fe.routes import solve_nominal
+from halbach_fe.routes import check_points, exact_part, finite_element_part
 from halbach_fe.study import read_study
 from halbach_fe.update import write_text
 
@@ -30,19 +34,26 @@ def run(arguments: argparse.Namespace) -> int:
     study = read_study(arguments.study)
     points = points_from(study.observation.positions)
     started = time.monotonic()
+    check_points(study, points)
+    observation = observe(study, points, np.ones_like(points, bool))
     with common.workshop(arguments) as workshop:
-        flux_density = solve_nominal(study, points, workshop)
+        part = finite_element_part(study, points, workshop, columns=False).nominal
+        with tempfile.TemporaryDirectory() as folder:  # the study's own run folders are kept
+            errors = reading_errors(study, observation, part,
+                                    replace(workshop, folder=Path(folder)))
         getdp = workshop.getdp
+    flux_density = exact_part(study, points) + part
     data = field_map(points, flux_density, attributes={
         "study": study.name, "halbach_fe": metadata.version("halbach-fe"), "getdp": getdp.version,
         "method": study.solver.method})
     for suffix in (".h5", ".csv", ".vtu"):
         write_map(data, arguments.output / f"field_map{suffix}")
-    observation = observe(study, points, np.ones_like(flux_density, bool))
     readings = observation.apply(flux_density)
-    lines = ["label,x_m,y_m,z_m,value_T"] + [
-        f"{label},{x!r},{y!r},{z!r},{value!r}" for label, (x, y, z), value in zip(
-            observation.labels, observation.positions.tolist(), readings.tolist(), strict=True)]
+    lines = ["label,x_m,y_m,z_m,value_T,error_T"] + [
+        f"{label},{x!r},{y!r},{z!r},{value!r},{error!r}"
+        for label, (x, y, z), value, error in zip(
+            observation.labels, observation.positions.tolist(), readings.tolist(),
+            errors.tolist(), strict=True)]
     write_text(arguments.output / "readings.csv", "\n".join([*lines, ""]))
     size = np.linalg.norm(flux_density, axis=1)
     strongest = int(np.argmax(size))
@@ -50,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         "study": study.name, "points": len(points), "readings": len(readings),
         "method": study.solver.method, "max_B_T": float(size.max()),
         "max_B_at_m": points[strongest].tolist(), "min_B_T": float(size.min()),
-        "mean_B_T": flux_density.mean(axis=0).tolist(),
+        "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
     if arguments.json:

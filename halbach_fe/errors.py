@@ -16,6 +16,10 @@ class HalbachError(Exception):
     exit_code = 1
 
 
+class HalbachWarning(UserWarning):
+    """Something that the user should know of a result that is delivered nevertheless."""
+
+
 class StudyError(HalbachError):
     """The study file cannot be read or describes something that cannot be built."""
 

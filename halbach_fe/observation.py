@@ -46,6 +46,16 @@ class Observation:
         flat = fields.reshape(-1, 3 * len(self.points))
         return np.asarray(self.operator @ flat.T).T.reshape(*fields.shape[:-2], len(self))
 
+    def magnitude(self, field: Floats) -> Floats:
+        """Size of a field (n, 3) in T as every reading sees it, whatever its direction or phase:
+        |B| at the point, or the amplitude of the harmonic.
+        """
+        if self.operator.nnz == len(self):  # one component at one point each
+            return np.linalg.norm(field, axis=1)[self.operator.indices // len(COMPONENTS)]
+        circles = len(np.unique(self.positions[:, 2]))
+        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K
+        return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
+
 
 def points_from(positions: Positions) -> Floats:
     """Expand the positions of a study into points (n, 3) in m."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, replace
 from importlib import metadata, resources
 from pathlib import Path
 
@@ -17,16 +18,18 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.discretization import reading_errors
 from halbach_fe.errors import GetDPError
-from halbach_fe.exact_field import field_of, unit_fields
+from halbach_fe.exact_field import unit_fields
 from halbach_fe.field_map import write_hdf5
 from halbach_fe.observation import Observation
 from halbach_fe.routes import (
     SUPERPOSITION_TOLERANCE,
     check_points,
+    exact_part,
     finite_element_part,
 )
-from halbach_fe.solve import Workshop
+from halbach_fe.solve import Workshop, make_folder
 from halbach_fe.study import COMPONENTS, MU_0, Study
 
 
@@ -41,6 +44,9 @@ class Response:
         ``r01s05.Mx``: ring 1, slot 5, component x.
     nominal : ndarray, shape (parameters,), in A/m
         The study's nominal magnetization.
+    error : ndarray, shape (readings,), in T
+        Error bar of the finite elements, for the nominal array; see
+        `halbach_fe.discretization.reading_errors`.
     superposition_error : float
         Largest difference between H times nominal and a direct solve, see `verify_superposition`.
     reused : bool
@@ -50,6 +56,7 @@ class Response:
     matrix: Floats
     parameters: tuple[str, ...]
     nominal: Floats
+    error: Floats
     superposition_error: float
     reused: bool = False
 
@@ -71,7 +78,6 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     blocks = blocks_of(study)
     dimension = study.dimension
     parts = finite_element_part(study, observation.points, workshop)
-    check = parts.nominal
     exact = study.solver.method == "reaction"
     vacuum = unit_fields(blocks, observation.points)
     columns = []
@@ -84,9 +90,12 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
                                          * block.recoil_permeability).T)
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
-    if exact:
-        check = check + field_of(blocks, observation.points)
-    built = Response(matrix, parameter_names(study), nominal,
+    check = exact_part(study, observation.points) + parts.nominal
+    with tempfile.TemporaryDirectory(prefix=".error-", dir=make_folder(workshop.folder)) as folder:
+        # the study's own run folders are kept
+        error = reading_errors(study, observation, parts.nominal,
+                               replace(workshop, folder=Path(folder)))
+    built = Response(matrix, parameter_names(study), nominal, error,
                      verify_superposition(matrix, nominal, observation.apply(check),
                                           parts.superposition_tolerance))
     _write(path, key, built)
@@ -130,7 +139,8 @@ def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
 def _write(path: Path, key: str, built: Response) -> None:
     data = xr.Dataset(
         {"H": (("reading", "parameter"), built.matrix, {"units": "T m/A"}),
-         "nominal": ("parameter", built.nominal, {"units": "A/m"})},
+         "nominal": ("parameter", built.nominal, {"units": "A/m"}),
+         "error": ("reading", built.error, {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error})
     write_hdf5(data, path)
@@ -143,7 +153,7 @@ def _read(path: Path, key: str) -> Response | None:
             if data.attrs["key"] != key:
                 return None
             return Response(data["H"].values, tuple(map(str, data["parameter"].values)),
-                            data["nominal"].values, float(data.attrs["superposition_error"]),
-                            reused=True)
+                            data["nominal"].values, data["error"].values,
+                            float(data.attrs["superposition_error"]), reused=True)
     except (OSError, KeyError, ValueError, RuntimeError):
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -10,8 +11,14 @@ import numpy as np
 from halbach_fe import azimuthal
 from halbach_fe.azimuthal import solve_modes
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
-from halbach_fe.errors import StudyError
+from halbach_fe.errors import HalbachWarning, StudyError
 from halbach_fe.exact_field import field_of
+from halbach_fe.extent import (
+    boundary_half_length,
+    boundary_radius,
+    magnet_half_length,
+    magnet_radius,
+)
 from halbach_fe.solve import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
@@ -32,6 +39,10 @@ ITERATED_TOLERANCE = 1e-6
 PLACED_TOLERANCE = 1e-2
 """Blocks placed by symmetry on a 3D mesh, which is not symmetric: what remains is the error of the
 mesh, which adds up over blocks. A wrong sign or place is of the order of 1."""
+
+MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
+          "edge_elements": "extruded", "scalar_potential": "extruded"}
+"""Kind of mesh by route."""
 
 BOUNDARY_NEAR = 0.5
 """Of the way from the magnet to the boundary: readings beyond it are warned of."""
@@ -60,10 +71,15 @@ class ElementFields:
 def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
     """Field of the nominal array at points (n, 3) in m, by the study's method; (n, 3) in T."""
     check_points(study, points)
-    field = finite_element_part(study, points, workshop, columns=False).nominal
+    return exact_part(study, points) + finite_element_part(
+        study, points, workshop, columns=False).nominal
+
+
+def exact_part(study: Study, points: Floats) -> Floats:
+    """What is not left to finite elements of the nominal array's field, (n, 3) in T."""
     if study.solver.method == "direct":
-        return field
-    return field_of(blocks_of(study), points) + field
+        return np.zeros((len(points), 3))
+    return field_of(blocks_of(study), points)
 
 
 def finite_element_part(
@@ -146,7 +162,9 @@ def choose_route(study: Study, points: Floats) -> str:
 
 
 def check_points(study: Study, points: Floats) -> None:
-    """Refuse points inside magnet or iron, where the field is not what a probe can read."""
+    """Refuse points inside magnet or iron, where the field is not what a probe can read; warn of
+    points so near to the boundary that it shapes their field.
+    """
     if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
             f"Input `observation.positions` of study {study.name} must lie in one plane, since it "
@@ -159,3 +177,18 @@ def check_points(study: Study, points: Floats) -> None:
             f"Input `observation.positions` of study {study.name} must lie in air; instead "
             f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
             f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
+    mesh = MESHES[choose_route(study, points)]
+    ways = [(np.hypot(points[:, 0], points[:, 1]), magnet_radius(study),
+             boundary_radius(study, mesh))]
+    if study.dimension == 3:
+        ways.append((np.abs(points[:, 2]), magnet_half_length(study),
+                     boundary_half_length(study, mesh)))
+    for position, magnet, boundary in ways:
+        near = position > magnet + BOUNDARY_NEAR * (boundary - magnet)
+        if near.any() and position.max() <= boundary:  # those beyond are refused
+            x, y, z = points[np.argmax(near)]
+            warnings.warn(
+                f"{near.sum()} of {len(points)} points lie more than half-way from the magnet to "
+                f"the boundary of the mesh, which shapes their field, the first at ({x:g}, {y:g}, "
+                f"{z:g}) m. Enlarge `open_boundary` of study {study.name}.", HalbachWarning,
+                stacklevel=2)

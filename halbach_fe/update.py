@@ -75,7 +75,7 @@ class Update:
     study: Study
     observation: Observation
     readings: Floats
-    sigma: Floats
+    noise: Floats
     held_out: NDArray[np.bool_]
     regions: tuple[str, ...]
     response: Response
@@ -84,6 +84,11 @@ class Update:
     prediction_prior: Prediction
     prediction_posterior: Prediction
     prior_conflict: float
+
+    @property
+    def sigma(self) -> Floats:
+        """What readings may differ by from the model: their noise and the solver's error."""
+        return np.hypot(self.noise, self.response.error)
 
     @property
     def scores(self) -> tuple[RegionScore, ...]:
@@ -157,7 +162,7 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
             "Check the study's radii and the map's axes and units."))
     measured = ~np.isnan(data["B_T"].values)
     observation = observe(study, points, measured)
-    sigma = standard_deviations(study, observation, data)
+    noise = standard_deviations(study, observation, data)
     keep = held_out(study, observation.positions[:, 2])
     if study.inference.held_out is not None and not keep.any():
         raise MeasurementError(must_be(
@@ -181,9 +186,10 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
     before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                          study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    sigma = np.hypot(noise, model.error)
     after = posterior(model.matrix[~keep], readings[~keep], sigma[~keep], before)
     return Update(
-        study=study, observation=observation, readings=readings, sigma=sigma, held_out=keep,
+        study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=Prediction(*predict(model.matrix, before)),
         prediction_posterior=Prediction(*predict(model.matrix, after)),
@@ -208,7 +214,8 @@ def write_update(update: Update, folder: Path) -> None:
     columns = {
         "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
         "region": np.array(update.regions), "held_out": update.held_out.astype(int),
-        "measured_T": update.readings, "sigma_T": update.sigma,
+        "measured_T": update.readings, "sigma_T": update.noise,
+        "solver_error_T": update.response.error,
         "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
         "posterior_mean_T": update.prediction_posterior.mean,
         "posterior_sd_T": update.prediction_posterior.sd}
@@ -230,6 +237,8 @@ def summary(update: Update) -> dict[str, object]:
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
         "superposition_error": update.response.superposition_error,
+        "largest_solver_error_T": float(update.response.error.max()),
+        "largest_solver_error_over_noise": float((update.response.error / update.noise).max()),
         "prior_conflict": update.prior_conflict,
         "prior_conflict_limit": update.conflict_limit,
         "largest_shift_A_per_m": float(np.abs(shift).max()),

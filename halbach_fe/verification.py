@@ -12,21 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from halbach_fe.blocks import Floats
-from halbach_fe.extent import (
-    boundary_half_length,
-    boundary_radius,
-    magnet_half_length,
-)
-from halbach_fe.mesh import meridian_size
+from halbach_fe.discretization import DUAL, REFINEMENT, dual, farther, refined
 from halbach_fe.observation import noise_regions, observe, points_from
-from halbach_fe.routes import choose_route, solve_nominal
+from halbach_fe.routes import MESHES, choose_route, solve_nominal
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
-
-REFINEMENT = 1.5
-MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
-          "edge_elements": "extruded", "scalar_potential": "extruded"}
-DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
 
 
 @dataclass(frozen=True)
@@ -75,27 +65,6 @@ class Verification:
     main_field_T: float
 
 
-def refined(study: Study, factor: float) -> Study:
-    """The study with all elements smaller by a factor."""
-    mesh = study.mesh
-    bore = mesh.bore_size_m or mesh.block_size_m
-    return study.model_copy(update={"mesh": mesh.model_copy(update={
-        "block_size_m": mesh.block_size_m / factor, "bore_size_m": bore / factor,
-        "meridian_size_m": meridian_size(study) / factor,
-        "layers_per_ring": max(1, round(mesh.layers_per_ring * factor)),
-        "growth": 1 + (mesh.growth - 1) / factor})})
-
-
-def farther(study: Study, mesh: str, factor: float) -> Study:
-    """The study with its boundary farther by a factor."""
-    end = magnet_half_length(study)
-    update = {"radius_m": factor * boundary_radius(study, mesh)}
-    if study.dimension == 3:
-        update["half_length_m"] = end + factor * (boundary_half_length(study, mesh) - end)
-    return study.model_copy(update={
-        "open_boundary": study.open_boundary.model_copy(update=update)})
-
-
 def verify(
     study: Study, workshop: Workshop, say: Callable[[str], None] = lambda _: None
 ) -> Verification:
@@ -119,10 +88,8 @@ def verify(
              compare("the study's mesh to a finer", base, fine),
              compare("boundary to a farther", base, far)]
     if route in DUAL:
-        dual = study.model_copy(update={
-            "solver": study.solver.model_copy(update={"route": DUAL[route]})})
-        steps.append(compare(f"dual route, {DUAL[route]}",
-                             base, solve(f"the dual route, {DUAL[route]}", dual)))
+        steps.append(compare(f"dual route, {DUAL[route]}", base,
+                             solve(f"the dual route, {DUAL[route]}", dual(study, route))))
     order = observed_order(steps[0].pointwise, steps[1].pointwise)
     series = 1 / (1 - REFINEMENT**-order)
     return Verification(

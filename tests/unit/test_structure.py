@@ -14,8 +14,8 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 # Later rooms may import earlier ones, never the other way round.
 ORDER = ["errors", "analytic", "study", "blocks", "symmetry", "extent", "regions", "exact_field",
          "geo", "mesh", "field_map", "getdp", "solutions", "evaluation", "inference", "solve",
-         "azimuthal", "routes", "observation", "response", "update", "verification", "report",
-         "cli"]
+         "azimuthal", "routes", "observation", "discretization", "response", "update",
+         "verification", "report", "cli"]
 
 
 def imports(path):
