@@ -12,7 +12,7 @@ test: setup-test
 
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test
-	.venv/bin/python benchmarks/run.py
+	.venv/bin/python -m benchmarks.run
 
 lint: setup-test
 	.venv/bin/ruff check .

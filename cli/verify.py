@@ -31,12 +31,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(asdict(found))
         return 0
-    rows = [{"change": d.what, "pointwise": f"{d.pointwise:.1e}", "readings": f"{d.readings:.1e}"}
+    def row(what: str, pointwise: float, fourier: float | None) -> dict[str, str]:
+        return {"change": what, "pointwise": f"{pointwise:.1e}",
+                "Fourier": "" if fourier is None else f"{fourier:.1e}"}
+
+    rows = [row(d.what, d.pointwise, d.fourier)
             | {name: f"{value:.1e}" for name, value in d.by_region.items()}
             for d in found.differences]
-    rows.append({"change": f"estimated error (order {found.order:.1f})",
-                 "pointwise": f"{found.error_pointwise:.1e}",
-                 "readings": f"{found.error_readings:.1e}"}
-                | dict.fromkeys(found.differences[0].by_region, ""))
+    rows.append(row(f"estimated error (order {found.order:.1f})", found.error_pointwise,
+                    found.error_fourier) | dict.fromkeys(found.differences[0].by_region, ""))
     common.print_table(rows, f"Route {found.route}; relative to {found.main_field_T:.4g} T")
     return 0

@@ -90,7 +90,11 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
             shape=(len(point), 3 * len(points)))
         return Observation(points, operator, tuple(f"B{COMPONENTS[c]}" for c in component),
                            points[point])
-    return _fourier(study.observation, points, measured)
+    if not measured[:, :2].all():
+        raise MeasurementError(must_be("components", "map",
+                                       "Bx and By at every point, for the Fourier coefficients "
+                                       "of B_r", "points without them"))
+    return fourier_of(points, study.observation)
 
 
 def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.int64]]:
@@ -122,13 +126,8 @@ def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.in
     return found
 
 
-def _fourier(
-    settings: FourierCoefficients, points: Floats, measured: NDArray[np.bool_]
-) -> Observation:
-    if not measured[:, :2].all():
-        raise MeasurementError(must_be("components", "map",
-                                       "Bx and By at every point, for the Fourier coefficients "
-                                       "of B_r", "points without them"))
+def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
+    """Fourier coefficients of B_r on the circles that points (n, 3) in m form."""
     order = np.arange(1, settings.harmonics + 1)
     rows, columns, values = [], [], []
     labels: list[str] = []

@@ -82,6 +82,12 @@ def exact_part(study: Study, points: Floats) -> Floats:
     return field_of(blocks_of(study), points)
 
 
+def is_vacuum(study: Study) -> bool:
+    """Tell whether nothing reacts: the exact field is all there is."""
+    return study.iron_ring is None and all(
+        block.recoil_permeability == 1.0 for block in blocks_of(study))
+
+
 def finite_element_part(
     study: Study, points: Floats, workshop: Workshop, columns: bool = True
 ) -> ElementFields:
@@ -96,9 +102,8 @@ def finite_element_part(
     columns : bool
         Whether single blocks are wanted too.
     """
-    blocks, size = blocks_of(study), study.dimension
-    vacuum = study.iron_ring is None and all(b.recoil_permeability == 1.0 for b in blocks)
-    if study.solver.method == "reaction" and vacuum:
+    size = study.dimension
+    if study.solver.method == "reaction" and is_vacuum(study):
         return ElementFields(SUPERPOSITION_TOLERANCE, np.zeros((len(points), 3)),
                              lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)

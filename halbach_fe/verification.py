@@ -11,12 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import DUAL, REFINEMENT, dual, farther, refined
-from halbach_fe.observation import noise_regions, observe, points_from
-from halbach_fe.routes import MESHES, choose_route, solve_nominal
+from halbach_fe.exact_field import field_of
+from halbach_fe.observation import fourier_of, noise_regions, points_from
+from halbach_fe.routes import MESHES, choose_route, is_vacuum, solve_nominal
 from halbach_fe.solve import Workshop
-from halbach_fe.study import Study
+from halbach_fe.study import FourierCoefficients, Study
+
+HARMONICS = 8
 
 
 @dataclass(frozen=True)
@@ -28,15 +31,15 @@ class Difference:
     what : str
     pointwise : float
         Of B at the points.
-    readings : float
-        Of the study's readings: the same, or Fourier coefficients.
+    fourier : float or None
+        Of the Fourier coefficients of B_r, where the study's positions are circles.
     by_region : dict
         Pointwise, by noise region.
     """
 
     what: str
     pointwise: float
-    readings: float
+    fourier: float | None
     by_region: dict[str, float]
 
 
@@ -48,12 +51,14 @@ class Verification:
     ----------
     route : str
     differences : tuple of Difference
-        Coarser to study, study to finer, nearer to farther boundary, and the dual route if any.
+        Coarser to study, study to finer, nearer to farther boundary, the dual route if any, and
+        the exact field if there is one (method ``direct``, no permeability, no iron).
     order : float
         Observed order of convergence in the element size, between 0.5 and 4.
-    error_pointwise, error_readings : float
-        Estimated for the study's own mesh, relative to the largest field: the remaining series of
-        refinements, plus what the boundary changes.
+    error_pointwise, error_fourier : float
+        Relative to the largest field: the difference to the exact field if there is one, otherwise
+        estimated for the study's own mesh as the remaining series of refinements, plus what the
+        boundary changes.
     main_field_T : float
     """
 
@@ -61,7 +66,7 @@ class Verification:
     differences: tuple[Difference, ...]
     order: float
     error_pointwise: float
-    error_readings: float
+    error_fourier: float | None
     main_field_T: float
 
 
@@ -91,12 +96,18 @@ def verify(
         steps.append(compare(f"dual route, {DUAL[route]}", base,
                              solve(f"the dual route, {DUAL[route]}", dual(study, route))))
     order = observed_order(steps[0].pointwise, steps[1].pointwise)
-    series = 1 / (1 - REFINEMENT**-order)
+    if study.solver.method == "direct" and is_vacuum(study):
+        exact = field_of(blocks_of(study), points)
+        steps.append(compare("exact field", base, exact))
+        error, fourier = steps[-1].pointwise, steps[-1].fourier
+    else:
+        series = 1 / (1 - REFINEMENT**-order)
+        error = series * steps[1].pointwise + steps[2].pointwise
+        fourier = (None if steps[1].fourier is None or steps[2].fourier is None
+                   else series * steps[1].fourier + steps[2].fourier)
     return Verification(
-        route=route, differences=tuple(steps), order=order,
-        error_pointwise=series * steps[1].pointwise + steps[2].pointwise,
-        error_readings=series * steps[1].readings + steps[2].readings,
-        main_field_T=compare.scale)
+        route=route, differences=tuple(steps), order=order, error_pointwise=error,
+        error_fourier=fourier, main_field_T=compare.scale)
 
 
 def observed_order(first: float, second: float) -> float:
@@ -115,7 +126,13 @@ class _Comparison:
 
     def __init__(self, study: Study, points: Floats, field: Floats) -> None:
         self.scale = float(np.linalg.norm(field, axis=1).max())
-        self._observation = observe(study, points, np.ones_like(field, bool))
+        self._circles = None
+        positions = study.observation.positions
+        if positions.kind == "circles" and positions.angles > 2:
+            wanted = getattr(study.observation, "harmonics", HARMONICS)
+            self._circles = fourier_of(points, FourierCoefficients(
+                quantity="fourier_coefficients", positions=positions,
+                harmonics=min(wanted, (positions.angles - 1) // 2)))
         self._regions = {"all": np.ones(len(points), bool)}
         if study.noise is not None:
             index = noise_regions(study.noise, points[:, 2])
@@ -124,9 +141,10 @@ class _Comparison:
 
     def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
         change = np.linalg.norm(one - two, axis=1) / self.scale
-        readings = np.abs(self._observation.apply(one - two)) / self.scale
+        fourier = (None if self._circles is None
+                   else float(np.abs(self._circles.apply(one - two)).max() / self.scale))
         return Difference(
-            what=what, pointwise=float(change.max()), readings=float(readings.max()),
+            what=what, pointwise=float(change.max()), fourier=fourier,
             by_region={name: float(change[mask].max()) for name, mask in self._regions.items()
                        if mask.any()})
 
