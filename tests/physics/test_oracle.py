@@ -9,8 +9,8 @@ import pytest
 from halbach_fe.blocks import blocks_of
 from halbach_fe.observation import points_from
 from halbach_fe.routes import choose_route, finite_element_part
-from halbach_fe.study import read_study
-from tests.conftest import ROOT, circle
+from halbach_fe.study import parse_study, read_study
+from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.oracles import ngsolve_model as oracle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
@@ -49,24 +49,31 @@ def test_full_array_against_the_vector_potential_in_3d(workshop, with_iron):
     assert np.linalg.norm(moved - theirs, axis=1).max() > 1e-3 * main_field
 
 
-@pytest.mark.parametrize("route", ["azimuthal_modes", "scalar_potential", "edge_elements"])
-def test_a_column_by_every_route_against_ngsolve(short_dipole, workshop, route):
-    """1 T along x of one block of two rings, with iron: the reaction relative to its rms.
+RINGS = {"iron_ring": IRON, "mesh": {"block_size_m": 0.03, "layers_per_ring": 3, "growth": 1.5}}
+NUMBER = 21
+POINTS = np.vstack([circle(0.05, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
 
-    Measured 0.7 %, 2.5 % and 19 %; NGSolve itself is good to about 0.5 %.
-    """
-    study = short_dipole(iron_ring=IRON, solver={"route": route, "symmetry": route != "edge"},
-                         mesh={"block_size_m": 0.03, "layers_per_ring": 3, "growth": 1.5})
-    points = np.vstack([circle(0.05, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
-    number = 21
-    block = blocks_of(study)[number]
-    assert choose_route(study, points) == route
-    ours = finite_element_part(study, points, workshop).block(number)[:, :, 0]
-    dipole = dipole_of(study)
-    mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.05)
+
+@pytest.fixture(scope="module")
+def column():
+    """1 T along x of one block of two rings, with iron, by NGSolve."""
+    study = parse_study(changed(DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,
+                                **RINGS))
+    block, dipole = blocks_of(study)[NUMBER], dipole_of(study)
+    mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     with ngsolve.TaskManager():
-        theirs = oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), points).reaction
-    scale = np.sqrt(np.mean(theirs**2))
-    cap = {"azimuthal_modes": 0.015, "scalar_potential": 0.05, "edge_elements": 0.35}[route]
-    assert np.sqrt(np.mean((ours - theirs) ** 2)) < cap * scale
-    assert np.sqrt(np.mean((ours + theirs) ** 2)) > 1.5 * scale  # the wrong sign
+        return oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), POINTS).reaction
+
+
+@pytest.mark.parametrize(("route", "cap"), [
+    ("azimuthal_modes", 0.01), ("scalar_potential", 0.03), ("edge_elements", 0.25)])
+def test_a_column_by_every_route_against_ngsolve(short_dipole, workshop, column, route, cap):
+    """The reaction relative to its rms: measured 0.45 %, 1.4 %, 13 %, of which the first
+    is in part NGSolve's own.
+    """
+    study = short_dipole(solver__route=route, **RINGS)
+    assert choose_route(study, POINTS) == route
+    ours = finite_element_part(study, POINTS, workshop).block(NUMBER)[:, :, 0]
+    scale = np.sqrt(np.mean(column**2))
+    assert np.sqrt(np.mean((ours - column) ** 2)) < cap * scale
+    assert np.sqrt(np.mean((ours + column) ** 2)) > 1.5 * scale  # the wrong sign
