@@ -18,11 +18,10 @@ from halbach_fe.errors import PointsOutsideError
 from halbach_fe.mesh import VerifiedMesh
 from halbach_fe.solutions import Ints, Unknowns
 
-CANDIDATES = (12, 128, 1024)
-"""Elements, by distance of their middle, in which a point is looked for; more if need be."""
-
-SLACK = 1e-8
-"""How far outside an element, in its own coordinates, a point still counts as inside."""
+SEARCHES = ((12, 1e-8), (128, 1e-8), (1024, 1e-8), (128, 0.05))
+"""How a point is looked for: in so many elements, by distance of their middle, and how far outside,
+in the element's own coordinates, it still counts as inside. The last is for points beside a curved
+face, which elements of second order do not quite meet."""
 
 _NEWTON_STEPS = 8  # elements are hardly curved: the first step is exact in most
 _SIMPLEX_EDGES = {2: ((0, 1), (1, 2), (2, 0)),
@@ -68,11 +67,11 @@ def locate(mesh: VerifiedMesh, points: Floats) -> Located:
     tree = KDTree(nodes.mean(axis=1))
     found: list[tuple[Ints, Ints, Floats]] = []  # points, elements, coordinates
     missing = np.arange(len(points))
-    for count in (min(n, len(air)) for n in CANDIDATES):
+    for count, slack in ((min(n, len(air)), slack) for n, slack in SEARCHES):
         nearest = tree.query(points[missing], count)[1].reshape(len(missing), count)
         held = np.zeros(len(missing), bool)
         for chosen in nearest.T:
-            reference, inside = _invert(nodes[chosen], points[missing])
+            reference, inside = _invert(nodes[chosen], points[missing], slack)
             found.append((missing[inside], air[chosen[inside]], reference[inside]))
             held |= inside
         missing = missing[~held]
@@ -153,7 +152,9 @@ def _barycentric(reference: Floats) -> tuple[Floats, Floats]:
     return np.column_stack([1 - reference.sum(axis=1), reference]), slopes
 
 
-def _invert(nodes: Floats, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _invert(
+    nodes: Floats, points: Floats, slack: float
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Coordinates of each point in its element with nodes (n, k, d), and whether it is inside."""
     kind = {4: "quad", 6: "triangle6", 10: "tetra10"}[nodes.shape[1]]
     dimension = points.shape[1]
@@ -168,9 +169,9 @@ def _invert(nodes: Floats, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
             break
     converged = np.abs(step).max(axis=1) < 1e-9
     if kind == "quad":
-        return reference, converged & (np.abs(reference) <= 1 + SLACK).all(axis=1)
+        return reference, converged & (np.abs(reference) <= 1 + slack).all(axis=1)
     weights, _ = _barycentric(reference)
-    return reference, converged & (weights >= -SLACK).all(axis=1)
+    return reference, converged & (weights >= -slack).all(axis=1)
 
 
 def _slopes(mesh: VerifiedMesh, located: Located, reference_slopes: Floats) -> Floats:
