@@ -64,7 +64,7 @@ def guarded(run: Callable[[], int]) -> int:
     previous = [signal.signal(number, signal.default_int_handler) for number in signals]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("always", HalbachWarning)
+            warnings.simplefilter("once", HalbachWarning)
             warnings.showwarning = lambda message, *_: say(f"warning: {message}")
             return run()
     except HalbachError as error:

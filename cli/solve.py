@@ -7,16 +7,13 @@ study's observation, and the GetDP run folders, which can be run by hand.
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
-from dataclasses import replace
 from importlib import metadata
-from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.cli import common
-from halbach_fe.discretization import reading_errors
+from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
 from halbach_fe.routes import check_points, exact_part, finite_element_part
@@ -38,16 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
     observation = observe(study, points, np.ones_like(points, bool))
     with common.workshop(arguments) as workshop:
         part = finite_element_part(study, points, workshop, columns=False).nominal
-        with tempfile.TemporaryDirectory() as folder:  # the study's own run folders are kept
-            errors = reading_errors(study, observation, part,
-                                    replace(workshop, folder=Path(folder)))
-        getdp = workshop.getdp
-    flux_density = exact_part(study, points) + part
-    data = field_map(points, flux_density, attributes={
-        "study": study.name, "halbach_fe": metadata.version("halbach-fe"), "getdp": getdp.version,
-        "method": study.solver.method})
-    for suffix in (".h5", ".csv", ".vtu"):
-        write_map(data, arguments.output / f"field_map{suffix}")
+        flux_density = exact_part(study, points) + part
+        data = field_map(points, flux_density, attributes={
+            "study": study.name, "halbach_fe": metadata.version("halbach-fe"),
+            "getdp": workshop.getdp.version, "method": study.solver.method})
+        for suffix in (".h5", ".csv", ".vtu"):
+            write_map(data, arguments.output / f"field_map{suffix}")
+        errors = reading_errors(study, observation, part, error_workshop(workshop))
     readings = observation.apply(flux_density)
     lines = ["label,x_m,y_m,z_m,value_T,error_T"] + [
         f"{label},{x!r},{y!r},{z!r},{value!r},{error!r}"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, MagnetBlock, array_half_length, blocks_of, position_angle_deg
-from halbach_fe.evaluation import Located, coordinates, locate, middles, nodal_operators
+from halbach_fe.evaluation import Located, coordinates, locate, nodal_operators, probes_of
 from halbach_fe.getdp import Job
 from halbach_fe.mesh import Entities, VerifiedMesh, build_meridian, verify_mesh
 from halbach_fe.solutions import Ints, read_solutions, read_unknowns
@@ -141,7 +141,7 @@ def solve_modes(
     located = locate(mesh, meridian)
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
     weights = _nominal_waves(study, highest)
-    case = _Case(study, mesh, weights, solved, located, *middles(mesh, located))
+    case = _Case(study, mesh, weights, solved, located, *probes_of(mesh, located))
     wanted = list(range(highest + 1))
     if not blocks:
         size = np.abs(weights).max(axis=(1, 2, 3))
@@ -173,7 +173,7 @@ def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
 
 def _nominal_waves(study: Study, highest: int) -> Floats:
     """Nominal remanence as waves, (modes, 2, rings, 2) in T: by what goes into cos(m theta) and
-    sin(m theta), ring, and along or across the blocks' middles.
+    sin(m theta), ring, and along or across the blocks' probes_of.
 
     A block at angle t with remanence A along and C across its middle has the potential
     A psi_along cos(m (theta - t)) + C psi_across sin(m (theta - t)).
@@ -188,6 +188,9 @@ def _nominal_waves(study: Study, highest: int) -> Floats:
         cosine, sine = np.cos(m * middle), np.sin(m * middle)
         found[:, 0, block.ring - 1] += np.column_stack([along * cosine, -across * sine])
         found[:, 1, block.ring - 1] += np.column_stack([along * sine, across * cosine])
+    # a remanence across the middle, the same all round, has no charges; and there is no sin(0)
+    found[0, 1] = 0
+    found[0, :, :, 1] = 0
     return found
 
 

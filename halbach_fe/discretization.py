@@ -5,6 +5,8 @@ All errors are those of the full nominal array, where the errors of blocks add u
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from halbach_fe.blocks import Floats
@@ -46,6 +48,11 @@ def dual(study: Study, route: str) -> Study:
         "solver": study.solver.model_copy(update={"route": DUAL[route]})})
 
 
+def error_workshop(workshop: Workshop) -> Workshop:
+    """The workshop with a folder of its own for error bars: the study's run folders are kept."""
+    return replace(workshop, folder=workshop.folder / "error-bar")
+
+
 def reading_errors(
     study: Study, observation: Observation, nominal: Floats, workshop: Workshop
 ) -> Floats:
@@ -53,7 +60,7 @@ def reading_errors(
 
     On a 3D mesh that is the dual formulation on the same mesh: the truth lies between them, as far
     as energies go, and they err in opposite directions at the boundary. Elsewhere, where a second
-    mesh is cheap, it is a coarser one, and the nearer of two boundaries.
+    mesh is cheap, it is a coarser one, and a farther boundary.
 
     Parameters
     ----------
@@ -71,4 +78,4 @@ def reading_errors(
     if route in DUAL:
         return change(dual(study, route))
     return change(refined(study, 1 / REFINEMENT)) + change(
-        farther(study, MESHES[route], 1 / REFINEMENT))
+        farther(study, MESHES[route], REFINEMENT))

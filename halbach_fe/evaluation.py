@@ -29,13 +29,14 @@ _SIMPLEX_EDGES = {2: ((0, 1), (1, 2), (2, 0)),
 _TETRAHEDRON_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # as GetDP numbers them
 _TETRAHEDRON_FACES = ((0, 1, 3), (0, 1, 2), (0, 2, 3), (1, 2, 3))
 _QUADRANGLE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])  # corners
+_PROBE = {"triangle6": (0.3, 0.2), "tetra10": (0.3, 0.2, 0.1), "quad": (0.31, -0.17)}
 _QUADRANGLE_SIDES = ((1, -1), (0, -1), (0, 1), (1, 1))  # as GetDP numbers them: axis and its value
 
 
 @dataclass(frozen=True)
 class Located:
     """Points in the elements of a mesh. One on a face belongs to both neighbours, between which
-    a derivative jumps: the mean is taken.
+    a derivative jumps: the mean of those found is taken.
 
     Attributes
     ----------
@@ -89,20 +90,20 @@ def locate(mesh: VerifiedMesh, points: Floats) -> Located:
                    np.vstack([reference for _, _, reference in found]), mean)
 
 
-def middles(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Located, Floats]:
-    """Middles (m, 3) of up to ``count`` of the elements that hold the points.
+def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Located, Floats]:
+    """Points (m, 3) inside up to ``count`` of the elements that hold the located ones.
 
-    There B does not depend on which of two neighbours a point is taken to belong to.
+    There B does not depend on which of two neighbours a point is taken to belong to. They are off
+    all planes of symmetry, where some of an element's functions or their slopes vanish.
     """
     cells = np.unique(located.cells)
     cells = cells[np.unique(np.linspace(0, len(cells) - 1, count).astype(int))]
     dimension = located.reference.shape[1]
-    centre = 1 / (dimension + 1) if mesh.cell_type != "quad" else 0.0
-    reference = np.full((len(cells), dimension), centre)
+    reference = np.tile(_PROBE[mesh.cell_type], (len(cells), 1))
     located = Located(cells, reference, sparse.eye_array(len(cells), format="csr"))
-    middle = np.zeros((len(cells), 3))
-    middle[:, :dimension] = coordinates(mesh, located)
-    return located, middle
+    places = np.zeros((len(cells), 3))
+    places[:, :dimension] = coordinates(mesh, located)
+    return located, places
 
 
 def coordinates(mesh: VerifiedMesh, located: Located) -> Floats:

@@ -36,9 +36,10 @@ missing column shows at 1e-3."""
 ITERATED_TOLERANCE = 1e-6
 """Conjugate gradients stop at 1e-10 of the residual; the field is off by some 1e-8."""
 
-PLACED_TOLERANCE = 1e-2
+PLACED_TOLERANCE = 0.1
 """Blocks placed by symmetry on a 3D mesh, which is not symmetric: what remains is the error of the
-mesh, which adds up over blocks. A wrong sign or place is of the order of 1."""
+mesh, some per cent of what finite elements contribute. A wrong sign or place of the blocks that
+share a source is of the order of 1; a single wrong block among hundreds does not show."""
 
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
@@ -55,7 +56,8 @@ class ElementFields:
     Attributes
     ----------
     superposition_tolerance : float
-        How well blocks must add up to the nominal array, relative to the sum of their magnitudes.
+        How well blocks must add up to the nominal array, relative to the sum of the magnitudes of
+        what finite elements contribute to each.
     nominal : ndarray, shape (n, 3), in T
         Of the whole array, solved for at once.
     block : callable

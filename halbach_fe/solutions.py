@@ -16,7 +16,7 @@ from halbach_fe.errors import GetDPError
 
 Ints = NDArray[np.int64]
 
-_VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
+_VECTOR = 1211214  # PETSc's class identifier
 _UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import GetDPError, OutputError, PointsOutsideError
-from halbach_fe.evaluation import Located, curl_operators, locate, middles, nodal_operators
+from halbach_fe.evaluation import Located, curl_operators, locate, nodal_operators, probes_of
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
 from halbach_fe.solutions import Unknowns, read_solutions, read_unknowns
@@ -223,7 +223,7 @@ def _task(
     suffix: str,
 ) -> Task:
     count = sources[1] - sources[0] + 1
-    probes, places = middles(mesh, located)
+    probes, places = probes_of(mesh, located)
 
     def read(folder: Path) -> Floats:
         unknowns = read_unknowns(folder / f"{Path(formulation.problem).stem}.pre", mesh.cell_type)

@@ -77,7 +77,10 @@ Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminato
 
 
 class BlockException(_Model):
-    """What is different in the blocks of one ring, or one slot, or both, from the array's."""
+    """What is different in the blocks of one ring, or one slot, or both, from the array's.
+
+    ``magnetization_angle_deg`` turns the magnetization, never the shape.
+    """
 
     ring: Annotated[int, Field(ge=1)] | None = None
     slot: Annotated[int, Field(ge=1)] | None = None

@@ -118,6 +118,18 @@ def test_ring_gaps_and_turned_arrays(modes, workshop):
     assert np.abs(found - exact).max() < 0.02 * np.abs(exact).max()
 
 
+@pytest.mark.parametrize("slot", [1, 4, 5])
+def test_one_block_of_another_remanence(modes, workshop, slot):
+    """It excites all modes, 0 among them; without permeability B itself is the exact field."""
+    study = modes(array__recoil_permeability=1.0, solver__method="direct",
+                  array__exceptions=[{"ring": 1, "slot": slot, "remanence_T": 1.9}])
+    found = solve_nominal(study, POINTS, workshop)
+    exact = field_of(blocks_of(study), POINTS)
+    ordinary = field_of(blocks_of(modes(array__recoil_permeability=1.0)), POINTS)
+    assert np.abs(found - exact).max() < 0.01 * np.abs(exact).max()
+    assert np.abs(found - ordinary).max() > 0.03 * np.abs(exact).max()
+
+
 def test_routes_are_chosen_by_symmetry(short_dipole, dipole):
     far = POINTS
     assert choose_route(short_dipole(), far) == "azimuthal_modes"

@@ -10,7 +10,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 
 from halbach_fe import getdp as runner
-from halbach_fe.evaluation import locate, middles
+from halbach_fe.evaluation import locate, probes_of
 from halbach_fe.mesh import build_mesh, verify_mesh
 from halbach_fe.solutions import read_solutions, read_unknowns
 from halbach_fe.solve import (
@@ -33,7 +33,7 @@ def dumped(study, formulation, blocks, workshop):
     mesh = verify_mesh(build_mesh(study, workshop.folder))
     located = locate(mesh, POINTS)
     count = 1 + study.dimension * len(blocks)
-    job = stage(study, mesh, middles(mesh, located)[1], folder, formulation, blocks,
+    job = stage(study, mesh, probes_of(mesh, located)[1], folder, formulation, blocks,
                 (0, count - 1))
     job = dataclasses.replace(job, options=(
         *job.options, "-ksp_view_rhs", "binary:rhs.bin::append",

@@ -167,10 +167,13 @@ def test_superposition(dipole, workshop, method):
 def test_superposition_check_can_fail(generator):
     matrix, nominal = generator.standard_normal((9, 4)), generator.standard_normal(4)
     direct = matrix @ nominal
-    assert verify_superposition(matrix, nominal, direct) < 1e-12
+    magnitude = np.abs(matrix) @ np.abs(nominal)
+    assert verify_superposition(matrix @ nominal, magnitude, direct) < 1e-12
     swapped = matrix[:, [1, 0, 2, 3]]
     with pytest.raises(GetDPError, match="do not add up"):
-        verify_superposition(swapped, nominal, direct)
+        verify_superposition(swapped @ nominal, magnitude, direct)
+    with pytest.raises(GetDPError, match="do not add up"):  # no column at all
+        verify_superposition(0 * direct, 0 * magnitude, direct)
 
 
 def test_stored_response_is_used_only_for_the_same_inputs(dipole, workshop):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from halbach_fe import solve
 from halbach_fe.errors import GetDPError, PointsOutsideError
-from halbach_fe.evaluation import coordinates, locate, middles, shape_functions
+from halbach_fe.evaluation import coordinates, locate, probes_of, shape_functions
 from halbach_fe.mesh import build_meridian, build_mesh, verify_mesh
 from halbach_fe.routes import finite_element_part
 from halbach_fe.solutions import read_solutions, read_unknowns
@@ -54,20 +54,31 @@ def test_damaged_lists_of_unknowns_are_refused(tmp_path, content):
         read_unknowns(path, "tetra10")
 
 
-@pytest.mark.parametrize(("route", "order"), [
-    ("azimuthal_modes", 1), ("scalar_potential", 1), ("edge_elements", 1), ("edge_elements", 2)])
-def test_other_numbering_is_noticed(short_dipole, workshop, monkeypatch, route, order):
+@pytest.mark.parametrize(("route", "order", "part", "corners_only"), [
+    *(("azimuthal_modes", 1, part, False) for part in range(3)),
+    ("scalar_potential", 1, 0, False), ("scalar_potential", 1, 0, True),
+    ("edge_elements", 1, 0, False), *(("edge_elements", 2, part, False) for part in range(3))])
+def test_other_numbering_is_noticed(
+    short_dipole, workshop, monkeypatch, route, order, part, corners_only
+):
     """Negative control of the comparison with GetDP's own print: unknowns in another order."""
     study = short_dipole(solver={"route": route, "edge_order": order},
                          mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
     points = circle(0.05, 5, 0.013)
     finite_element_part(study, points, workshop, columns=False)
+    mesh = None if route == "azimuthal_modes" else verify_mesh(
+        build_mesh(study, workshop.folder / "again"))
 
     def shifted(path, cell_type):
         unknowns = read_unknowns(path, cell_type)
-        last = unknowns.functions[-1]
+        some = unknowns.functions[part].copy()
+        if corners_only:
+            corners = np.unique(mesh.cells[:, :4]) + 1
+            some[corners] = np.roll(some[corners], 7)
+        else:
+            some = np.roll(some, 7)
         return dataclasses.replace(unknowns, functions=(
-            *unknowns.functions[:-1], np.roll(last, 7)))
+            *unknowns.functions[:part], some, *unknowns.functions[part + 1:]))
 
     monkeypatch.setattr(solve, "read_unknowns", shifted)
     monkeypatch.setattr("halbach_fe.azimuthal.read_unknowns", shifted)
@@ -100,7 +111,7 @@ def test_points_are_found_where_they_are(short_dipole, dipole, tmp_path, generat
         np.testing.assert_allclose(coordinates(mesh, located),
                                    where[:, :mesh.points.shape[1]], atol=1e-9)
         assert mesh.in_air[located.cells].all()
-        probes, places = middles(mesh, located)
+        probes, places = probes_of(mesh, located)
         np.testing.assert_allclose(coordinates(mesh, probes), places[:, :mesh.points.shape[1]])
         with pytest.raises(PointsOutsideError):
             locate(mesh, np.array([[100.0, 0, 0]]))
