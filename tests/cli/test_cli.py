@@ -242,7 +242,9 @@ def test_interruption_ends_getdp_too(study, tmp_path, number):
     fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
     process = subprocess.Popen(
         [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(out), "--getdp",
-         str(fake)], stderr=subprocess.PIPE, text=True)
+         str(fake)], stderr=subprocess.PIPE, text=True,
+        # a shell's background jobs ignore Ctrl-C, and so would their children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     while not (marker.exists() and marker.read_text().strip()):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
