@@ -46,7 +46,8 @@ class Response:
         Error bar of the finite elements, for the nominal array; see
         `halbach_fe.discretization.reading_errors`.
     superposition_error : float
-        Largest difference between H times nominal and a direct solve, see `verify_superposition`.
+        How far the blocks' finite-element parts, summed, miss that of the whole array, see
+        `verify_superposition`.
     reused : bool
         Whether it was taken from an earlier run with the same inputs.
     """
@@ -81,16 +82,15 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     columns = []
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
     for number, block in enumerate(blocks):
-        field = parts.block(number)
-        share = observation.apply(np.moveaxis(field, 2, 0)) * (
-            block.remanence * np.array(block.easy_axis[:dimension]))[:, None]
+        readings = observation.apply(np.moveaxis(parts.block(number), 2, 0))
+        share = readings * (block.remanence * np.array(block.easy_axis[:dimension]))[:, None]
         total += share.sum(axis=0)
         magnitude += np.abs(share).sum(axis=0)
         if exact:
-            field = field + next(vacuum)[:, :, :dimension]
+            readings = readings + observation.apply(
+                np.moveaxis(next(vacuum)[:, :, :dimension], 2, 0))
         # B_r = mu_0 mu_r M turns per tesla into per A/m
-        columns.append(observation.apply(np.moveaxis(field, 2, 0) * MU_0
-                                         * block.recoil_permeability).T)
+        columns.append(readings.T * MU_0 * block.recoil_permeability)
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     direct = observation.apply(parts.nominal)

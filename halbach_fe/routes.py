@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halbach_fe import azimuthal
-from halbach_fe.azimuthal import solve_modes
+from halbach_fe.azimuthal import solve_modes, suits
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
 from halbach_fe.errors import HalbachWarning, StudyError
 from halbach_fe.exact_field import field_of
@@ -155,8 +154,8 @@ def choose_route(study: Study, points: Floats) -> str:
     """
     if study.dimension == 2:
         return "cross_section"
-    asked, suits = study.solver.route, azimuthal.suits(study, points)
-    if asked == "azimuthal_modes" and not suits:
+    asked, symmetric = study.solver.route, suits(study, points)
+    if asked == "azimuthal_modes" and not symmetric:
         raise StudyError(
             f"Input `solver.route` of study {study.name} must be another than "
             "azimuthal_modes here, which needs sectors without angular gaps, of one permeability "
@@ -164,7 +163,7 @@ def choose_route(study: Study, points: Floats) -> str:
     if asked == "auto":
         if study.solver.method == "direct":
             return "edge_elements"
-        return "azimuthal_modes" if suits else "scalar_potential"
+        return "azimuthal_modes" if symmetric else "scalar_potential"
     return asked
 
 
