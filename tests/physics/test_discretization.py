@@ -36,13 +36,13 @@ def bars(study, workshop):
 @pytest.mark.parametrize("method", ["direct", "reaction"])
 @pytest.mark.parametrize("observation", [None, FOURIER], ids=["points", "fourier"])
 def test_bars_cover_the_error(dipole, workshop, method, observation):
-    """Four of five readings lie within their bar (measured: nine of ten or more), and bars are no
-    more than some ten times too long: an estimate, not a guess.
+    """Four of five readings lie within their bar (measured 88 to 94 %), and bars are not much too
+    long: an estimate, not a guess (measured 2.2 to 2.5 times the error, rms).
     """
     changes = {} if observation is None else {"observation": observation}
     stated, true = bars(dipole(iron_ring=IRON, solver={"method": method}, **changes), workshop)
     assert np.mean(true <= stated) > 0.8
-    assert np.sqrt(np.mean(stated**2)) < 12 * np.sqrt(np.mean(true**2))
+    assert np.sqrt(np.mean(stated**2)) < 5 * np.sqrt(np.mean(true**2))
 
 
 def test_bars_shrink_with_the_mesh(dipole, workshop):
