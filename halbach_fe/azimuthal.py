@@ -32,7 +32,7 @@ from halbach_fe.solve import (
     render,
     run_tasks,
 )
-from halbach_fe.study import Study
+from halbach_fe.study import Study, is_nonlinear
 from halbach_fe.symmetry import unique_points
 
 PROBLEM = "azimuthal_modes.pro"
@@ -56,6 +56,8 @@ def suits(study: Study, points: Floats) -> bool:
     """Tell whether materials are rotationally symmetric and the points need few modes."""
     block = study.array.block
     if study.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
+        return False
+    if is_nonlinear(study) or not all(block.isotropic for block in blocks_of(study)):
         return False
     permeability = np.array([b.recoil_permeability for b in blocks_of(study)])
     by_ring = permeability.reshape(study.array.rings, -1)

@@ -67,7 +67,10 @@ Outline = tuple[Edge, ...]
 
 @dataclass(frozen=True)
 class MagnetBlock:
-    """One block; ``ring`` and ``slot`` count from 1. Lengths in m, remanence in T."""
+    """One block; ``ring`` and ``slot`` count from 1. Lengths in m, remanence in T.
+
+    The recoil permeability is relative, along the easy axis and across it.
+    """
 
     ring: int
     slot: int
@@ -77,6 +80,19 @@ class MagnetBlock:
     easy_axis: tuple[float, float, float]
     remanence: float
     recoil_permeability: float
+    recoil_permeability_across: float
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether the recoil permeability is the same in all directions."""
+        return self.recoil_permeability == self.recoil_permeability_across
+
+    @property
+    def recoil_tensor(self) -> Floats:
+        """Relative recoil permeability as a tensor, (3, 3)."""
+        axis = np.array(self.easy_axis)
+        along, across = self.recoil_permeability, self.recoil_permeability_across
+        return across * np.eye(3) + (along - across) * np.outer(axis, axis)
 
     @property
     def name(self) -> str:
@@ -157,19 +173,23 @@ def _block(
     array: Array, ring: int, slot: int, outline: Outline, limits: tuple[float, float]
 ) -> MagnetBlock:
     """One block, as its array or an exception to it has it; the last exception counts."""
-    angle, permeability, remanence = (
-        magnetization_angle_deg(array, slot), array.recoil_permeability, array.remanence_T)
+    angle, remanence = magnetization_angle_deg(array, slot), array.remanence_T
+    permeability = array.recoil_permeability
+    across = array.recoil_permeability_across or permeability
     for exception in array.exceptions:
         if exception.ring in (None, ring) and exception.slot in (None, slot):
             if exception.magnetization_angle_deg is not None:
                 angle = exception.magnetization_angle_deg
-            permeability = exception.recoil_permeability or permeability
+            if exception.recoil_permeability is not None:
+                permeability = across = exception.recoil_permeability
+            across = exception.recoil_permeability_across or across
             remanence = exception.remanence_T or remanence
     direction = np.radians(angle)
     block = MagnetBlock(
         ring=ring, slot=slot, outline=outline, z_min=limits[0], z_max=limits[1],
         easy_axis=(float(np.cos(direction)), float(np.sin(direction)), 0.0),
-        remanence=np.nan if remanence is None else remanence, recoil_permeability=permeability)
+        remanence=np.nan if remanence is None else remanence, recoil_permeability=permeability,
+        recoil_permeability_across=across)
     if remanence is not None:
         return block
     return replace(block, remanence=_remanence_of_moment(array, block))

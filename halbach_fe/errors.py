@@ -54,6 +54,20 @@ class GetDPError(HalbachError):
     exit_code = 7
 
 
+class NotConvergedError(GetDPError):
+    """Newton's method did not converge.
+
+    Attributes
+    ----------
+    residuals : tuple of float
+        Of every step of the last sample, relative to the right-hand side.
+    """
+
+    def __init__(self, message: str, residuals: tuple[float, ...]) -> None:
+        super().__init__(message)
+        self.residuals = residuals
+
+
 class OutputError(HalbachError):
     """Results cannot be written, or a stored result cannot be read back."""
 

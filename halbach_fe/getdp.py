@@ -57,6 +57,7 @@ _INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp`), or name it wi
 _NAMED_FAILURES = (  # pattern in the log, what it means
     (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
     (r"[Nn]o space left", "the disk is full"),
+    (r"Newton's method did not converge", "Newton's method did not converge"),
     (r"MUMPS|INFOG|MatSolve.*mumps|factorization", "MUMPS could not factorize the matrix"),
     (r"IterativeLoop did NOT converge|not converge", "an iteration did not converge"),
     (r"assuming zero|Unset|undefined run-time", "a run-time variable was never set"),
@@ -89,8 +90,9 @@ class Job:
         ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
     outputs : tuple of str
         Files that the run must write.
-    solutions : str or None
-        File for every solution, see `halbach_fe.solutions`.
+    solutions, matrix : str or None
+        Files for the solution of every linear system, and the last one's matrix, see
+        `halbach_fe.solutions`.
     unknowns : int or None
         Number of unknowns that the system must have; None where it cannot be foretold.
     solves : int
@@ -109,6 +111,7 @@ class Job:
     outputs: tuple[str, ...]
     numbers: Mapping[str, float] = field(default_factory=dict)
     solutions: str | None = None
+    matrix: str | None = None
     unknowns: int | None = None
     solves: int = 1
     options: tuple[str, ...] = DIRECT_SOLVER
@@ -170,6 +173,9 @@ def run(
     if job.solutions is not None:
         arguments += ["-ksp_view_solution", f"binary:{job.solutions}::append"]
         written = (*written, job.solutions)
+    if job.matrix is not None:
+        arguments += ["-ksp_view_mat", f"binary:{job.matrix}"]
+        written = (*written, job.matrix)
     for output in written:
         (folder / output).unlink(missing_ok=True)  # GetDP would append to, or leave, a stale one
     lines = _execute(arguments, job, folder, on_line, cancel)

@@ -90,10 +90,10 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
             readings = readings + observation.apply(
                 np.moveaxis(next(vacuum)[:, :, :dimension], 2, 0))
         # B_r = mu_0 mu_r M turns per tesla into per A/m
-        columns.append(readings.T * MU_0 * block.recoil_permeability)
+        columns.append(readings.T @ (MU_0 * block.recoil_tensor[:dimension, :dimension]))
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
-    direct = observation.apply(parts.nominal)
+    direct = observation.apply(parts.along_nominal)
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     error = reading_errors(study, observation, parts.nominal, error_workshop(workshop))
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little

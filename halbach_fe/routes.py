@@ -21,11 +21,15 @@ from halbach_fe.extent import (
 from halbach_fe.solve import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
+    Formulation,
     Workshop,
     edge_elements,
+    nominal_samples,
+    solve_samples,
     solve_sources,
+    solve_tangent,
 )
-from halbach_fe.study import Study
+from halbach_fe.study import Study, is_nonlinear
 from halbach_fe.symmetry import no_symmetry, symmetry_of
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -59,6 +63,9 @@ class ElementFields:
         what finite elements contribute to each.
     nominal : ndarray, shape (n, 3), in T
         Of the whole array, solved for at once.
+    along_nominal : ndarray, shape (n, 3), in T
+        What the blocks must add up to: the same, or with non-linear iron the derivative of the
+        field along the nominal magnetization.
     block : callable
         Number of a block, from 0, to its contribution (n, 3, D), in T per T of remanence along
         each axis. By symmetry several blocks share one solve.
@@ -66,6 +73,7 @@ class ElementFields:
 
     superposition_tolerance: float
     nominal: Floats
+    along_nominal: Floats
     block: Callable[[int], Floats]
 
 
@@ -86,7 +94,7 @@ def exact_part(study: Study, points: Floats) -> Floats:
 def is_vacuum(study: Study) -> bool:
     """Tell whether nothing reacts: the exact field is all there is."""
     return study.iron_ring is None and all(
-        block.recoil_permeability == 1.0 for block in blocks_of(study))
+        block.isotropic and block.recoil_permeability == 1.0 for block in blocks_of(study))
 
 
 def finite_element_part(
@@ -105,16 +113,23 @@ def finite_element_part(
     """
     size = study.dimension
     if study.solver.method == "reaction" and is_vacuum(study):
-        return ElementFields(SUPERPOSITION_TOLERANCE, np.zeros((len(points), 3)),
+        zero = np.zeros((len(points), 3))
+        return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero,
                              lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)
     if not columns:
-        return ElementFields(np.nan, _solve(study, points, (), workshop, route)[0], _not_solved)
-    # in a cross-section there is little to save
-    placed = study.solver.symmetry and size == 3
+        nominal = _solve_nominal(study, points, workshop, route)
+        return ElementFields(np.nan, nominal, nominal, _not_solved)
+    # in a cross-section there is little to save, and iron saturates where the field is
+    placed = study.solver.symmetry and size == 3 and not is_nonlinear(study)
     symmetry = symmetry_of(study) if placed else no_symmetry(study)
     places, index = symmetry.spread(points)
-    fields = _solve(study, places, symmetry.sources, workshop, route)
+    if is_nonlinear(study):
+        nominal, fields = solve_tangent(study, places, symmetry.sources, workshop,
+                                        formulation_of(study, route))
+    else:
+        fields = _solve(study, places, symmetry.sources, workshop, route)
+        nominal = fields[0]
     # the identity is among the placements: the first block is its own source, where it stands
     here = index[symmetry.sources[0]]
 
@@ -127,7 +142,7 @@ def finite_element_part(
     tolerance = {"azimuthal_modes": SUPERPOSITION_TOLERANCE}.get(route) or (
         PLACED_TOLERANCE if placed else
         ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE)
-    return ElementFields(tolerance, fields[0, here], block)
+    return ElementFields(tolerance, nominal[here], fields[0, here], block)
 
 
 def _not_solved(number: int) -> Floats:
@@ -139,9 +154,20 @@ def _solve(
 ) -> Floats:
     if route == "azimuthal_modes":
         return solve_modes(study, points, blocks, workshop)
-    formulation = {"cross_section": CROSS_SECTION, "scalar_potential": SCALAR_POTENTIAL}.get(
+    return solve_sources(study, points, blocks, workshop, formulation_of(study, route))
+
+
+def _solve_nominal(study: Study, points: Floats, workshop: Workshop, route: str) -> Floats:
+    if is_nonlinear(study):
+        return solve_samples(study, points, nominal_samples(study), workshop,
+                             formulation_of(study, route))[0]
+    return _solve(study, points, (), workshop, route)[0]
+
+
+def formulation_of(study: Study, route: str) -> Formulation:
+    """What is solved on the mesh of a route."""
+    return {"cross_section": CROSS_SECTION, "scalar_potential": SCALAR_POTENTIAL}.get(
         route) or edge_elements(study.solver.edge_order)
-    return solve_sources(study, points, blocks, workshop, formulation)
 
 
 def choose_route(study: Study, points: Floats) -> str:
@@ -158,8 +184,8 @@ def choose_route(study: Study, points: Floats) -> str:
     if asked == "azimuthal_modes" and not symmetric:
         raise StudyError(
             f"Input `solver.route` of study {study.name} must be another than "
-            "azimuthal_modes here, which needs sectors without angular gaps, of one permeability "
-            "in each ring, and points that are not too near to the blocks. Leave it out.")
+            "azimuthal_modes here, which needs sectors without angular gaps, of one isotropic "
+            "permeability in each ring, linear iron, and points that are not too near to the blocks. Leave it out.")
     if asked == "auto":
         if study.solver.method == "direct":
             return "edge_elements"

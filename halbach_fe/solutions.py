@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sparse
 from numpy.typing import NDArray
 
+from halbach_fe.blocks import Floats
 from halbach_fe.errors import GetDPError
 
 Ints = NDArray[np.int64]
 
-_VECTOR = 1211214  # PETSc's class identifier
+_VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
 _UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for
 
 
@@ -79,8 +81,10 @@ def _entities(text: str, name: str, count: int) -> Ints:
     return np.array(wanted, int).reshape(-1, count)
 
 
-def read_solutions(path: Path, unknowns: int, solves: int) -> NDArray[np.floating]:
-    """Solutions in the order of their solves, (solves, unknowns), mapped from the file.
+def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> NDArray[np.floating]:
+    """The last ``solves`` solutions of a run, (solves, unknowns), mapped from the file.
+
+    ``before`` is how many others there are.
 
     Raises
     ------
@@ -92,13 +96,59 @@ def read_solutions(path: Path, unknowns: int, solves: int) -> NDArray[np.floatin
         raw = np.memmap(path, np.uint8, "r")
     except (OSError, ValueError) as error:
         raise GetDPError(f"GetDP's solutions {path} cannot be read ({error}).") from None
-    if len(raw) != solves * size:
-        raise GetDPError(f"GetDP's file {path} holds {len(raw)} bytes in place of {solves} "
+    total = before + solves
+    if len(raw) != total * size:
+        raise GetDPError(f"GetDP's file {path} holds {len(raw)} bytes in place of {total} "
                          f"solutions of {unknowns} unknowns; a full disk looks like this.")
-    heads = raw.reshape(solves, size)[:, :8].copy().view(">i4")
+    heads = raw.reshape(total, size)[:, :8].copy().view(">i4")
     if not (heads == [_VECTOR, unknowns]).all():
-        raise GetDPError(f"GetDP's file {path} does not hold {solves} PETSc vectors.")
-    solutions = np.ndarray((solves, unknowns), ">f8", raw, offset=8, strides=(size, 8))
+        raise GetDPError(f"GetDP's file {path} does not hold {total} PETSc vectors.")
+    solutions = np.ndarray((solves, unknowns), ">f8", raw, offset=8 + before * size,
+                           strides=(size, 8))
     if not all(np.isfinite(solution).all() for solution in solutions):
         raise GetDPError(f"GetDP's file {path} holds values that are not finite.")
     return solutions
+
+
+def read_saved(path: Path, unknowns: int, count: int) -> Floats:
+    """Solutions (count, unknowns) that GetDP's SaveSolution wrote into a ``.res`` file as text.
+
+    Raises
+    ------
+    GetDPError
+        If the file does not hold just these, or values that are not finite.
+    """
+    try:
+        parts = path.read_text(encoding="ascii").split("$Solution")[1:]
+        # a comment and a line of numbers, then a value a line
+        solutions = np.array([np.array(part.partition("$End")[0].split("\n")[2:-1], float)
+                              for part in parts])
+    except (OSError, ValueError) as error:
+        raise GetDPError(f"GetDP's solutions {path} cannot be read ({error}).") from None
+    if solutions.shape != (count, unknowns):
+        raise GetDPError(f"GetDP's file {path} holds solutions {solutions.shape} in place of "
+                         f"{count} of {unknowns} unknowns; a full disk looks like this.")
+    if not np.isfinite(solutions).all():
+        raise GetDPError(f"GetDP's file {path} holds values that are not finite.")
+    return solutions
+
+
+def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
+    """A matrix (unknowns, unknowns) that PETSc wrote in binary; raise GetDPError if it is none."""
+    try:
+        raw = np.fromfile(path, np.uint8)
+        head = raw[:16].view(">i4")
+        if len(raw) < 16 or tuple(head[:3]) != (_MATRIX, unknowns, unknowns):
+            raise ValueError("another header")
+        lengths = raw[16:16 + 4 * unknowns].view(">i4").astype(np.int64)
+        start, count = 16 + 4 * unknowns, int(head[3])
+        columns = raw[start:start + 4 * count].view(">i4").astype(np.int64)
+        values = raw[start + 4 * count:start + 12 * count].view(">f8").astype(float)
+        if lengths.sum() != count or len(values) != count or len(raw) != start + 12 * count:
+            raise ValueError("truncated")
+    except (OSError, ValueError) as error:
+        raise GetDPError(f"GetDP's matrix {path} cannot be read ({error}).") from None
+    if not np.isfinite(values).all():
+        raise GetDPError(f"GetDP's matrix {path} holds values that are not finite.")
+    return sparse.csr_array((values, columns, np.append(0, np.cumsum(lengths))),
+                            shape=(unknowns, unknowns))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata, resources
 from itertools import pairwise
 from pathlib import Path
@@ -20,21 +21,34 @@ from numpy.typing import NDArray
 
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.errors import GetDPError, OutputError, PointsOutsideError
+from halbach_fe.errors import GetDPError, NotConvergedError, OutputError, PointsOutsideError
 from halbach_fe.evaluation import Located, curl_operators, locate, nodal_operators, probes_of
 from halbach_fe.getdp import GetDP, Job
 from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
-from halbach_fe.solutions import Unknowns, read_solutions, read_unknowns
-from halbach_fe.study import MU_0, Study
+from halbach_fe.solutions import (
+    Unknowns,
+    read_matrix,
+    read_saved,
+    read_solutions,
+    read_unknowns,
+)
+from halbach_fe.study import MU_0, Study, curve_of, is_nonlinear
 
 NOMINAL_SOURCE = 0
 FLUX_DENSITY_FILE = "flux_density.txt"
+NEWTON_FILE = "newton_flux_density.txt"
+NEWTON_HISTORY = "newton.csv"
 SOLUTIONS_FILE = "solutions.bin"
+MATRIX_FILE = "matrix.bin"
 SOLUTIONS_AT_ONCE = 32
 PRINTED_TOLERANCE = 1e-10
 """Of the largest value. Both evaluate the same polynomials; points are found to 1e-13."""
 
-PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro")
+NEWTON_TOLERANCE = 1e-10
+"""Residual of Newton's method relative to the right-hand side: the last step, quadratic, ends far
+below; rounding leaves 1e-14 or so."""
+
+PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro", "solve_newton.pro")
 Progress = Callable[[int, int], None]
 """Called with the number of solves done and the number of all."""
 
@@ -118,7 +132,8 @@ def solve_sources(
     study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
     formulation: Formulation,
 ) -> Floats:
-    """Finite-element part of the field of the nominal array and of single blocks.
+    """Finite-element part of the field of the nominal array and of single blocks, iron being
+    linear.
 
     For the method ``direct`` that is B itself. For ``reaction`` it is the difference of two
     solves on one mesh, real materials minus vacuum, to be added to the exact field in vacuum;
@@ -135,23 +150,147 @@ def solve_sources(
     ndarray, shape (1 + D len(blocks), n, 3), in T
         The nominal array, then block by block, axis by axis.
     """
+    case = _case(study, points, blocks, workshop, formulation)
+    return _difference(study, workshop, lambda vacuum, parts: _source_tasks(case, vacuum, parts))
+
+
+def solve_tangent(
+    study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
+    formulation: Formulation,
+) -> tuple[Floats, Floats]:
+    """Finite-element part of the field of a magnet with non-linear iron, and its derivative.
+
+    Returns
+    -------
+    field : ndarray, shape (n, 3), in T
+        Of the nominal array, by Newton's method.
+    derivative : ndarray, shape (1 + D len(blocks), n, 3), in T
+        There, along the nominal magnetization, then per tesla of each block along each axis: the
+        Gateaux problem, with the differential reluctivity dH/dB.
+    """
+    case = _case(study, points, blocks, workshop, formulation)
+
+    def tasks(vacuum: bool, parts: int) -> list[Task]:
+        return _source_tasks(case, vacuum, 1) if vacuum else [
+            _newton_task(case, nominal_samples(study), False, NEWTON_TOLERANCE, gateaux=True)]
+
+    real, *vacuum = _run_variants(study, workshop, tasks)
+    if vacuum:  # of the nominal array, for the field, and for the derivative along it
+        real = real - vacuum[0][[0, *range(len(vacuum[0]))]]
+    return real[0], real[1:]
+
+
+def solve_samples(
+    study: Study, points: Floats, samples: Floats, workshop: Workshop, formulation: Formulation,
+    cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
+) -> Floats:
+    """Finite-element part of the field for samples of magnetization, by Newton's method.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    samples : ndarray, shape (k, blocks, 3), in A/m
+    cold : bool
+        Whether every sample starts from zero, not from the one before.
+    tolerance : float
+        Of the residual, relative to the right-hand side.
+
+    Returns
+    -------
+    ndarray, shape (k, n, 3), in T
+
+    Raises
+    ------
+    NotConvergedError
+        With the residuals of the sample that failed.
+    """
+    case = _case(study, points, (), workshop, formulation)
+    return _difference(study, workshop, lambda vacuum, parts: [
+        _newton_task(case, samples, vacuum, tolerance, cold=cold)])
+
+
+def nominal_samples(study: Study) -> Floats:
+    """The nominal magnetization as the only sample, (1, blocks, 3) in A/m."""
+    return np.array([[block.magnetization for block in blocks_of(study)]])
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A linear problem as GetDP assembled it, and its solutions.
+
+    Attributes
+    ----------
+    matrix : sparse array, shape (unknowns, unknowns)
+    solutions : ndarray, shape (1 + D blocks, unknowns)
+        Of the nominal array, and of all blocks per tesla along each axis.
+    """
+
+    mesh: VerifiedMesh
+    unknowns: Unknowns
+    matrix: sparse.csr_array
+    solutions: Floats
+
+
+def assemble(study: Study, workshop: Workshop, formulation: Formulation) -> Assembly:
+    """Have GetDP assemble and solve a study with linear iron, for all its blocks."""
+    place = np.zeros((1, 3))  # any in air: GetDP prints there what is compared
+    blocks = range(len(blocks_of(study)))
+    case = _case(study, place, blocks, workshop, formulation)
     last = study.dimension * len(blocks)
+    kept: list[Assembly] = []
+
+    def read(folder: Path, unknowns: Unknowns, solutions: NDArray[np.floating]) -> None:
+        kept.append(Assembly(case.mesh, unknowns, read_matrix(
+            folder / MATRIX_FILE, unknowns.count), np.array(solutions, float)))
+        (folder / MATRIX_FILE).unlink()
+
+    run_tasks([_source_task(case, False, (0, last), "", matrix=read)], workshop)
+    return kept[0]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What the runs of a study on one mesh have in common."""
+
+    study: Study
+    mesh: VerifiedMesh
+    located: Located
+    blocks: Sequence[int]
+    formulation: Formulation
+    time_limit_s: float
+
+
+def _case(
+    study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
+    formulation: Formulation,
+) -> _Case:
     if study.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
-    folder = make_folder(workshop.folder)
-    mesh = verify_mesh(build_mesh(study, folder))
+    mesh = verify_mesh(build_mesh(study, make_folder(workshop.folder)))
     check_inside(mesh, points)
-    located = locate(mesh, points)
+    return _Case(study, mesh, locate(mesh, points), blocks, formulation, workshop.time_limit_s)
+
+
+def _difference(
+    study: Study, workshop: Workshop, tasks: Callable[[bool, int], list[Task]]
+) -> Floats:
+    """B by the study's method: of real materials, or that minus vacuum."""
+    real, *vacuum = _run_variants(study, workshop, tasks)
+    return real - vacuum[0] if vacuum else real
+
+
+def _run_variants(
+    study: Study, workshop: Workshop, tasks: Callable[[bool, int], list[Task]]
+) -> list[Floats]:
+    """Run the tasks of each variant that the study's method needs, real materials first.
+
+    ``tasks`` makes those of real materials (False) or vacuum (True), in about so many parts.
+    """
     variants = [False] if study.solver.method == "direct" else [False, True]
-    parts = max(1, min(last + 1, workshop.jobs // len(variants)))
-    limits = np.linspace(0, last + 1, parts + 1).astype(int)
-    ranges = [(int(a), int(b) - 1) for a, b in pairwise(limits)]
-    tasks = [_task(study, mesh, located, blocks, part, vacuum, workshop, formulation,
-                   f"-{number}" if number else "")
-             for vacuum in variants for number, part in enumerate(ranges)]
-    results = run_tasks(tasks, workshop)
-    fields = [np.concatenate(results[i * parts:(i + 1) * parts]) for i in range(len(variants))]
-    return fields[0] if len(fields) == 1 else fields[0] - fields[1]
+    made = [tasks(vacuum, max(1, workshop.jobs // len(variants))) for vacuum in variants]
+    results = run_tasks([task for part in made for task in part], workshop)
+    limits = np.cumsum([0, *(len(part) for part in made)])
+    return [np.concatenate(results[a:b]) for a, b in pairwise(limits)]
 
 
 @dataclass(frozen=True)
@@ -172,7 +311,17 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
     def run(task: Task) -> Floats:
         with _run_folder(workshop.folder, task.name, cancel) as folder:
             job = task.stage(folder)
-            runner.run(workshop.getdp, job, folder, counter.line, cancel)
+            history: list[str] = []
+
+            def see(line: str) -> None:
+                counter.line(line)
+                if line.startswith("NEWTON"):
+                    history.append(line)
+
+            try:
+                runner.run(workshop.getdp, job, folder, see, cancel)
+            except GetDPError as error:
+                raise _with_history(error, newton_residuals(history)) from None
             return task.read(folder)
 
     with ThreadPoolExecutor(max(1, workshop.jobs)) as pool:
@@ -187,6 +336,17 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
             cancel.set()  # on failure and on Ctrl-C nobody waits for the others
             for future in futures:
                 future.cancel()
+
+
+def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
+    """The error, with the residuals if Newton's method is what failed."""
+    if "Newton's method did not converge" not in str(error) or not history:
+        return error
+    residuals = tuple(history[-1])
+    return NotConvergedError(
+        f"{error} Relative residuals of sample {len(history)}: "
+        f"{', '.join(f'{residual:.1e}' for residual in residuals)}. Refine the mesh in the iron, "
+        "or smooth its H(B) curve.", residuals)
 
 
 def render(template: str, *, study: Study, **data: object) -> str:
@@ -211,38 +371,121 @@ class _Counter:
         self._progress = progress
 
     def line(self, line: str) -> None:
-        if line.startswith("SOURCE") and self._progress is not None:
+        if line.startswith(("SOURCE", "SAMPLE")) and self._progress is not None:
             with self._lock:
                 self._done += 1
                 self._progress(self._done, self._total)
 
 
-def _task(
-    study: Study, mesh: VerifiedMesh, located: Located, blocks: Sequence[int],
-    sources: tuple[int, int], vacuum: bool, workshop: Workshop, formulation: Formulation,
-    suffix: str,
+def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:
+    """The nominal array and all sources of a linear problem, in up to so many runs."""
+    last = case.study.dimension * len(case.blocks)
+    limits = np.linspace(0, last + 1, min(last + 1, parts) + 1).astype(int)
+    return [_source_task(case, vacuum, (int(a), int(b) - 1), f"-{number}" if number else "")
+            for number, (a, b) in enumerate(pairwise(limits))]
+
+
+def _source_task(
+    case: _Case, vacuum: bool, sources: tuple[int, int], suffix: str,
+    matrix: Callable[[Path, Unknowns, NDArray[np.floating]], None] | None = None,
 ) -> Task:
     count = sources[1] - sources[0] + 1
-    probes, places = probes_of(mesh, located)
+    probes, places = probes_of(case.mesh, case.located)
 
     def read(folder: Path) -> Floats:
-        unknowns = read_unknowns(folder / f"{Path(formulation.problem).stem}.pre", mesh.cell_type)
+        unknowns = _unknowns(case, folder)
         solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, count)
-
-        def field(located: Located, chosen: NDArray[np.floating]) -> Floats:
-            operators = formulation.flux_density(mesh, located, unknowns)
-            return np.stack([apply_to(operator, chosen) for operator in operators], axis=2)
-
-        compare_printed(field(probes, solutions[:1])[0], folder / FLUX_DENSITY_FILE, places)
-        result = field(located, solutions)
+        printed = _fields(case, unknowns, probes, solutions[:1])[0]
+        compare_printed(printed, folder / FLUX_DENSITY_FILE, places)
+        result = _fields(case, unknowns, case.located, solutions)
+        if matrix is not None:
+            matrix(folder, unknowns, solutions)
         (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
         return result
 
-    return Task(
-        name=f"getdp-{'vacuum' if vacuum else 'real'}{suffix}",
-        stage=lambda folder: stage(study, mesh, places, folder, formulation, blocks, sources,
-                                   vacuum, workshop.time_limit_s),
-        read=read, solves=count)
+    def fill(folder: Path) -> Job:
+        job = stage(case.study, case.mesh, places, folder, case.formulation, case.blocks, sources,
+                    vacuum, case.time_limit_s)
+        return job if matrix is None else replace(job, matrix=MATRIX_FILE)
+
+    return Task(f"getdp-{_variant(vacuum)}{suffix}", fill, read, count)
+
+
+def _newton_task(
+    case: _Case, samples: Floats, vacuum: bool, tolerance: float, cold: bool = False,
+    gateaux: bool = False,
+) -> Task:
+    """Newton's method for samples (k, blocks, 3) in A/m; its fields, then derivatives if wanted."""
+    columns = 1 + case.study.dimension * len(case.blocks) if gateaux else 0
+    probes, places = probes_of(case.mesh, case.located)
+
+    def fill(folder: Path) -> Job:
+        job = stage(case.study, case.mesh, places, folder, case.formulation, case.blocks,
+                    (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
+        outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
+        return replace(
+            job, resolution="Newton", solves=max(columns, 1),
+            outputs=(*outputs, _saved(case)), solutions=SOLUTIONS_FILE if gateaux else None,
+            numbers=job.numbers | {"TOLERANCE": tolerance, "COLD": cold, "GATEAUX": gateaux})
+
+    def read(folder: Path) -> Floats:
+        steps = write_history(folder)
+        unknowns = _unknowns(case, folder)
+        saved = read_saved(folder / _saved(case), unknowns.count, len(samples))
+        compare_printed(_fields(case, unknowns, probes, saved[:1])[0], folder / NEWTON_FILE, places)
+        fields = _fields(case, unknowns, case.located, saved)
+        (folder / _saved(case)).unlink()
+        if not gateaux:
+            return fields
+        derivatives = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, columns, steps)
+        compare_printed(_fields(case, unknowns, probes, derivatives[:1])[0],
+                        folder / FLUX_DENSITY_FILE, places)
+        fields = np.concatenate([fields, _fields(case, unknowns, case.located, derivatives)])
+        (folder / SOLUTIONS_FILE).unlink()
+        return fields
+
+    return Task(f"getdp-{_variant(vacuum)}", fill, read, len(samples) + columns)
+
+
+def _variant(vacuum: bool) -> str:
+    return "vacuum" if vacuum else "real"
+
+
+def _saved(case: _Case) -> str:
+    """The file that GetDP's SaveSolution writes."""
+    return f"{Path(case.formulation.problem).stem}.res"
+
+
+def _unknowns(case: _Case, folder: Path) -> Unknowns:
+    return read_unknowns(folder / f"{Path(case.formulation.problem).stem}.pre", case.mesh.cell_type)
+
+
+def _fields(
+    case: _Case, unknowns: Unknowns, located: Located, solutions: NDArray[np.floating]
+) -> Floats:
+    operators = case.formulation.flux_density(case.mesh, located, unknowns)
+    return np.stack([apply_to(operator, solutions) for operator in operators], axis=2)
+
+
+def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
+    """Relative residuals of Newton's method in a log of GetDP, by sample and step."""
+    found: list[list[float]] = []
+    for line in lines:
+        match = re.search(r"NEWTON (\d+) (\d+) (\S+)", line)
+        if match:
+            if match[2] == "0":
+                found.append([])
+            found[-1].append(float(match[3]))
+    return found
+
+
+def write_history(folder: Path) -> int:
+    """Keep the residuals of a run's log as a table; return the number of steps."""
+    history = newton_residuals((folder / "getdp.log").read_text("utf-8").splitlines())
+    rows = [f"{sample},{step},{residual:.6e}" for sample, residuals in enumerate(history)
+            for step, residual in enumerate(residuals)]
+    (folder / NEWTON_HISTORY).write_text("\n".join(["sample,step,residual", *rows, ""]), "utf-8")
+    return sum(len(residuals) - 1 for residuals in history)
 
 
 def apply_to(operator: sparse.csr_array, solutions: NDArray[np.floating]) -> Floats:
@@ -275,12 +518,13 @@ def compare_printed(ours: Floats, printed: Path, places: Floats) -> None:
 def stage(
     study: Study, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
     blocks: Sequence[int] = (), sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE),
-    vacuum: bool = False, time_limit_s: float = 3600.0,
+    vacuum: bool = False, time_limit_s: float = 3600.0, samples: Floats | None = None,
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there.
 
     ``places`` (n, 3) in m are where GetDP prints the first source's field; ``sources`` are the
-    first and last to solve for, 0 being the nominal array, the others the axes of ``blocks``.
+    first and last to solve for, 0 being the whole array, the others the axes of ``blocks``.
+    ``samples`` (k, blocks, 3) in A/m are magnetizations of the whole array; default the nominal.
     """
     for name in (formulation.problem, *PROBLEM_INCLUDES):
         text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
@@ -289,7 +533,9 @@ def stage(
     ranks[list(blocks)] = np.arange(1, len(blocks) + 1)
     (folder / "case.pro").write_text(
         render("case.pro.j2", study=study, regions=mesh.regions, points=places.tolist(),
-               ranks=ranks.tolist()), encoding="utf-8")
+               ranks=ranks.tolist(), curve=curve_of(study),
+               samples=(nominal_samples(study) if samples is None else samples).tolist()),
+        encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
     return Job(
         problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
@@ -314,7 +560,8 @@ def _run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pa
             raise
         kept = parent / f"{name}-failed"
         _replace(folder, kept)
-        raise GetDPError(str(error).replace(str(folder), str(kept))) from None
+        error.args = (str(error).replace(str(folder), str(kept)),)
+        raise
     except OSError as error:
         raise OutputError(f"Cannot write into {parent}: {error.strerror}.") from None
     finally:

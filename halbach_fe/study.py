@@ -12,18 +12,18 @@ magnetization at the working point.
 from __future__ import annotations
 
 import difflib
-import math
 import tomllib
 import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from halbach_fe import materials
 from halbach_fe.errors import StudyError, must_be
-
-MU_0 = 4e-7 * math.pi
-"""Vacuum permeability in T m/A; the pre-2019 value, 1.3e-10 relative from the measured one."""
+from halbach_fe.materials import MU_0 as MU_0
+from halbach_fe.materials import Curve
 
 MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
@@ -34,6 +34,7 @@ Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
 Coordinate = Annotated[
     float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M, allow_inf_nan=False)]
 Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
+RecoilPermeability = Annotated[float, Field(ge=1.0, le=2.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Component = Literal["x", "y", "z"]
@@ -79,12 +80,14 @@ Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminato
 class BlockException(_Model):
     """What is different in the blocks of one ring, or one slot, or both, from the array's.
 
-    ``magnetization_angle_deg`` turns the magnetization, never the shape.
+    ``magnetization_angle_deg`` turns the magnetization, never the shape. A recoil permeability
+    alone is that in all directions.
     """
 
     ring: Annotated[int, Field(ge=1)] | None = None
     slot: Annotated[int, Field(ge=1)] | None = None
-    recoil_permeability: Annotated[float, Field(ge=1.0, le=2.0)] | None = None
+    recoil_permeability: RecoilPermeability | None = None
+    recoil_permeability_across: RecoilPermeability | None = None
     remanence_T: Remanence | None = None
     magnetization_angle_deg: Angle | None = None
 
@@ -95,6 +98,8 @@ class Array(_Model):
     Block ``i`` (from 1) sits at ``first_block_angle_deg + (i-1) 360/N``; its magnetization turns
     ``1 + multipole_order`` times faster (K. Halbach, Nucl. Instrum. Methods 169 (1980) 1), from
     ``first_magnetization_angle_deg``. Rings are numbered from 1 at the lowest z.
+    ``recoil_permeability`` is relative and holds along the easy axis, and across it unless
+    ``recoil_permeability_across`` says otherwise.
     """
 
     multipole_order: Annotated[int, Field(ge=1, le=20)] = 1
@@ -106,7 +111,8 @@ class Array(_Model):
     ring_gap_m: Gap = 0.0
     first_block_angle_deg: Angle = 0.0
     first_magnetization_angle_deg: Angle = 0.0
-    recoil_permeability: Annotated[float, Field(ge=1.0, le=2.0)] = 1.0
+    recoil_permeability: RecoilPermeability = 1.0
+    recoil_permeability_across: RecoilPermeability | None = None
     remanence_T: Remanence | None = None
     block_moment_A_m2: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
     block: Block
@@ -131,13 +137,74 @@ class Array(_Model):
         return self
 
 
+class TableCurve(_Model):
+    """H(B) as a table, in a CSV file (``H_A_per_m,B_T``, its path from the study's folder) or here.
+
+    Read from a file, the study holds its numbers.
+    """
+
+    kind: Literal["table"]
+    file: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
+    H_A_per_m: tuple[float, ...] = ()
+    B_T: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TableCurve:
+        if self.file is None:
+            materials.table_curve(np.array(self.H_A_per_m), np.array(self.B_T))
+        elif self.H_A_per_m or self.B_T:
+            raise ValueError("give either a file, or H_A_per_m and B_T, not both")
+        return self
+
+
+class SteelCurve(_Model):
+    """A curve that comes with halbach-fe, by name."""
+
+    kind: Literal["steel"]
+    name: str
+
+    @model_validator(mode="after")
+    def _known(self) -> SteelCurve:
+        if self.name not in materials.steels():
+            raise ValueError(f"no steel is called '{self.name}'; there are "
+                             f"{', '.join(materials.steels())}")
+        return self
+
+
+class FroehlichKennellyCurve(_Model):
+    """B = mu_0 H + J_s H / (H + h), h following from the initial permeability."""
+
+    kind: Literal["froehlich_kennelly"]
+    initial_relative_permeability: Annotated[float, Field(ge=2.0, le=1e6)]
+    saturation_polarization_T: Annotated[float, Field(gt=0.0, le=materials.MAX_POLARIZATION)]
+
+
+class BrauerCurve(_Model):
+    """H = (k1 exp(k2 B^2) + k3) B, as far as its slope stays below that of vacuum."""
+
+    kind: Literal["brauer"]
+    k1_m_per_H: Annotated[float, Field(gt=0.0, le=1e6)]
+    k2_per_T2: Annotated[float, Field(gt=0.0, le=100.0)]
+    k3_m_per_H: Annotated[float, Field(ge=0.0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _possible(self) -> BrauerCurve:
+        materials.brauer(self.k1_m_per_H, self.k2_per_T2, self.k3_m_per_H)
+        return self
+
+
+IronCurve = Annotated[TableCurve | SteelCurve | FroehlichKennellyCurve | BrauerCurve,
+                      Field(discriminator="kind")]
+
+
 class IronRing(_Model):
-    """A coaxial iron tube outside the array, of constant permeability."""
+    """A coaxial iron tube outside the array, of constant permeability or with an H(B) curve."""
 
     inner_radius_m: Length
     outer_radius_m: Length
     length_m: Length | None = None
-    relative_permeability: Annotated[float, Field(ge=1.0, le=1e6)]
+    relative_permeability: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
+    curve: IronCurve | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> IronRing:
@@ -146,6 +213,8 @@ class IronRing(_Model):
                 f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
                 f"({self.inner_radius_m})"
             )
+        if (self.relative_permeability is None) == (self.curve is None):
+            raise ValueError("give exactly one of relative_permeability and curve")
         return self
 
 
@@ -377,7 +446,7 @@ def read_study(path: str | Path) -> Study:
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
         ) from None
-    return parse_study(document, where)
+    return _with_table(parse_study(document, where), path.parent, where)
 
 
 def parse_study(document: dict[str, Any], where: str = "study") -> Study:
@@ -386,6 +455,49 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
         return Study.model_validate(document)
     except ValidationError as error:
         raise StudyError(_sentence(error, where)) from None
+
+
+def curve_of(study: Study) -> Curve | None:
+    """The iron ring's magnetization curve, if it has one."""
+    curve = study.iron_ring and study.iron_ring.curve
+    if not curve:
+        return None
+    if curve.kind == "brauer":
+        return materials.brauer(curve.k1_m_per_H, curve.k2_per_T2, curve.k3_m_per_H)
+    if curve.kind == "froehlich_kennelly":
+        return materials.froehlich_kennelly(curve.initial_relative_permeability,
+                                            curve.saturation_polarization_T)
+    if curve.kind == "steel":
+        table = materials.read_table(materials.steels()[curve.name])
+    else:
+        assert curve.file is None  # a study from a file holds its numbers
+        table = curve.H_A_per_m, curve.B_T
+    return materials.table_curve(np.array(table[0]), np.array(table[1]))
+
+
+def is_nonlinear(study: Study) -> bool:
+    """Tell whether the field is no linear function of the magnetizations."""
+    return study.iron_ring is not None and study.iron_ring.curve is not None
+
+
+def _with_table(study: Study, folder: Path, where: str) -> Study:
+    """The study with the numbers of its H(B) file in place of the file's name."""
+    ring = study.iron_ring
+    if ring is None or ring.curve is None or ring.curve.kind != "table" or not ring.curve.file:
+        return study
+    path = folder / ring.curve.file
+    try:
+        field, flux_density = materials.read_table(path)
+        table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
+    except OSError as error:
+        raise StudyError(must_be("`iron_ring.curve.file`", where, "a readable file",
+                                 f"'{path}' ({error.strerror})", "Check the path.")) from None
+    except ValidationError as error:
+        reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+        raise StudyError(f"H(B) table {path} of {where} cannot be used: {reason}.") from None
+    except ValueError as error:
+        raise StudyError(f"H(B) table {path} of {where} cannot be used: {error}.") from None
+    return study.model_copy(update={"iron_ring": ring.model_copy(update={"curve": table})})
 
 
 def _sentence(error: ValidationError, where: str) -> str:

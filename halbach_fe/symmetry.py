@@ -109,12 +109,12 @@ def symmetry_of(study: Study) -> Symmetry:
     """
     blocks = blocks_of(study)
     slots, rings = study.array.blocks_per_ring, study.array.rings
-    permeability = np.array([b.recoil_permeability for b in blocks]).reshape(rings, slots)
+    tensors = np.array([b.recoil_tensor for b in blocks]).reshape(rings, slots, 3, 3)
     outlines = [block.outline for block in blocks[:slots]]
     pitch = 2 * np.pi / slots
     period = next(k for k in range(1, slots + 1) if slots % k == 0 and _turns(
-        outlines, permeability, k, pitch))
-    mirror = study.dimension == 3 and bool((permeability == permeability[::-1]).all())
+        outlines, tensors, k, pitch))
+    mirror = study.dimension == 3 and _equal(tensors, tensors[::-1])
     placements = []
     for number in range(len(blocks)):
         ring, slot = divmod(number, slots)
@@ -124,11 +124,12 @@ def symmetry_of(study: Study) -> Symmetry:
     return Symmetry(tuple(placements))
 
 
-def _turns(outlines: list[Outline], permeability: Floats, step: int, pitch: float) -> bool:
+def _turns(outlines: list[Outline], tensors: Floats, step: int, pitch: float) -> bool:
     """Tell whether a turn by ``step`` blocks leaves shapes and permeabilities as they are."""
-    if not (permeability == np.roll(permeability, step, axis=1)).all():
+    space = turn_matrix(step * pitch)
+    if not _equal(np.roll(space @ tensors @ space.T, step, axis=1), tensors):
         return False
-    turn = turn_matrix(step * pitch)[:2, :2]
+    turn = space[:2, :2]
     return all(_same_shape(_corners(one) @ turn.T, _corners(other))
                for one, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
 
@@ -183,6 +184,11 @@ def frame_of(block: MagnetBlock) -> Frame:
              *np.round(local[order], 9).ravel().tolist())
     return Frame(angle, 0.0 if infinite else (block.z_min + block.z_max) / 2, shape,
                  _same_shape(local * [1, -1], local))
+
+
+def _equal(one: Floats, other: Floats) -> bool:
+    """Tell whether permeabilities are the same but for rounding of their turns."""
+    return bool(np.abs(one - other).max() < 1e-12)
 
 
 def _corners(outline: Outline) -> Floats:
