@@ -7,6 +7,7 @@ product, where GetDP's own printing searches the mesh for every point of every s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 import scipy.sparse as sparse
@@ -53,8 +54,10 @@ class Located:
     mean: sparse.csr_array
 
 
-def locate(mesh: VerifiedMesh, points: Floats) -> Located:
-    """Find the air elements that hold each of the points (n, 3); in 2D, z is not looked at.
+def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Located:
+    """Find the air elements, or with ``anywhere`` all, that hold each of the points (n, 3).
+
+    In 2D, z is not looked at.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def locate(mesh: VerifiedMesh, points: Floats) -> Located:
     """
     dimension = mesh.regions.dimension
     points = points[:, :dimension]
-    air = np.flatnonzero(mesh.in_air)
+    air = np.flatnonzero(mesh.in_air | anywhere)
     nodes = mesh.points[mesh.cells[air]]
     tree = KDTree(nodes.mean(axis=1))
     found: list[tuple[Ints, Ints, Floats]] = []  # points, elements, coordinates
@@ -104,6 +107,50 @@ def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Lo
     places = np.zeros((len(cells), 3))
     places[:, :dimension] = coordinates(mesh, located)
     return located, places
+
+
+def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
+    """GetDP's Gauss points of elements, and the weights (m,) of integrals over them in m^d.
+
+    The rules, of 7 points on triangles and 15 on tetrahedra, are exact for polynomials of degree
+    5; see O. C. Zienkiewicz, R. L. Taylor, The Finite Element Method, and P. Keast, Comput.
+    Methods Appl. Mech. Engrg. 55 (1986) 339.
+    """
+    reference, weights = _RULES[mesh.cell_type]
+    count = len(reference)
+    located = Located(np.repeat(cells, count), np.tile(reference, (len(cells), 1)),
+                      sparse.eye_array(len(cells) * count, format="csr"))
+    _, slopes = shape_functions(mesh.cell_type, located.reference)
+    jacobian = np.einsum("nkd,nke->nde", mesh.points[mesh.cells[located.cells]], slopes)
+    return located, np.abs(np.linalg.det(jacobian)) * np.tile(weights, len(cells))
+
+
+def _rule(groups: list[tuple[float, float, set[tuple[float, ...]]]]) -> tuple[Floats, Floats]:
+    """Points and weights from groups of a weight, a total and barycentric coordinates, permuted."""
+    points, weights = [], []
+    for weight, volume, coordinates_ in groups:
+        for place in sorted(coordinates_):
+            points.append(place[1:])
+            weights.append(weight * volume)
+    return np.array(points), np.array(weights)
+
+
+def _orbit(*coordinates_: float) -> set[tuple[float, ...]]:
+    return set(permutations(coordinates_))
+
+
+_ROOT = np.sqrt(15)
+_A, _B, _C = (7 - _ROOT) / 34, (7 + _ROOT) / 34, (10 - 2 * _ROOT) / 40
+_RULES = {
+    "triangle6": _rule([(9 / 40, 1 / 2, _orbit(1 / 3, 1 / 3, 1 / 3))] + [
+        ((155 + sign * _ROOT) / 1200, 1 / 2,
+         _orbit(a := (6 + sign * _ROOT) / 21, a, 1 - 2 * a)) for sign in (-1, 1)]),
+    "tetra10": _rule([
+        (16 / 135, 1 / 6, _orbit(1 / 4, 1 / 4, 1 / 4, 1 / 4)),
+        ((2665 + 14 * _ROOT) / 37800, 1 / 6, _orbit(_A, _A, _A, 1 - 3 * _A)),
+        ((2665 - 14 * _ROOT) / 37800, 1 / 6, _orbit(_B, _B, _B, 1 - 3 * _B)),
+        (10 / 189, 1 / 6, _orbit(_C, _C, 1 / 2 - _C, 1 / 2 - _C))]),
+}
 
 
 def coordinates(mesh: VerifiedMesh, located: Located) -> Floats:

@@ -97,7 +97,7 @@ class Law:
 
 
 def _akima_slopes(x: Floats, y: Floats) -> Floats:
-    """Slopes of Akima's method as GetDP has them (scipy's tell straight pieces by another limit)."""
+    """Slopes of Akima's method as GetDP has them (scipy tells straight pieces by another limit)."""
     secant = np.diff(y) / np.diff(x)
     m = np.concatenate([[0, 0], secant, [0, 0]])
     m[1], m[-2] = 2 * m[2] - m[3], 2 * m[-3] - m[-4]

@@ -69,7 +69,7 @@ class VerifiedMesh:
         Nodes of every element, in the order of the file, all of one type.
     cell_type : str
         meshio's name of it: ``triangle6``, ``quad`` or ``tetra10``.
-    in_air : ndarray of bool, shape (elements,)
+    in_air, in_iron : ndarray of bool, shape (elements,)
     inner : Entities
         Off the outer boundary.
     axis : Entities
@@ -84,6 +84,7 @@ class VerifiedMesh:
     cells: Ints
     cell_type: str
     in_air: NDArray[np.bool_]
+    in_iron: NDArray[np.bool_]
     inner: Entities
     axis: Entities
     radius: float
@@ -174,6 +175,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
     return VerifiedMesh(
         path=files.mesh, regions=regions, points=mesh.points[:, :regions.dimension], cells=cells,
         cell_type=kind, in_air=material == regions.air,
+        in_iron=material == regions.iron,
         inner=_less(_count(cells, kind), _count(boundary, edge)),
         axis=_less(_count(np.vstack([axis, boundary]), edge), _count(boundary, edge)),
         radius=radius, half_length=half_length)

@@ -1,5 +1,7 @@
 """The response matrix H: block magnetizations p in A/m to readings q in T, q = H p.
 
+With non-linear iron H is the derivative at the nominal magnetization, and q = offset + H p near it.
+
 Each column is the field of one block magnetized by 1 A/m along one axis: its exact field in
 vacuum plus the finite-element reaction, or the finite-element field alone (method ``direct``).
 One more solve, of the nominal array at once, is compared with the sum of the columns.
@@ -25,10 +27,11 @@ from halbach_fe.observation import Observation
 from halbach_fe.routes import (
     SUPERPOSITION_TOLERANCE,
     check_points,
+    exact_part,
     finite_element_part,
 )
 from halbach_fe.solve import Workshop
-from halbach_fe.study import COMPONENTS, MU_0, Study
+from halbach_fe.study import COMPONENTS, MU_0, Study, is_nonlinear
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Response:
         ``r01s05.Mx``: ring 1, slot 5, component x.
     nominal : ndarray, shape (parameters,), in A/m
         The study's nominal magnetization.
+    offset : ndarray, shape (readings,), in T
+        What linearizing leaves; 0 where the problem is linear.
     error : ndarray, shape (readings,), in T
         Error bar of the finite elements, for the nominal array; see
         `halbach_fe.discretization.reading_errors`.
@@ -55,6 +60,7 @@ class Response:
     matrix: Floats
     parameters: tuple[str, ...]
     nominal: Floats
+    offset: Floats
     error: Floats
     superposition_error: float
     reused: bool = False
@@ -97,8 +103,12 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     error = reading_errors(study, observation, parts.nominal, error_workshop(workshop))
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
-    built = Response(matrix, parameter_names(study), nominal, np.hypot(error, total - direct),
-                     superposition)
+    offset = np.zeros(len(observation))
+    if is_nonlinear(study):
+        field = exact_part(study, observation.points) + parts.nominal
+        offset = observation.apply(field) - matrix @ nominal
+    built = Response(matrix, parameter_names(study), nominal, offset,
+                     np.hypot(error, total - direct), superposition)
     _write(path, key, built)
     return built
 
@@ -145,6 +155,7 @@ def _write(path: Path, key: str, built: Response) -> None:
     data = xr.Dataset(
         {"H": (("reading", "parameter"), built.matrix, {"units": "T m/A"}),
          "nominal": ("parameter", built.nominal, {"units": "A/m"}),
+         "offset": ("reading", built.offset, {"units": "T"}),
          "error": ("reading", built.error, {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error})
@@ -158,7 +169,7 @@ def _read(path: Path, key: str) -> Response | None:
             if data.attrs["key"] != key:
                 return None
             return Response(data["H"].values, tuple(map(str, data["parameter"].values)),
-                            data["nominal"].values, data["error"].values,
+                            data["nominal"].values, data["offset"].values, data["error"].values,
                             float(data.attrs["superposition_error"]), reused=True)
     except (OSError, KeyError, ValueError, RuntimeError):
         return None

@@ -185,7 +185,8 @@ def choose_route(study: Study, points: Floats) -> str:
         raise StudyError(
             f"Input `solver.route` of study {study.name} must be another than "
             "azimuthal_modes here, which needs sectors without angular gaps, of one isotropic "
-            "permeability in each ring, linear iron, and points that are not too near to the blocks. Leave it out.")
+            "permeability in each ring, linear iron, and points that are not too near to the "
+            "blocks. Leave it out.")
     if asked == "auto":
         if study.solver.method == "direct":
             return "edge_elements"

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from importlib import metadata, resources
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -32,7 +33,7 @@ from halbach_fe.solutions import (
     read_solutions,
     read_unknowns,
 )
-from halbach_fe.study import MU_0, Study, curve_of, is_nonlinear
+from halbach_fe.study import MU_0, Study, curve_of
 
 NOMINAL_SOURCE = 0
 FLUX_DENSITY_FILE = "flux_density.txt"
@@ -92,6 +93,8 @@ class Formulation:
         PETSc's.
     numbers : mapping
         Constants of the problem.
+    law : str
+        Which of a curve's laws it solves with: ``reluctivity`` or ``permeability``.
     """
 
     problem: str
@@ -99,6 +102,7 @@ class Formulation:
     flux_density: Callable[[VerifiedMesh, Located, Unknowns], list[sparse.csr_array]]
     options: tuple[str, ...] = runner.DIRECT_SOLVER
     numbers: Mapping[str, float] = field(default_factory=dict)
+    law: str = "reluctivity"
 
 
 def _curl_of_axial(
@@ -116,7 +120,7 @@ def _minus_gradient(
 
 CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda mesh: mesh.inner.nodes, _curl_of_axial)
 SCALAR_POTENTIAL = Formulation("scalar_potential_3d.pro", lambda mesh: mesh.inner.nodes,
-                               _minus_gradient, runner.CONJUGATE_GRADIENTS)
+                               _minus_gradient, runner.CONJUGATE_GRADIENTS, law="permeability")
 
 
 def edge_elements(order: int) -> Formulation:
@@ -156,9 +160,11 @@ def solve_sources(
 
 def solve_tangent(
     study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
-    formulation: Formulation,
+    formulation: Formulation, anywhere: bool = False,
 ) -> tuple[Floats, Floats]:
     """Finite-element part of the field of a magnet with non-linear iron, and its derivative.
+
+    With ``anywhere`` points may lie in magnet and iron.
 
     Returns
     -------
@@ -168,7 +174,7 @@ def solve_tangent(
         There, along the nominal magnetization, then per tesla of each block along each axis: the
         Gateaux problem, with the differential reluctivity dH/dB.
     """
-    case = _case(study, points, blocks, workshop, formulation)
+    case = _case(study, points, blocks, workshop, formulation, anywhere)
 
     def tasks(vacuum: bool, parts: int) -> list[Task]:
         return _source_tasks(case, vacuum, 1) if vacuum else [
@@ -237,15 +243,20 @@ def assemble(study: Study, workshop: Workshop, formulation: Formulation) -> Asse
     blocks = range(len(blocks_of(study)))
     case = _case(study, place, blocks, workshop, formulation)
     last = study.dimension * len(blocks)
-    kept: list[Assembly] = []
+    kept: dict[str, Any] = {}
 
-    def read(folder: Path, unknowns: Unknowns, solutions: NDArray[np.floating]) -> None:
-        kept.append(Assembly(case.mesh, unknowns, read_matrix(
-            folder / MATRIX_FILE, unknowns.count), np.array(solutions, float)))
+    def keep_matrix(folder: Path, unknowns: Unknowns, _: NDArray[np.floating]) -> None:
+        kept["unknowns"] = unknowns
+        kept["matrix"] = read_matrix(folder / MATRIX_FILE, unknowns.count)
         (folder / MATRIX_FILE).unlink()
 
-    run_tasks([_source_task(case, False, (0, last), "", matrix=read)], workshop)
-    return kept[0]
+    def keep_solutions(_: Path, __: Unknowns, solutions: NDArray[np.floating]) -> None:
+        kept["solutions"] = np.array(solutions, float)
+
+    # PETSc writes the matrix at every solve, so one run for it and one for the solutions
+    alone = replace(_source_task(case, False, (0, 0), "-matrix", keep_matrix), matrix=True)
+    run_tasks([alone, _source_task(case, False, (0, last), "", keep_solutions)], workshop)
+    return Assembly(case.mesh, **kept)
 
 
 @dataclass(frozen=True)
@@ -262,13 +273,14 @@ class _Case:
 
 def _case(
     study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
-    formulation: Formulation,
+    formulation: Formulation, anywhere: bool = False,
 ) -> _Case:
     if study.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
     mesh = verify_mesh(build_mesh(study, make_folder(workshop.folder)))
     check_inside(mesh, points)
-    return _Case(study, mesh, locate(mesh, points), blocks, formulation, workshop.time_limit_s)
+    return _Case(study, mesh, locate(mesh, points, anywhere), blocks, formulation,
+                 workshop.time_limit_s)
 
 
 def _difference(
@@ -295,12 +307,15 @@ def _run_variants(
 
 @dataclass(frozen=True)
 class Task:
-    """One GetDP run: how to fill its folder, how to read its answer, how many solves it makes."""
+    """One GetDP run: how to fill its folder, how to read its answer, how many solves it makes,
+    and whether PETSc writes the matrix.
+    """
 
     name: str
     stage: Callable[[Path], Job]
     read: Callable[[Path], Floats]
     solves: int
+    matrix: bool = False
 
 
 def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
@@ -311,6 +326,8 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
     def run(task: Task) -> Floats:
         with _run_folder(workshop.folder, task.name, cancel) as folder:
             job = task.stage(folder)
+            if task.matrix:
+                job = replace(job, matrix=MATRIX_FILE)
             history: list[str] = []
 
             def see(line: str) -> None:
@@ -387,8 +404,9 @@ def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:
 
 def _source_task(
     case: _Case, vacuum: bool, sources: tuple[int, int], suffix: str,
-    matrix: Callable[[Path, Unknowns, NDArray[np.floating]], None] | None = None,
+    keep: Callable[[Path, Unknowns, NDArray[np.floating]], None] | None = None,
 ) -> Task:
+    """The nominal array and sources of a linear problem; ``keep`` sees all solutions."""
     count = sources[1] - sources[0] + 1
     probes, places = probes_of(case.mesh, case.located)
 
@@ -398,17 +416,16 @@ def _source_task(
         printed = _fields(case, unknowns, probes, solutions[:1])[0]
         compare_printed(printed, folder / FLUX_DENSITY_FILE, places)
         result = _fields(case, unknowns, case.located, solutions)
-        if matrix is not None:
-            matrix(folder, unknowns, solutions)
+        if keep is not None:
+            keep(folder, unknowns, solutions)
         (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
         return result
 
-    def fill(folder: Path) -> Job:
-        job = stage(case.study, case.mesh, places, folder, case.formulation, case.blocks, sources,
-                    vacuum, case.time_limit_s)
-        return job if matrix is None else replace(job, matrix=MATRIX_FILE)
-
-    return Task(f"getdp-{_variant(vacuum)}{suffix}", fill, read, count)
+    return Task(
+        name=f"getdp-{_variant(vacuum)}{suffix}",
+        stage=lambda folder: stage(case.study, case.mesh, places, folder, case.formulation,
+                                   case.blocks, sources, vacuum, case.time_limit_s),
+        read=read, solves=count)
 
 
 def _newton_task(
@@ -426,7 +443,7 @@ def _newton_task(
         return replace(
             job, resolution="Newton", solves=max(columns, 1),
             outputs=(*outputs, _saved(case)), solutions=SOLUTIONS_FILE if gateaux else None,
-            numbers=job.numbers | {"TOLERANCE": tolerance, "COLD": cold, "GATEAUX": gateaux})
+            numbers={**job.numbers, "TOLERANCE": tolerance, "COLD": cold, "GATEAUX": gateaux})
 
     def read(folder: Path) -> Floats:
         steps = write_history(folder)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import asdict, dataclass
+import warnings
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, points_in_material
-from halbach_fe.errors import MeasurementError, PointsOutsideError, must_be
+from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference.linear import chi2_per_reading, posterior, predict, prior_conflict
 from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
     Observation,
     held_out,
@@ -30,12 +32,15 @@ from halbach_fe.observation import (
 )
 from halbach_fe.response import Response, response
 from halbach_fe.solve import Workshop
-from halbach_fe.study import Study
+from halbach_fe.study import Study, is_nonlinear
 
 ALL_READINGS = "all"
 """The one region of a study without noise regions."""
 
 TRAINING, HELD_OUT = "training", "held out"
+LINEAR_ENOUGH = 0.3
+"""Of the error bar: what linearizing the iron may move a reading without a word."""
+
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
 
@@ -125,7 +130,8 @@ class Update:
             inside = np.abs(self.readings - prediction.mean)[chosen] <= COVERAGE_Z * total
             figures[f"coverage95_{name}"] = float(np.mean(inside)) if unseen else None
             figures[f"chi2_{name}"] = chi2_per_reading(
-                self.response.matrix[chosen], self.readings[chosen], self.sigma[chosen],
+                self.response.matrix[chosen],
+                (self.readings - self.response.offset)[chosen], self.sigma[chosen],
                 model) if unseen else None
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
@@ -187,13 +193,35 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
     before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                          study.prior.direction_sd_deg, study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
-    after = posterior(model.matrix[~keep], readings[~keep], sigma[~keep], before)
+    linear = (readings - model.offset)[~keep]
+    after = posterior(model.matrix[~keep], linear, sigma[~keep], before)
+    if is_nonlinear(study):
+        _check_linearization(study, observation, workshop, model, after.mean, sigma)
     return Update(
         study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
-        prediction_prior=Prediction(*predict(model.matrix, before)),
-        prediction_posterior=Prediction(*predict(model.matrix, after)),
-        prior_conflict=prior_conflict(model.matrix[~keep], readings[~keep], sigma[~keep], before))
+        prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
+        prior_conflict=prior_conflict(model.matrix[~keep], linear, sigma[~keep], before))
+
+
+def _predict(model: Response, parameters: Gaussian) -> Prediction:
+    mean, sd = predict(model.matrix, parameters)
+    return Prediction(model.offset + mean, sd)
+
+
+def _check_linearization(
+    study: Study, observation: Observation, workshop: Workshop, model: Response, mean: Floats,
+    sigma: Floats,
+) -> None:
+    """Warn if iron is so far from linear that the posterior's readings show it."""
+    folder = replace(workshop, folder=workshop.folder / "posterior")
+    true = newton_readings(study, observation, folder, mean[None])[0]
+    worst = float((np.abs(model.offset + model.matrix @ mean - true) / sigma).max())
+    if worst > LINEAR_ENOUGH:
+        warnings.warn(
+            f"The iron is linearized about the nominal magnet, which moves a reading of the updated"
+            f" one by {worst:.2g} of its error bar: study {study.name} needs the non-linear "
+            "posterior.", HalbachWarning, stacklevel=2)
 
 
 def write_update(update: Update, folder: Path) -> None:

@@ -64,7 +64,9 @@ def test_runs_by_hand_without_options(getdp, staged):
 
 def test_unknown_setnumber(getdp, staged):
     folder, job = staged
-    assert declared_constants(folder) == {"VACUUM", "FIRST_SOURCE", "LAST_SOURCE"}
+    assert declared_constants(folder) == {
+        "VACUUM", "FIRST_SOURCE", "LAST_SOURCE", "TOLERANCE", "MAX_STEPS", "LINE_SEARCH", "COLD",
+        "GATEAUX"}
     with pytest.raises(GetDPError, match="-setnumber VACUM sets a constant that no"):
         run(getdp, dataclasses.replace(job, numbers={"VACUM": 1}), folder)
 

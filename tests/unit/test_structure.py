@@ -12,10 +12,10 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
          for path in (ROOT / folder).rglob("*.py")]
 
 # Later rooms may import earlier ones, never the other way round.
-ORDER = ["errors", "analytic", "study", "blocks", "symmetry", "extent", "regions", "exact_field",
-         "geo", "mesh", "field_map", "getdp", "solutions", "evaluation", "inference", "solve",
-         "azimuthal", "routes", "observation", "discretization", "response", "update",
-         "verification", "report", "cli"]
+ORDER = ["errors", "analytic", "materials", "study", "blocks", "symmetry", "extent", "regions",
+         "exact_field", "geo", "mesh", "field_map", "getdp", "solutions", "evaluation", "condensed",
+         "inference", "solve", "azimuthal", "routes", "observation", "discretization", "response",
+         "nonlinear", "update", "verification", "report", "cli"]
 
 
 def imports(path):
