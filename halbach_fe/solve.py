@@ -134,7 +134,7 @@ def edge_elements(order: int) -> Formulation:
 
 def solve_sources(
     study: Study, points: Floats, blocks: Sequence[int], workshop: Workshop,
-    formulation: Formulation,
+    formulation: Formulation, anywhere: bool = False,
 ) -> Floats:
     """Finite-element part of the field of the nominal array and of single blocks, iron being
     linear.
@@ -148,13 +148,15 @@ def solve_sources(
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
         Numbers, from 0, of the blocks to solve for with 1 T along each axis.
+    anywhere : bool
+        Whether points may lie in magnet and iron.
 
     Returns
     -------
     ndarray, shape (1 + D len(blocks), n, 3), in T
         The nominal array, then block by block, axis by axis.
     """
-    case = _case(study, points, blocks, workshop, formulation)
+    case = _case(study, points, blocks, workshop, formulation, anywhere)
     return _difference(study, workshop, lambda vacuum, parts: _source_tasks(case, vacuum, parts))
 
 

@@ -364,6 +364,15 @@ class Inference(_Model):
     held_out: HeldOut | None = None
 
 
+class Plan(_Model):
+    """What `halbach-fe plan` chooses from (default: the observation's positions), and how many
+    points (default: as many as the observation has).
+    """
+
+    points: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    candidates: tuple[Positions, ...] = ()
+
+
 class Solver(_Model):
     """``reaction``: exact field of the blocks plus the finite-element reaction of permeability
     and iron. ``direct``: the finite-element field as it is.
@@ -397,6 +406,7 @@ class Study(_Model):
     noise: Noise | None = None
     prior: Prior = Prior()
     inference: Inference = Inference()
+    plan: Plan = Plan()
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:

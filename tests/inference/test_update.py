@@ -13,7 +13,7 @@ from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.errors import MeasurementError, StudyError
 from halbach_fe.field_map import field_map
-from halbach_fe.report import write_report
+from halbach_fe.report.inference import write_report
 from halbach_fe.study import MU_0
 from halbach_fe.update import infer, write_update
 from tests.conftest import circle

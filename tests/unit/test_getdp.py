@@ -149,7 +149,7 @@ def test_stale_output(getdp, staged):
 
 def test_unset_run_time_variable(getdp, staged):
     folder, job = staged
-    edit(folder / "solve_sources.pro", "Evaluate[ $source = FIRST_SOURCE ];", "")
+    edit(folder / "solve_sources.pro", "Evaluate[ $source = FIRST_SOURCE, $sample = 0 ];", "")
     with pytest.raises(GetDPError, match=r"run-time variable was never set"):
         run(getdp, job, folder)
 

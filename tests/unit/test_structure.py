@@ -15,7 +15,7 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 ORDER = ["errors", "analytic", "materials", "study", "blocks", "symmetry", "extent", "regions",
          "exact_field", "geo", "mesh", "field_map", "getdp", "solutions", "evaluation", "condensed",
          "inference", "solve", "azimuthal", "routes", "observation", "discretization", "response",
-         "nonlinear", "update", "verification", "report", "cli"]
+         "nonlinear", "update", "planning", "sensitivity", "verification", "report", "cli"]
 
 
 def imports(path):

@@ -1,27 +1,28 @@
-"""Figures and the HTML page of an update. The only module that plots."""
+"""Figures and the HTML page of an update."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata, resources
 from pathlib import Path
 
-import jinja2
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.field_map import atomic
-from halbach_fe.update import COVERAGE_Z, HELD_OUT, Update, write_text
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    axes_along,
+    save,
+    write_page,
+)
+from halbach_fe.update import COVERAGE_Z, HELD_OUT, Update
 
-# Okabe and Ito's colours, told apart by every kind of colour vision
 NOTHING = "–"
-PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 
 
 @dataclass(frozen=True)
@@ -82,22 +83,11 @@ def write_report(
         "blocks.png": (_blocks(update), "Posterior change of the magnetization along the easy "
                        "axis by ring and slot"),
     }
-    pictures = []
-    for name, (figure, text) in figures.items():
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=130)
-        with atomic(folder / name) as temporary:
-            temporary.write_bytes(buffer.getvalue())
-        pictures.append((base64.b64encode(buffer.getvalue()).decode(), text))
-    template = resources.files("halbach_fe").joinpath("report.html.j2").read_text("utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined,
-                                     trim_blocks=True, lstrip_blocks=True)
     array = update.study.array
-    page = environment.from_string(template).render(
-        update=update, rows=score_table(update, published), pictures=pictures,
-        assumptions=assumptions, version=metadata.version("halbach-fe"), array=array,
+    write_page(
+        folder / "report.html", "inference.html.j2", save(figures, folder), update=update,
+        rows=score_table(update, published), assumptions=assumptions, array=array,
         remanence=blocks_of(update.study)[0].remanence, conflict=_conflict(update))
-    write_text(folder / "report.html", page)
 
 
 def _conflict(update: Update) -> str:
@@ -121,15 +111,6 @@ def _z_of(update: Update, region: str, part: str) -> Floats:
     return update.observation.positions[mask, 2]
 
 
-def _axes(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(8, 2.4 + 1.7 * rows), layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=True, squeeze=False,
-                           gridspec_kw={"height_ratios": ratios or [1] * rows})
-    for axis in axes[:, 0]:
-        axis.grid(alpha=0.3)
-    return figure, list(axes[:, 0])
-
-
 def _first_label(update: Update) -> tuple[str, Floats, np.ndarray[tuple[int], np.dtype[np.intp]]]:
     """The readings that a figure along z shows: all of the first label, in order of z."""
     label = update.observation.labels[0]
@@ -141,7 +122,7 @@ def _first_label(update: Update) -> tuple[str, Floats, np.ndarray[tuple[int], np
 
 def _profile(update: Update) -> Figure:
     label, z, index = _first_label(update)
-    figure, (top, bottom) = _axes(2, [2, 1])
+    figure, (top, bottom) = axes_along(2, [2, 1])
     held = update.held_out[index]
     measured = update.readings[index]
     top.plot(z, update.prediction_prior.mean[index], color=PRIOR, label="prior", lw=1.2)
@@ -165,7 +146,7 @@ def _profile(update: Update) -> Figure:
 
 def _relative_error(update: Update, published: Published | None) -> Figure:
     label, z, index = _first_label(update)
-    figure, (axis,) = _axes(1)
+    figure, (axis,) = axes_along(1)
     figure.set_size_inches(8, 4.5)
     held = update.held_out[index]
     if published is not None:

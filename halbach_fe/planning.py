@@ -1,0 +1,123 @@
+"""A measurement plan: the positions that tell most about a study's magnetizations, compared with
+the positions of the study.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import StudyError
+from halbach_fe.inference.design import greedy, information
+from halbach_fe.inference.linear import posterior
+from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.observation import observe, points_from, standard_deviations
+from halbach_fe.response import response
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study
+
+
+@dataclass(frozen=True)
+class MeasurementPlan:
+    """Positions chosen one after another, and what they and the study's own tell.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+    candidates, points, baseline : ndarray, shape (n, 3), in m
+        What was chosen from, what was chosen, in order, and the study's positions.
+    gain, baseline_gain : ndarray
+        Expected information in nats after every chosen position; and after as many of the study's
+        positions, spread evenly.
+    nominal, prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
+        Nominal magnetization; sd before, after the plan, and after as many of the study's
+        positions.
+    """
+
+    parameters: tuple[str, ...]
+    candidates: Floats
+    points: Floats
+    baseline: Floats
+    gain: Floats
+    baseline_gain: Floats
+    nominal: Floats
+    prior_sd: Floats
+    planned_sd: Floats
+    baseline_sd: Floats
+
+    @property
+    def same_information(self) -> int | None:
+        """How many chosen positions tell as much as all of the study's; None if all tell less."""
+        enough = np.flatnonzero(self.gain >= self.baseline_gain[-1])
+        return int(enough[0]) + 1 if len(enough) else None
+
+    @property
+    def volume_ratio(self) -> float:
+        """Mean sd (geometric, over the posterior's axes) after the plan over that after as many of
+        the study's positions.
+        """
+        count = min(len(self.gain), len(self.baseline_gain)) - 1
+        difference = self.gain[count] - self.baseline_gain[count]
+        return float(np.exp(-difference / len(self.parameters)))
+
+
+def plan(study: Study, workshop: Workshop, count: int | None = None) -> MeasurementPlan:
+    """Choose positions for a study's next measurement.
+
+    Parameters
+    ----------
+    count : int, optional
+        How many; default the study's ``plan.points``, else as many as the study measures.
+
+    Raises
+    ------
+    StudyError
+        If there are fewer candidates, or the study does not observe flux densities.
+    """
+    if study.observation.quantity != "flux_density":
+        raise StudyError(
+            f"Input `observation.quantity` of study {study.name} must be flux_density for a plan; "
+            f"instead it is {study.observation.quantity}. Plan the points first.")
+    baseline = points_from(study.observation.positions)
+    sets = study.plan.candidates or (study.observation.positions,)
+    candidates = np.unique(np.round(np.vstack([points_from(one) for one in sets]), 9), axis=0)
+    wanted = count or study.plan.points or len(baseline)
+    if wanted > len(candidates):
+        raise StudyError(
+            f"Input `plan.points` of study {study.name} must be at most the number of candidates, "
+            f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
+    points = np.vstack([baseline, candidates])
+    observation = observe(study, points, np.ones_like(points, bool))
+    model = response(study, observation, workshop)
+    noise = standard_deviations(study, observation, xr.Dataset())
+    prior = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
+                        study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    sigma = np.hypot(noise, model.error)
+    size = len(observation) // len(points)  # readings at a point
+    whitened = ((model.matrix @ prior.root) / sigma[:, None]).reshape(len(points), size, -1)
+    chosen, gain = greedy(whitened[len(baseline):], wanted)
+    own = [information(np.vstack(whitened[spread(len(baseline), number)]))
+           for number in range(1, len(baseline) + 1)]
+    rows = np.arange(len(observation)).reshape(len(points), size)
+
+    def sd_after(positions: Floats) -> Floats:
+        index = rows[positions].ravel()
+        return _posterior(model.matrix[index], sigma[index], prior).sd
+
+    return MeasurementPlan(
+        model.parameters, candidates, candidates[chosen], baseline, gain, np.array(own),
+        model.nominal, prior.sd, sd_after(chosen + len(baseline)),
+        sd_after(spread(len(baseline), min(wanted, len(baseline)))))
+
+
+def spread(total: int, count: int) -> Floats:
+    """``count`` of ``total`` indices, evenly."""
+    return np.floor(np.arange(count) * total / count).astype(int)
+
+
+def _posterior(matrix: Floats, sigma: Floats, prior: Gaussian) -> Gaussian:
+    """What remains to be known; it does not depend on the readings."""
+    return posterior(matrix, matrix @ prior.mean, sigma, prior)

@@ -1,0 +1,1 @@
+"""Figures and HTML pages. The only room that plots."""

@@ -1,0 +1,41 @@
+"""How the field answers a change of one block: the Gateaux derivative, anywhere in the plane."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.errors import StudyError
+from halbach_fe.routes import choose_route, formulation_of
+from halbach_fe.solve import Workshop, solve_sources, solve_tangent
+from halbach_fe.study import MU_0, Study, is_nonlinear
+
+
+def derivative(study: Study, block: int, points: Floats, workshop: Workshop) -> Floats:
+    """Derivative of B along the nominal magnetization of a block, iron at its operating point.
+
+    Parameters
+    ----------
+    block : int
+        Number of the block, from 0.
+    points : ndarray, shape (n, 3), in m
+        Anywhere inside the boundary, magnet and iron included.
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T m/A
+    """
+    blocks = blocks_of(study)
+    if not 0 <= block < len(blocks):
+        raise StudyError(f"Input block of study {study.name} must be one of its {len(blocks)}; "
+                         f"instead received {block + 1}.")
+    direct = study.model_copy(update={  # the field in materials has no exact form
+        "solver": study.solver.model_copy(update={"method": "direct"})})
+    formulation = formulation_of(direct, choose_route(direct, points))
+    if is_nonlinear(study):
+        fields = solve_tangent(direct, points, (block,), workshop, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), workshop, formulation, anywhere=True)
+    size, one = study.dimension, blocks[block]
+    remanence = MU_0 * one.recoil_tensor @ np.array(one.easy_axis)  # of 1 A/m
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])
