@@ -17,6 +17,7 @@ from halbach_fe.errors import StudyError
 from halbach_fe.study import MU_0, Array, Study
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from halbach_fe.blocks import Ints
 from halbach_fe.errors import GetDPError
-
-Ints = NDArray[np.int64]
 
 _VECTOR = 1211214  # PETSc's class identifier
 _UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for

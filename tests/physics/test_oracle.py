@@ -11,18 +11,10 @@ from halbach_fe.observation import points_from
 from halbach_fe.routes import choose_route, finite_element_part
 from halbach_fe.study import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
+from tests.oracles import dipole_of
 from tests.oracles import ngsolve_model as oracle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
-
-
-def dipole_of(study):
-    array, iron = study.array, study.iron_ring
-    return oracle.Dipole(
-        array.blocks_per_ring, array.inner_radius_m, array.outer_radius_m,
-        array.rings * array.ring_length_m, blocks_of(study)[0].remanence,
-        array.recoil_permeability,
-        iron=iron and (iron.inner_radius_m, iron.outer_radius_m, iron.relative_permeability))
 
 
 @pytest.mark.parametrize("with_iron", [True, False], ids=["iron", "air"])
