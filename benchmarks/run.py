@@ -13,7 +13,7 @@ import platform
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import magpylib
@@ -29,11 +29,13 @@ from halbach_fe.getdp import find_getdp
 from halbach_fe.inference.prior import block_prior
 from halbach_fe.observation import observe, points_from
 from halbach_fe.response import Response, response
-from halbach_fe.routes import finite_element_part
+from halbach_fe.routes import exact_part, finite_element_part
 from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, read_study
+from halbach_fe.study import Study, parse_study, read_study
 from halbach_fe.update import write_text
 from halbach_fe.verification import verify
+from tests.conftest import changed
+from tests.oracles import dipole_of
 from tests.oracles import ngsolve_model as oracle
 
 HERE = Path(__file__).parent
@@ -42,17 +44,6 @@ COLUMNS_BY_PROCESS = 2
 ORACLE_POINTS = 13  # every 13th point of the map is compared with NGSolve
 
 Note = Callable[[str, float, str, str], None]
-
-
-def changed(study: Study, **sections: Mapping[str, object] | None) -> Study:
-    """The study with keys of some sections changed; None removes a section."""
-    document = study.model_dump(exclude_none=True)
-    for name, change in sections.items():
-        if change is None:
-            document.pop(name, None)
-        else:
-            document[name] = document.get(name, {}) | dict(change)
-    return Study.model_validate(document)
 
 
 def built(study: Study, points: np.ndarray, folder: Path) -> tuple[Response, float]:
@@ -76,30 +67,12 @@ def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
     dipole = dipole_of(study)
     some = points[::ORACLE_POINTS]
     ours = finite_element_part(study, some, workshop, columns=False).nominal
-    main_field = float(np.abs(array_field(study, some, ours)).max())
+    main_field = float(np.abs(exact_part(study, some) + ours).max())
     with ngsolve.TaskManager():
         theirs = oracle.vector_potential(dipole, oracle.eighth(dipole, 0.02), 4, some)
     note("response.error_against_ngsolve",
          float(np.linalg.norm(ours - theirs, axis=1).max()) / main_field, "of the main field",
          f"NGSolve, curl-curl of order 4 in 3D, curved; {len(some)} points, fringe included")
-
-
-def dipole_of(study: Study) -> oracle.Dipole:
-    """The study's numbers for the oracle."""
-    array, iron = study.array, study.iron_ring
-    assert iron is not None
-    return oracle.Dipole(
-        array.blocks_per_ring, array.inner_radius_m, array.outer_radius_m,
-        array.rings * (array.ring_length_m or 0.0), blocks_of(study)[0].remanence,
-        array.recoil_permeability,
-        iron=(iron.inner_radius_m, iron.outer_radius_m, iron.relative_permeability))
-
-
-def array_field(study: Study, points: np.ndarray, reaction: np.ndarray) -> np.ndarray:
-    """B of the nominal array, (n, 3) in T."""
-    from halbach_fe.exact_field import field_of
-
-    return field_of(blocks_of(study), points) + reaction
 
 
 def matrix_error(study: Study, points: np.ndarray, base: Response, folder: Path) -> float:
@@ -187,17 +160,20 @@ def against_ngsolve(
 
 def symmetry(study: Study, folder: Path, note: Note) -> None:
     """Two rings of trapezoids on a 3D mesh, every column solved against those by symmetry."""
-    short = changed(study, iron_ring=None, array={
-        "rings": 2, "block": {"shape": "trapezoid", "side_gap_m": 0.001}}, mesh={
-        "block_size_m": 0.04, "bore_size_m": 0.05, "growth": 2.0, "layers_per_ring": 2},
-        observation={"positions": {"kind": "circles", "radius_m": 0.06, "angles": 12,
-                                   "z_min_m": -0.2, "z_max_m": 0.2, "count": 9}})
+    document = changed(
+        study.model_dump(exclude_none=True), iron_ring=None, array__rings=2,
+        array__block={"shape": "trapezoid", "side_gap_m": 0.001}, mesh__block_size_m=0.04,
+        mesh__bore_size_m=0.05, mesh__growth=2.0, mesh__layers_per_ring=2,
+        observation__positions={"kind": "circles", "radius_m": 0.06, "angles": 12,
+                                "z_min_m": -0.2, "z_max_m": 0.2, "count": 9})
+    short = parse_study(document)
     points = points_from(short.observation.positions)
     workshop = Workshop(find_getdp(), folder, jobs=2)
     fields, seconds = [], []
     for used in (True, False):
         started = time.monotonic()
-        parts = finite_element_part(changed(short, solver={"symmetry": used}), points, workshop)
+        variant = parse_study(changed(document, solver__symmetry=used))
+        parts = finite_element_part(variant, points, workshop)
         fields.append(sum(parts.block(n) @ (np.array(b.easy_axis) * b.remanence)
                           for n, b in enumerate(blocks_of(short))))
         seconds.append(time.monotonic() - started)

@@ -13,17 +13,14 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
-from numpy.typing import NDArray
 
 from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, blocks_of, iron_half_length, ring_limits
+from halbach_fe.blocks import Floats, Ints, blocks_of, iron_half_length, ring_limits
 from halbach_fe.extent import boundary_half_length, boundary_radius
 from halbach_fe.geo.cross_section import draw, regions_of
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
-
-Ints = NDArray[np.int64]
 
 TRIANGLE6, TETRAHEDRON10 = 9, 11  # Gmsh's element types
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))

@@ -16,11 +16,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats, MagnetBlock, array_half_length, blocks_of, position_angle_deg
+from halbach_fe.blocks import (
+    Floats,
+    Ints,
+    MagnetBlock,
+    array_half_length,
+    blocks_of,
+    position_angle_deg,
+)
 from halbach_fe.evaluation import Located, coordinates, locate, nodal_operators, probes_of
 from halbach_fe.getdp import Job
 from halbach_fe.mesh import Entities, VerifiedMesh, build_meridian, verify_mesh
-from halbach_fe.solutions import Ints, read_solutions, read_unknowns
+from halbach_fe.solutions import read_solutions, read_unknowns
 from halbach_fe.solve import (
     SOLUTIONS_FILE,
     Task,

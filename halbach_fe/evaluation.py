@@ -14,10 +14,10 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import PointsOutsideError
 from halbach_fe.mesh import VerifiedMesh
-from halbach_fe.solutions import Ints, Unknowns
+from halbach_fe.solutions import Unknowns
 
 SEARCHES = ((12, 1e-8), (128, 1e-8), (1024, 1e-8), (128, 0.05))
 """How a point is looked for: in so many elements, by distance of their middle, and how far outside,

@@ -27,8 +27,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from halbach_fe.blocks import Edge, Floats, MagnetBlock, Outline
-from halbach_fe.symmetry import Frame, Ints, frame_of, turn_matrix, unique_points
+from halbach_fe.blocks import Edge, Floats, Ints, MagnetBlock, Outline
+from halbach_fe.symmetry import Frame, frame_of, turn_matrix, unique_points
 
 _ORDER = 12
 _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB

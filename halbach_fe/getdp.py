@@ -171,7 +171,8 @@ def run(
         arguments += ["-setnumber", name, f"{value:.17g}"]
     written = job.outputs
     if job.solutions is not None:
-        arguments += ["-ksp_view_solution", f"binary:{job.solutions}::append"]
+        arguments += ["-ksp_view_solution", f"binary:{job.solutions}::append",
+                      "-viewer_binary_skip_info"]  # PETSc's own note of the options beside it
         written = (*written, job.solutions)
     if job.matrix is not None:
         arguments += ["-ksp_view_mat", f"binary:{job.matrix}"]

@@ -15,11 +15,10 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import MeshError, OutputError
 from halbach_fe.regions import Regions
 from halbach_fe.study import Study
-
-Ints = NDArray[np.int64]
 
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
@@ -80,7 +79,7 @@ class VerifiedMesh:
 
     path: Path
     regions: Regions
-    points: NDArray[np.float64]
+    points: Floats
     cells: Ints
     cell_type: str
     in_air: NDArray[np.bool_]
@@ -200,7 +199,7 @@ def _read(path: Path) -> meshio.Mesh:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
 
 
-def _on(mesh: meshio.Mesh, physical: list[NDArray[np.int64]], tag: int) -> tuple[str, Ints]:
+def _on(mesh: meshio.Mesh, physical: list[Ints], tag: int) -> tuple[str, Ints]:
     """Type and elements of a part of the boundary."""
     parts = [(c.type, c.data[tags == tag]) for c, tags in zip(mesh.cells, physical, strict=True)
              if (tags == tag).any()]

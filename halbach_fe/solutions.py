@@ -13,10 +13,8 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import GetDPError
-
-Ints = NDArray[np.int64]
 
 _VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
 _UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for

@@ -11,12 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats, MagnetBlock, Outline, blocks_of
+from halbach_fe.blocks import Floats, Ints, MagnetBlock, Outline, blocks_of
 from halbach_fe.study import Study
-
-Ints = NDArray[np.int64]
 
 _ROUNDING = 1e-12  # m; coordinates nearer than this are one point
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

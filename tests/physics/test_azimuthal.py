@@ -38,7 +38,7 @@ def columns_in_vacuum(study, points):
 def test_every_column_against_its_exact_field(modes, workshop):
     """Without permeability B itself, by modes, is the exact field: place, sign, all axes.
 
-    Second-order elements: measured 1.5 % of the largest value of each column's own axis, rms 0.3 %.
+    Second-order elements: measured 0.55 % of the largest value of each column, rms 0.06 %.
     """
     study = modes(array__recoil_permeability=1.0, solver__method="direct")
     points = np.vstack([POINTS, AXIS])
@@ -46,7 +46,7 @@ def test_every_column_against_its_exact_field(modes, workshop):
     exact = columns_in_vacuum(study, points)
     scale = np.abs(exact).max(axis=(1, 2))
     error = np.abs(found - exact).max(axis=(1, 2)) / scale
-    assert error.max() < 0.03
+    assert error.max() < 0.015
     wrong = np.roll(exact, 3, axis=0)  # negative control: neighbours exchanged
     assert (np.abs(found - wrong).max(axis=(1, 2)) / scale).min() > 0.1
 
@@ -82,24 +82,28 @@ def test_reaction_against_3d_routes(modes, workshop, route, cap):
 
 @pytest.mark.parametrize("iron", [None, IRON], ids=["air", "iron"])
 def test_middle_of_a_long_array_against_closed_form(modes, workshop, iron):
-    """2.4 m long, the ends change the middle by some 1e-5; measured error 4e-5 and 7e-5."""
-    study = modes(array__rings=16, array__ring_length_m=0.15, iron_ring=iron)
+    """4.8 m long, the ends hardly change the middle: measured 4.5e-5 (air) and 8e-6 (iron), along
+    z 3e-8. In air half the length has 4 times as much on any mesh: the reaction's moment ends.
+    """
+    study = modes(array__rings=16, array__ring_length_m=0.3, iron_ring=iron)
     points = circle(0.07, 9, 0.01)
     tube = None if iron is None else (0.19, 0.2, 1000.0)
     expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
                                   1.05, points[:, :2], tube)
     found = solve_nominal(study, points, workshop)
-    assert np.abs(found[:, :2] - expected).max() < 2e-4 * np.abs(expected).max()
-    assert np.abs(found[:, 2]).max() < 2e-4 * np.abs(expected).max()
+    assert np.abs(found[:, :2] - expected).max() < 1.2e-4 * np.abs(expected).max()
+    assert np.abs(found[:, 2]).max() < 1e-7 * np.abs(expected).max()
 
 
 def test_refinement_converges(modes, workshop):
-    """The nominal field with iron on three meshes: each step is at least twice smaller."""
+    """The nominal field with iron on three meshes: each step is at least twice smaller.
+    Measured 8.8e-5 and 4.1e-5 of the field.
+    """
     fields = [solve_nominal(modes(iron_ring=IRON, mesh__meridian_size_m=size), POINTS, workshop)
               for size in (0.04, 0.02, 0.01)]
     steps = [np.abs(b - a).max() for a, b in pairwise(fields)]
     assert steps[1] < steps[0] / 2
-    assert steps[1] < 3e-4 * np.abs(fields[-1]).max()
+    assert steps[1] < 1.2e-4 * np.abs(fields[-1]).max()
 
 
 def test_superposition_of_rings(modes, workshop):
@@ -110,23 +114,27 @@ def test_superposition_of_rings(modes, workshop):
 
 
 def test_ring_gaps_and_turned_arrays(modes, workshop):
-    """A gap between rings is still symmetric; first angles need not be multiples of the pitch."""
+    """A gap between rings is still symmetric; first angles need not be multiples of the pitch.
+    Measured 5e-4.
+    """
     study = modes(array__ring_gap_m=0.01, array__recoil_permeability=1.0, solver__method="direct",
                   array__first_block_angle_deg=17.0, array__first_magnetization_angle_deg=71.0)
     found = azimuthal.solve_modes(study, POINTS, (), workshop)[0]
     exact = field_of(blocks_of(study), POINTS)
-    assert np.abs(found - exact).max() < 0.02 * np.abs(exact).max()
+    assert np.abs(found - exact).max() < 1.5e-3 * np.abs(exact).max()
 
 
 @pytest.mark.parametrize("slot", [1, 4, 5])
 def test_one_block_of_another_remanence(modes, workshop, slot):
-    """It excites all modes, 0 among them; without permeability B itself is the exact field."""
+    """It excites all modes, 0 among them; without permeability B itself is the exact field.
+    Measured 3.5e-4 to 7.3e-4.
+    """
     study = modes(array__recoil_permeability=1.0, solver__method="direct",
                   array__exceptions=[{"ring": 1, "slot": slot, "remanence_T": 1.9}])
     found = solve_nominal(study, POINTS, workshop)
     exact = field_of(blocks_of(study), POINTS)
     ordinary = field_of(blocks_of(modes(array__recoil_permeability=1.0)), POINTS)
-    assert np.abs(found - exact).max() < 0.01 * np.abs(exact).max()
+    assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
     assert np.abs(found - ordinary).max() > 0.03 * np.abs(exact).max()
 
 

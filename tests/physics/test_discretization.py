@@ -54,7 +54,8 @@ def test_bars_shrink_with_the_mesh(dipole, workshop):
 
 def test_dual_formulations_bracket_the_modes(short_dipole, workshop):
     """In 3D the bar is the difference of the dual formulations; the azimuthal modes, far more
-    exact, lie within it nearly everywhere.
+    exact, lie within it nearly everywhere (measured: at all readings of these, at 98 % of others),
+    and it is short beside the reaction (measured 12 %).
     """
     changes = {"mesh": {"block_size_m": 0.03, "layers_per_ring": 3, "growth": 1.5}}
     study = short_dipole(solver__route="scalar_potential", **changes)
@@ -64,8 +65,8 @@ def test_dual_formulations_bracket_the_modes(short_dipole, workshop):
     stated = reading_errors(study, observation, part, workshop)
     truth = finite_element_part(short_dipole(mesh__meridian_size_m=0.01), points, workshop,
                                 columns=False).nominal
-    assert np.mean(np.abs(part - truth).ravel() <= stated) > 0.9
-    assert stated.max() < 0.5 * np.abs(part).max()
+    assert np.mean(np.abs(part - truth).ravel() <= stated) > 0.95
+    assert stated.max() < 0.3 * np.abs(part).max()
 
 
 def test_the_error_is_part_of_the_inference(dipole, workshop):

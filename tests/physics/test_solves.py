@@ -26,14 +26,14 @@ def error_2d(study, workshop, expected, points):
 
 @pytest.mark.parametrize("iron", [None, IRON], ids=["air", "iron"])
 def test_cross_section_against_layered_closed_form(dipole, workshop, iron):
-    """Permeability and iron; caps are 3 times what was measured on this mesh."""
+    """Permeability and iron; caps are 3 times what was measured on this mesh: 3.2e-3, 9e-5."""
     points = circle(0.075)
     tube = None if iron is None else (0.19, 0.2, 1000.0)
     expected = layered_bore_field(SECTORS, 0.104, 0.1865, 1.05, points[:, :2], tube)
     errors = {method: error_2d(dipole(iron_ring=iron, solver={"method": method}), workshop,
                                expected, points) for method in ("direct", "reaction")}
-    assert errors["direct"] < 1.5e-2
-    assert errors["reaction"] < 4e-4
+    assert errors["direct"] < 1e-2
+    assert errors["reaction"] < 3e-4
     assert errors["reaction"] < errors["direct"] / 5
 
 
@@ -48,7 +48,7 @@ def test_order_of_convergence(dipole, workshop):
     """Second-order triangles: B converges at order 2 in the element size, and gets small.
 
     Meshes are unstructured, so the slope between two of them scatters by some tenths; over a
-    factor of four in size it must reach 1.6.
+    factor of four in size it must reach 1.6. Measured 1.87, and an error of 2.4e-4.
     """
     points = circle(0.075)
     expected = bore_field(SECTORS, 0.104, 0.1865, points[:, :2])
@@ -57,7 +57,7 @@ def test_order_of_convergence(dipole, workshop):
               for size in (0.024, 0.006)]
     order = np.log(errors[0] / errors[1]) / np.log(4)
     assert order > 1.6
-    assert errors[1] < 1e-3
+    assert errors[1] < 7e-4
 
 
 def test_order_check_fails_on_a_stagnating_error(dipole, workshop):
@@ -71,8 +71,8 @@ def test_order_check_fails_on_a_stagnating_error(dipole, workshop):
 
 
 def in_bore(count=200):
-    """Random points of the bore: B is constant along z in an element, so that points at the
-    middles of layers would look too good, and points at their limits too bad.
+    """Random points of the bore: B of the lowest order is constant in a tetrahedron, so that points
+    near the middles of elements would look too good, and points at their limits too bad.
     """
     generator = np.random.default_rng(5)
     radius, angle = 0.06 * np.sqrt(generator.random(count)), 2 * np.pi * generator.random(count)
@@ -83,7 +83,7 @@ def in_bore(count=200):
 def test_3d_ring_against_magpylib_and_exact_field(short_dipole, workshop):
     """Lowest-order edge elements on a coarse mesh: some per cent, and the right sign and axes.
 
-    Measured 0.175 and 0.037 of the largest field; a fine mesh is for `method = "reaction"`.
+    Measured 0.22 and, rms, 0.044 of the largest field; a fine mesh is for `method = "reaction"`.
     """
     study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"})
     points = in_bore()
@@ -98,7 +98,7 @@ def test_3d_ring_against_magpylib_and_exact_field(short_dipole, workshop):
 def test_3d_error_falls_with_refinement(short_dipole, workshop):
     """First order in B: halving every size must take at least a third off, down to a cap.
 
-    Measured 0.037, 0.020 (and 0.013 at a third of the size).
+    Measured 0.043 and 0.020, rms.
     """
     points = in_bore()
     errors = []
@@ -115,7 +115,8 @@ def test_3d_error_falls_with_refinement(short_dipole, workshop):
 def test_3d_one_block_all_components(short_dipole, workshop):
     """A unit source along x, y and z of one block: each against its exact field.
 
-    Measured: 0.05 to 0.10 of the largest value; against the field of another axis 0.2 to 0.4.
+    Measured, rms: 0.06 to 0.10 of the largest value; against the field of another axis 0.19 to
+    0.47.
     """
     study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"})
     points, number = in_bore(), 5
@@ -136,7 +137,7 @@ def test_reaction_in_3d_reduces_the_field_as_it_should(short_dipole, workshop):
     expected = layered_bore_field(SECTORS, 0.104, 0.1865, 1.05, points[:, :2])
     found = solve_nominal(study, points, workshop)[:, :2]
     vacuum = field_of(blocks_of(study), points)[:, :2]
-    # The whole reaction is 2.5 %; this mesh has it to a tenth, the exact part is exact.
+    # The whole reaction is 2.4 %; this mesh has it to 7 % (1.6e-3), the exact part is exact.
     assert np.abs(found - expected).max() < 0.004 * np.abs(expected).max()
     assert np.abs(vacuum - expected).max() > 0.015 * np.abs(expected).max()
 

@@ -7,6 +7,8 @@ import pytest
 
 from halbach_fe.blocks import blocks_of
 from halbach_fe.exact_field import unit_field, unit_fields
+from halbach_fe.observation import observe
+from halbach_fe.response import response
 from halbach_fe.routes import choose_route, finite_element_part
 from halbach_fe.symmetry import Placement, frame_of, no_symmetry, symmetry_of, unique_points
 from tests.conftest import circle
@@ -34,8 +36,9 @@ def test_modes_reduced_equal_unreduced(short_dipole, workshop, rings):
 
 @pytest.mark.parametrize("block", [{"shape": "trapezoid", "side_gap_m": 0.002}])
 def test_3d_reduced_agree_with_unreduced(short_dipole, workshop, block):
-    """On a mesh without symmetry they agree to its error: measured 17 % of the largest reaction of
-    a block, 7 % rms on these coarse elements. A wrong sign or place is 100 % away.
+    """On a mesh without symmetry they agree to its error: measured 8 % of the largest reaction of
+    a block, 6 % rms on these coarse elements. Axes exchanged are 49 % away, wrong places and signs
+    99 % and more.
     """
     changes = {"array__block": block, "array__recoil_permeability": 1.2,
                "array__blocks_per_ring": 6, "mesh__block_size_m": 0.05, "mesh__growth": 2.5}
@@ -43,11 +46,18 @@ def test_3d_reduced_agree_with_unreduced(short_dipole, workshop, block):
     reduced = fields(short_dipole(**changes), workshop)
     plain = fields(short_dipole(solver__symmetry=False, **changes), workshop)
     scale = np.abs(plain).max()
-    assert np.abs(reduced - plain).max() < 0.3 * scale
+    assert np.abs(reduced - plain).max() < 0.2 * scale
     assert np.sqrt(np.mean((reduced - plain) ** 2)) < 0.15 * np.sqrt(np.mean(plain**2))
     for wrong in (-plain, np.roll(plain, 1, axis=0), plain.swapaxes(2, 3),
                   plain.reshape(2, 6, *plain.shape[1:])[::-1].reshape(plain.shape)):
         assert np.sqrt(np.mean((reduced - wrong) ** 2)) > 0.45 * np.sqrt(np.mean(plain**2))
+
+
+def test_lowest_order_on_a_coarse_mesh_is_not_taken_for_a_wrong_column(short_dipole, workshop):
+    """Edge elements of order 1, placed by symmetry, miss the array by 11 % here."""
+    study = short_dipole(solver__method="direct")
+    built = response(study, observe(study, POINTS, np.ones(POINTS.shape, bool)), workshop)
+    assert 0.05 < built.superposition_error < 0.25
 
 
 def test_what_is_a_symmetry(short_dipole):
@@ -77,7 +87,9 @@ def test_blocks_of_other_permeability_take_a_3d_route(short_dipole):
 
 
 def test_an_exceptional_ring_in_modes_and_in_3d(short_dipole, workshop):
-    """One ring of mu_r 1.4: its reaction by two routes, and not that of the ordinary array."""
+    """One ring of mu_r 1.4: its reaction by two routes, measured 2.2 % apart, and not that of the
+    ordinary array, 69 % away.
+    """
     changes = {"array__exceptions": [{"ring": 1, "recoil_permeability": 1.4, "remanence_T": 0.9}],
                "mesh__growth": 1.5}
 

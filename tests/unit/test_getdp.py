@@ -24,7 +24,13 @@ from halbach_fe.getdp import (
     run,
 )
 from halbach_fe.mesh import build_mesh, verify_mesh
-from halbach_fe.solve import CROSS_SECTION, FLUX_DENSITY_FILE, edge_elements, stage
+from halbach_fe.solve import (
+    CROSS_SECTION,
+    FLUX_DENSITY_FILE,
+    SOLUTIONS_FILE,
+    edge_elements,
+    stage,
+)
 from tests.conftest import circle
 
 POINTS = circle(0.07, 5)
@@ -54,6 +60,15 @@ def test_a_sound_run_passes(getdp, staged):
     field = read_vectors(folder / FLUX_DENSITY_FILE, POINTS)
     assert field.shape == (5, 3)
     assert (folder / "getdp.log").read_text().startswith("magnetostatics_2d.pro -msh mesh.msh")
+
+
+def test_a_run_leaves_nothing_else(getdp, staged):
+    """PETSc would write its options beside the solutions, as ``solutions.bin.info``."""
+    folder, job = staged
+    before = {path.name for path in folder.iterdir()}
+    run(getdp, job, folder)
+    left = {path.name for path in folder.iterdir()} - before
+    assert left == {FLUX_DENSITY_FILE, SOLUTIONS_FILE, "getdp.log", "magnetostatics_2d.pre"}
 
 
 def test_runs_by_hand_without_options(getdp, staged):
