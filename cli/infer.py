@@ -23,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Infer, write everything, print the before/after table."""
-    from halbach_fe.report.inference import score_table, write_report  # matplotlib loads only when needed
+    from halbach_fe.report.inference import (  # matplotlib loads only when needed
+        score_table,
+        write_report,
+    )
 
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     with common.workshop(arguments) as workshop:
