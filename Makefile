@@ -1,11 +1,15 @@
 # make demo     the main job: the FASER dipole, before and after its measurement
 # make test     all tests
+# make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo test benchmark lint wheel-check setup setup-test clean
+.PHONY: demo study-sensitivity test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
+
+study-sensitivity: setup
+	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
 
 test: setup-test
 	.venv/bin/python -m pytest

@@ -9,10 +9,14 @@ from importlib import metadata
 from pathlib import Path
 
 import jinja2
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
+from halbach_fe.blocks import blocks_of
 from halbach_fe.field_map import atomic
+from halbach_fe.study import Study
 from halbach_fe.update import write_text
 
 # Okabe and Ito's colours, told apart by every kind of colour vision
@@ -52,3 +56,19 @@ def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure
     for axis in axes[:, 0]:
         axis.grid(alpha=0.3)
     return figure, list(axes[:, 0])
+
+
+def draw_magnet(axis: Axes, study: Study) -> None:
+    """Outlines of a ring's blocks with arrows of their magnetization, and the iron; in mm."""
+    t = np.linspace(0, 1, 9)
+    for block in blocks_of(study)[:study.array.blocks_per_ring]:
+        outline = 1e3 * np.vstack([edge.at(t)[0] for edge in block.outline])
+        axis.plot(*outline.T, color="#777777", lw=0.6)
+        middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
+        length = 150 * (study.array.outer_radius_m - study.array.inner_radius_m)
+        axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
+                      middle - length * np.array(block.easy_axis[:2]),
+                      arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})
+    if study.iron_ring is not None:
+        for radius in (study.iron_ring.inner_radius_m, study.iron_ring.outer_radius_m):
+            axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))

@@ -1,0 +1,119 @@
+"""Figures, table and page of a measurement plan."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.planning import MeasurementPlan
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
+from halbach_fe.study import Study
+from halbach_fe.update import write_text
+
+
+def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
+    """What a script wants to know of a plan; information in nats, lengths in A/m."""
+    return {
+        "points": len(plan.points), "candidates": len(plan.candidates),
+        "information": float(plan.gain[-1]),
+        "study_points": len(plan.baseline),
+        "study_information": float(plan.baseline_gain[-1]),
+        "points_with_the_study_information": plan.same_information,
+        "mean_sd_over_study_with_as_many_points": plan.volume_ratio,
+        "rms_sd_prior": _rms(plan.prior_sd), "rms_sd_plan": _rms(plan.planned_sd),
+        "rms_sd_study_with_as_many_points": _rms(plan.baseline_sd),
+    }
+
+
+def write_plan(study: Study, plan: MeasurementPlan, folder: Path) -> None:
+    """Write plan.csv, plan.json, plan.html and its figures."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["order", "x_m", "y_m", "z_m", "information_nats"])
+    writer.writerows([number, *point, gain] for number, (point, gain) in enumerate(
+        zip(plan.points.tolist(), plan.gain.tolist(), strict=True), start=1))
+    write_text(folder / "plan.csv", table.getvalue())
+    summary = plan_summary(plan)
+    write_text(folder / "plan.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    pictures = save({
+        "plan_positions.png": (_positions(study, plan), "Candidates, chosen positions coloured by "
+                               "their order, and the study's own positions as rings"),
+        "plan_information.png": (_information(plan), "Expected information against the number of "
+                                 "points, for the plan and for as many of the study's positions"),
+        "plan_blocks.png": (_blocks(study, plan), "Standard deviation of the blocks' magnetizations"
+                            " after the measurement over that before, by slot, for the plan and "
+                            "for as many of the study's positions"),
+    }, folder)
+    write_page(folder / "plan.html", "plan.html.j2", pictures, study=study, plan=plan,
+               summary=summary)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _positions(study: Study, plan: MeasurementPlan) -> Figure:
+    flat = np.ptp(plan.candidates[:, 2]) == 0
+    figure = Figure(figsize=(6.4, 5.2) if flat else (10, 5.2), layout="constrained")
+    left, *others = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
+    order = np.arange(1, len(plan.points) + 1)
+    draw_magnet(left, study)
+    shown = _scatter(left, plan, lambda points: (1e3 * points[:, 0], 1e3 * points[:, 1]), order)
+    reach = 1.15e3 * float(np.hypot(*np.vstack([plan.candidates, plan.baseline])[:, :2].T).max())
+    left.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x in mm",
+             ylabel="y in mm")
+    for axis in others:
+        shown = _scatter(axis, plan, lambda points: (
+            points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))), order)
+        axis.set(xlabel="z in m", ylabel="angle in degrees")
+    figure.colorbar(shown, label="order of choice", ax=[left, *others])
+    return figure
+
+
+def _scatter(axis: Axes, plan: MeasurementPlan, place, order):  # type: ignore[no-untyped-def]
+    axis.plot(*place(plan.candidates), ".", color="#cccccc", ms=2, label="candidates")
+    shown = axis.scatter(*place(plan.points), c=order, cmap="viridis", s=28, label="chosen",
+                         zorder=3)
+    axis.plot(*place(plan.baseline), "o", mfc="none", color=PRIOR, ms=7, mew=0.8, label="study")
+    axis.legend(loc="upper right", fontsize="small")
+    return shown
+
+
+def _information(plan: MeasurementPlan) -> Figure:
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(range(1, len(plan.gain) + 1), plan.gain, color=POSTERIOR, label="plan")
+    axis.plot(range(1, len(plan.baseline_gain) + 1), plan.baseline_gain, color=PRIOR,
+              label="positions of the study")
+    axis.axhline(plan.baseline_gain[-1], color=PUBLISHED, lw=0.8, ls=":")
+    axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def _blocks(study: Study, plan: MeasurementPlan) -> Figure:
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    slots = np.array([block.slot for block in blocks_of(study)])
+    places = np.arange(1, study.array.blocks_per_ring + 1)
+
+    def by_slot(sd: Floats) -> Floats:
+        variance = (sd**2).reshape(len(slots), -1).sum(axis=1)
+        return np.sqrt([variance[slots == place].mean() for place in places])
+
+    before = by_slot(plan.prior_sd)
+    for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
+                                    ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
+        axis.bar(places + shift, by_slot(sd) / before, 0.4, color=colour, label=name)
+    axis.set(xlabel="slot", ylabel="sd after / sd before", ylim=(0, 1))
+    axis.set_xticks(places[::max(1, len(places) // 16)])
+    axis.legend()
+    return figure

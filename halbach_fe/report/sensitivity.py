@@ -1,0 +1,125 @@
+"""Figures, tables and page of a sensitivity study of a cross-section."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from halbach_fe.blocks import Floats
+from halbach_fe.report.page import IRON, POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
+from halbach_fe.study import Study
+from halbach_fe.update import write_text
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What a sensitivity study found.
+
+    Attributes
+    ----------
+    block : int
+        Slot whose derivative the map shows, from 1.
+    x, y : ndarray, shape (n,), in m
+        Axes of the map.
+    size : ndarray, shape (n, n), in T m/A
+        |B'| by y and x; NaN outside the mesh.
+    angle : ndarray, shape (m,), in rad
+        Of the readings on the circle.
+    along, across : ndarray, shape (m, blocks), in T
+        |B'| at each reading for 1 % more magnetization of each block, and for a turn of 1 degree.
+    printed_form : float
+        Largest relative error on the circle of the derivative by the formula that the paper
+        prints, whose iron is that of the derivative's own field.
+    information : mapping
+        Expected information in nats against the number of points, by name.
+    """
+
+    block: int
+    x: Floats
+    y: Floats
+    size: Floats
+    angle: Floats
+    along: Floats
+    across: Floats
+    printed_form: float
+    information: Mapping[str, Floats]
+
+
+def write_sensitivity(
+    study: Study, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, object]],
+) -> None:
+    """Write sensitivity.html, its figures, sensitivity.json and readings.csv.
+
+    ``plans`` are the summaries of measurement plans, by name.
+    """
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["angle_rad", "slot", "one_percent_T", "one_degree_T"])
+    writer.writerows(
+        [angle, slot + 1, found.along[row, slot], found.across[row, slot]]
+        for row, angle in enumerate(found.angle.tolist()) for slot in range(found.along.shape[1]))
+    write_text(folder / "readings.csv", table.getvalue())
+    summary = {
+        "study": study.name, "block": found.block, "printed_form_error": found.printed_form,
+        "largest_one_percent_T": float(found.along.max()),
+        "smallest_one_percent_T": float(found.along.min()),
+        "largest_one_degree_T": float(found.across.max()), "plans": plans}
+    write_text(folder / "sensitivity.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    pictures = save({
+        "derivative.png": (_map(study, found), f"Size of the derivative of B along the nominal "
+                           f"magnetization of block {found.block}, in T per A/m, logarithmic"),
+        "readings.png": (_readings(found), "Change of B at every reading of the circle for every "
+                         "block: 1 % more magnetization, and a turn by 1 degree"),
+        "information.png": (_information(found), "Expected information about all magnetizations "
+                            "against the number of points"),
+    }, folder)
+    write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=study,
+               found=found, plans=plans)
+
+
+def _map(study: Study, found: Sensitivity) -> Figure:
+    figure = Figure(figsize=(7.4, 6), layout="constrained")
+    axis = figure.subplots()
+    largest = float(np.nanmax(found.size))
+    shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, found.size, shading="nearest",
+                            norm=LogNorm(largest * 1e-5, largest), cmap="cividis", rasterized=True)
+    draw_magnet(axis, study)
+    axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
+    figure.colorbar(shown, label="|B'| in T m/A", extend="min")
+    return figure
+
+
+def _readings(found: Sensitivity) -> Figure:
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    degrees = np.degrees(found.angle)
+    blocks = np.arange(1, found.along.shape[1] + 1)
+    for axis, values, name in zip(axes, (found.along, found.across),
+                                  ("1 % more magnetization", "1 degree turned"), strict=True):
+        shown = axis.pcolormesh(blocks, degrees, 1e3 * values, shading="nearest", cmap="cividis")
+        axis.set(xlabel="slot", title=name)
+        figure.colorbar(shown, label="|change of B| in mT", ax=axis)
+    axes[0].set_ylabel("angle of the reading in degrees")
+    return figure
+
+
+def _information(found: Sensitivity) -> Figure:
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    axis = figure.subplots()
+    colours = (PRIOR, POSTERIOR, PUBLISHED, IRON)
+    for (name, gain), colour in zip(found.information.items(), colours, strict=False):
+        # plans may tell hardly more than what they are compared with
+        axis.plot(range(1, len(gain) + 1), gain, color=colour, label=name,
+                  ls="--" if colour == PRIOR else "-", zorder=3 if colour == PRIOR else 2)
+    axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return figure

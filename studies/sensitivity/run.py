@@ -1,0 +1,126 @@
+"""Sensitivity of the field to the blocks, and where to measure it, in a cross-section with iron.
+
+The map of |B'| for block 13 is that of the paper's figure 1; the plans choose positions on the
+paper's circle, and wherever a probe could go::
+
+    python studies/sensitivity/run.py -o results/sensitivity
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.cli import common
+from halbach_fe.observation import observe, points_from
+from halbach_fe.planning import plan
+from halbach_fe.report.plan import plan_summary, write_plan
+from halbach_fe.report.sensitivity import Sensitivity, write_sensitivity
+from halbach_fe.response import Response, response
+from halbach_fe.sensitivity import derivative
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study, curve_of, read_study
+
+HERE = Path(__file__).parent
+BLOCK = 13
+"""Slot of the paper's figure."""
+
+MAP_HALF_WIDTH_M, MAP_POINTS = 0.25, 201
+
+
+def plane(study: Study, workshop: Workshop) -> tuple[Floats, Floats]:
+    """The map's axis (n,) in m, and |B'| (n, n) in T m/A."""
+    # off the lines of symmetry, where the derivative of an edge between elements is two-valued
+    axis = np.linspace(-MAP_HALF_WIDTH_M, MAP_HALF_WIDTH_M, MAP_POINTS) + 1e-6
+    x, y = np.meshgrid(axis, axis)
+    points = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    found = derivative(study, BLOCK - 1, points, workshop)
+    return axis, np.linalg.norm(found, axis=1).reshape(x.shape)
+
+
+def by_block(study: Study, model: Response) -> tuple[Floats, Floats]:
+    """|B'| (readings, blocks) in T for 1 % more magnetization, and for a turn of 1 degree."""
+    size = []
+    for turned in (False, True):
+        columns = []
+        for number, block in enumerate(blocks_of(study)):
+            x, y = block.magnetization[:2]
+            change = 0.01 * np.array([x, y]) if not turned else np.radians(1) * np.array([-y, x])
+            column = model.matrix[:, 2 * number:2 * number + 2] @ change
+            columns.append(np.linalg.norm(column.reshape(-1, 2), axis=1))
+        size.append(np.column_stack(columns))
+    return size[0], size[1]
+
+
+def printed_form_error(study: Study, model: Response, workshop: Workshop) -> float:
+    """Largest relative error on the circle if the iron is that of the derivative's own, small,
+    field: at its initial permeability.
+    """
+    curve, ring = curve_of(study), study.iron_ring
+    assert curve is not None
+    assert ring is not None
+    initial = study.model_copy(update={"iron_ring": ring.model_copy(
+        update={"curve": None, "relative_permeability": curve.initial})})
+    points = points_from(study.observation.positions)
+    other = response(initial, observe(study, points, np.ones_like(points, bool)),
+                     replace(workshop, folder=workshop.folder / "printed-form"))
+    column = 2 * (BLOCK - 1)
+    change = blocks_of(study)[BLOCK - 1].magnetization[:2]
+    ours, theirs = (one.matrix[:, column:column + 2] @ change for one in (model, other))
+    return float(np.abs(ours - theirs).max() / np.abs(ours).max())
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the study and print its table."""
+    study = read_study(options.study)
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool))
+    with common.workshop(options) as workshop:
+        def room(name: str) -> Workshop:
+            return replace(workshop, folder=workshop.folder / name)
+
+        axis, size = plane(study, room("map"))
+        model = response(study, observation, room("circle"))
+        on_circle = study.model_copy(update={"plan": study.plan.model_copy(
+            update={"candidates": tuple(one for one in study.plan.candidates
+                                        if one.radius_m == study.observation.positions.radius_m)})})
+        plans = {"on the circle": plan(on_circle, room("plan-circle")),
+                 "wherever the probe can go": plan(study, room("plan"))}
+        error = printed_form_error(study, model, workshop)
+    along, across = by_block(study, model)
+    information = {"equally spaced circle": plans["on the circle"].baseline_gain} | {
+        f"plan {name}": found.gain for name, found in plans.items()}
+    write_plan(on_circle, plans["on the circle"], options.output / "plan-circle")
+    write_plan(study, plans["wherever the probe can go"], options.output / "plan")
+    summaries = {name: plan_summary(found) for name, found in plans.items()}
+    write_sensitivity(study, Sensitivity(
+        BLOCK, axis, axis, size, np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), along,
+        across, error, information), options.output, summaries)
+    first, second = summaries.values()
+    common.print_table([{"what": key} | {name: f"{value:.4g}" if isinstance(value, float)
+                                         else str(value) for name, value in zip(
+                                             summaries, (first[key], second[key]), strict=True)}
+                        for key in first], "Where to measure: plans for the same number of points")
+    common.say(f"Report: {options.output / 'sensitivity.html'}")
+    return 0
+
+
+def main() -> int:
+    """Parse the command line and run; return the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.set_defaults(study=HERE / "study.toml")
+    parser.add_argument("-o", "--output", type=Path, default=Path("results/sensitivity"))
+    parser.add_argument("--jobs", type=common.positive, default=2)
+    parser.add_argument("--time-limit", type=float, default=3600.0)
+    common.add_getdp_argument(parser)
+    options = parser.parse_args()
+    return common.guarded(lambda: run(options))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
