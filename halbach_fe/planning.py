@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import StudyError
 from halbach_fe.inference.design import greedy, information
 from halbach_fe.inference.linear import posterior
@@ -83,7 +83,8 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
             f"instead it is {study.observation.quantity}. Plan the points first.")
     baseline = points_from(study.observation.positions)
     sets = study.plan.candidates or (study.observation.positions,)
-    candidates = np.unique(np.round(np.vstack([points_from(one) for one in sets]), 9), axis=0)
+    places: list[Floats] = [points_from(one) for one in sets]
+    candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
     wanted = count or study.plan.points or len(baseline)
     if wanted > len(candidates):
         raise StudyError(
@@ -103,7 +104,7 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
            for number in range(1, len(baseline) + 1)]
     rows = np.arange(len(observation)).reshape(len(points), size)
 
-    def sd_after(positions: Floats) -> Floats:
+    def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
         return _posterior(model.matrix[index], sigma[index], prior).sd
 
@@ -113,7 +114,7 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
         sd_after(spread(len(baseline), min(wanted, len(baseline)))))
 
 
-def spread(total: int, count: int) -> Floats:
+def spread(total: int, count: int) -> Ints:
     """``count`` of ``total`` indices, evenly."""
     return np.floor(np.arange(count) * total / count).astype(int)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from halbach_fe.blocks import Floats, blocks_of
@@ -63,25 +65,26 @@ def _positions(study: Study, plan: MeasurementPlan) -> Figure:
     flat = np.ptp(plan.candidates[:, 2]) == 0
     figure = Figure(figsize=(6.4, 5.2) if flat else (10, 5.2), layout="constrained")
     left, *others = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
-    order = np.arange(1, len(plan.points) + 1)
     draw_magnet(left, study)
-    shown = _scatter(left, plan, lambda points: (1e3 * points[:, 0], 1e3 * points[:, 1]), order)
+    shown = _show(left, plan, lambda points: 1e3 * points[:, :2])
     reach = 1.15e3 * float(np.hypot(*np.vstack([plan.candidates, plan.baseline])[:, :2].T).max())
     left.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x in mm",
              ylabel="y in mm")
     for axis in others:
-        shown = _scatter(axis, plan, lambda points: (
-            points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))), order)
+        shown = _show(axis, plan, lambda points: np.column_stack(
+            [points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
         axis.set(xlabel="z in m", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
     return figure
 
 
-def _scatter(axis: Axes, plan: MeasurementPlan, place, order):  # type: ignore[no-untyped-def]
-    axis.plot(*place(plan.candidates), ".", color="#cccccc", ms=2, label="candidates")
-    shown = axis.scatter(*place(plan.points), c=order, cmap="viridis", s=28, label="chosen",
+def _show(axis: Axes, plan: MeasurementPlan, place: Callable[[Floats], Floats]) -> PathCollection:
+    """Candidates, chosen and the study's points where ``place`` puts them."""
+    axis.plot(*place(plan.candidates).T, ".", color="#cccccc", ms=2, label="candidates")
+    x, y = place(plan.points).T
+    shown = axis.scatter(x, y, 28, np.arange(1, len(x) + 1), cmap="viridis", label="chosen",
                          zorder=3)
-    axis.plot(*place(plan.baseline), "o", mfc="none", color=PRIOR, ms=7, mew=0.8, label="study")
+    axis.plot(*place(plan.baseline).T, "o", mfc="none", color=PRIOR, ms=7, mew=0.8, label="study")
     axis.legend(loc="upper right", fontsize="small")
     return shown
 

@@ -1,0 +1,76 @@
+"""Where to measure: the greedy choice against exhaustive search, and against what is known."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from halbach_fe.errors import StudyError
+from halbach_fe.inference.design import greedy, information
+from halbach_fe.planning import plan, spread
+
+NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
+
+
+def test_gain_is_the_mutual_information(generator):
+    """Of two Gaussians, by the entropies of prior and posterior."""
+    design = generator.standard_normal((7, 4))
+    posterior = np.linalg.inv(np.eye(4) + design.T @ design)
+    assert information(design) == pytest.approx(-np.linalg.slogdet(posterior)[1] / 2, rel=1e-12)
+    assert information(design.T) == pytest.approx(  # more parameters than readings
+        -np.linalg.slogdet(np.linalg.inv(np.eye(7) + design @ design.T))[1] / 2, rel=1e-12)
+
+
+def test_running_gain_is_that_of_the_chosen(generator):
+    design = generator.standard_normal((30, 2, 5))
+    chosen, gain = greedy(design, 12)
+    assert len(set(chosen)) == 12
+    for count in (1, 5, 12):
+        assert gain[count - 1] == pytest.approx(information(np.vstack(design[chosen[:count]])))
+
+
+def test_greedy_is_near_the_best(generator):
+    """At least 1 - 1/e of the best of all choices; most other choices are worse."""
+    for _ in range(5):
+        design = generator.standard_normal((12, 2, 4)) * generator.uniform(0.2, 2, (12, 1, 1))
+        chosen, gain = greedy(design, 4)
+        every = [information(np.vstack(design[list(some)]))
+                 for some in itertools.combinations(range(12), 4)]
+        assert gain[-1] >= (1 - 1 / np.e) * max(every)
+        assert gain[-1] > np.quantile(every, 0.95)
+        assert chosen[0] == np.argmax([information(one) for one in design])
+
+
+def test_plan_in_a_cross_section(dipole, workshop):
+    """Equally spaced points are as good as any on one circle; nearer to the blocks is better."""
+    def circles(*radii):
+        return [{"kind": "circles", "radius_m": radius, "angles": 48} for radius in radii]
+
+    study = dipole(noise=NOISE, observation__components=["x", "y"],
+                   plan={"candidates": circles(0.075), "points": 12})
+    same = plan(study, workshop)
+    assert len(same.points) == 12
+    assert same.baseline_gain[11] < same.gain[11] * 1.02
+    assert same.volume_ratio == pytest.approx(1, abs=0.05)  # measured: 0.99
+
+    wider = plan(dipole(noise=NOISE, observation__components=["x", "y"],
+                        plan={"candidates": circles(0.05, 0.09), "points": 24}), workshop)
+    outside = np.isclose(np.hypot(*wider.points[:, :2].T), 0.09)
+    assert outside.mean() > 0.8  # measured: 22 of 24; a few farther in average several blocks
+    assert wider.same_information < 24
+    assert wider.volume_ratio < 0.7
+    assert (wider.planned_sd < wider.baseline_sd).all()
+    # the sd's are those of a posterior: not above the prior's, and the plan's gain is its volume
+    assert (wider.planned_sd <= wider.prior_sd).all()
+
+
+def test_even_spread():
+    assert spread(60, 4).tolist() == [0, 15, 30, 45]
+    assert spread(5, 5).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_too_few_candidates(dipole, workshop):
+    with pytest.raises(StudyError, match="at most the number of candidates, 24"):
+        plan(dipole(noise=NOISE), workshop, count=25)
