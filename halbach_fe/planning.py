@@ -100,7 +100,7 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
     size = len(observation) // len(points)  # readings at a point
     whitened = ((model.matrix @ prior.root) / sigma[:, None]).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)
-    own = [information(np.vstack(whitened[spread(len(baseline), number)]))
+    own = [information(whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2]))
            for number in range(1, len(baseline) + 1)]
     rows = np.arange(len(observation)).reshape(len(points), size)
 
