@@ -96,8 +96,7 @@ def nonlinear_model(
     prior = block_prior(
         linear.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd)
-    samples = prior.mean + generator.standard_normal(
-        (VERIFIED_SAMPLES, prior.root.shape[1])) @ prior.root.T
+    samples = prior.sample(VERIFIED_SAMPLES, generator)
     return replace(model, agreement_T=verify(model, study, observation, workshop, samples))
 
 

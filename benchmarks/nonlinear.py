@@ -1,0 +1,106 @@
+"""Non-linear iron in a cross-section: the condensed engine against GetDP's Newton method."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.note import Note
+from halbach_fe import getdp as runner
+from halbach_fe.cli import common
+from halbach_fe.getdp import find_getdp
+from halbach_fe.inference.prior import block_prior
+from halbach_fe.mesh import build_mesh, verify_mesh
+from halbach_fe.nonlinear import newton_readings, nonlinear_model
+from halbach_fe.observation import observe, points_from
+from halbach_fe.solve import CROSS_SECTION, Workshop, stage
+from halbach_fe.study import Study, read_study
+
+STUDY = Path(__file__).parent.parent / "studies" / "sensitivity" / "study.toml"
+SAMPLES, HARD = 180, 20
+"""Magnetizations compared with GetDP: from the prior, and with random directions in all blocks,
+which saturate the iron, from a cold start."""
+
+LOOPED, ALONE = 20, 3
+"""Solves timed in one GetDP process, and in one each."""
+
+MANY = 18_000
+LOOP_TOLERANCE = 1e-8  # of GetDP's residual, as one would choose for speed
+ENGINE_TOLERANCE_T = 1e-9
+
+
+def getdp_seconds(study: Study, samples: np.ndarray, folder: Path) -> float:
+    """Wall time of one GetDP process that solves samples (k, blocks, 3) in A/m, starting each from
+    the one before with full Newton steps: the fastest way it has.
+    """
+    mesh = verify_mesh(build_mesh(study, folder))
+    started = time.monotonic()
+    job = stage(study, mesh, np.array([[0.0123, 0.0321, 0.0]]), folder / "run", CROSS_SECTION,
+                samples=samples)
+    runner.run(find_getdp(), replace(
+        job, resolution="Newton", solutions=None, outputs=("newton_flux_density.txt",),
+        numbers={"TOLERANCE": LOOP_TOLERANCE, "LINE_SEARCH": 0}), folder / "run")
+    return time.monotonic() - started
+
+
+def run(note: Note) -> None:
+    """Measure and note."""
+    study = read_study(STUDY)
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool))
+    generator = np.random.default_rng(4)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "run").mkdir()
+        workshop = Workshop(find_getdp(), folder / "model", jobs=2)
+        common.say("condensed model of the cross-section")
+        started = time.monotonic()
+        model = nonlinear_model(study, observation, workshop, generator)
+        note("nonlinear.build_seconds", time.monotonic() - started, "s",
+             "error bars and verification included")
+        unknowns = verify_mesh(build_mesh(study, folder)).inner.nodes
+        note("nonlinear.unknowns", unknowns, "", f"of them {len(model.condensed.potential)} in "
+             "the iron")
+        prior = block_prior(model.nominal, 2, 0.01, 1.0)
+        draws = prior.sample(MANY, generator)
+        blocks = np.zeros((LOOPED + 1, len(model.nominal) // 2, 3))
+        blocks[..., :2] = draws[:LOOPED + 1].reshape(LOOPED + 1, -1, 2)
+
+        common.say("GetDP looping in one process, and in fresh ones")
+        first = getdp_seconds(study, blocks[:1], folder)
+        loop = (getdp_seconds(study, blocks, folder) - first) / LOOPED
+        alone = float(np.mean([getdp_seconds(study, blocks[k:k + 1], folder)
+                               for k in range(ALONE)]))
+        common.say(f"{MANY} condensed solves")
+        started = time.monotonic()
+        steps = 0
+        for row in draws:
+            _, statistics = model.condensed.solve(row, ENGINE_TOLERANCE_T)
+            steps += statistics.newton_steps
+        total = time.monotonic() - started
+        note("nonlinear.seconds_18000", total, "s", f"{MANY} solves to {ENGINE_TOLERANCE_T:g} T, "
+             f"{steps} Newton steps in all")
+        note("nonlinear.speedup_vs_getdp_loop", loop * MANY / total, "ratio",
+             f"per solve; GetDP {loop:.2f} s, warm start, tolerance {LOOP_TOLERANCE:g}")
+        note("nonlinear.speedup_vs_process", alone * MANY / total, "ratio",
+             f"per solve; a fresh GetDP process takes {alone:.2f} s")
+        started = time.monotonic()
+        model.jacobian(draws[0])
+        note("nonlinear.jacobian_over_newton", (time.monotonic() - started) / loop, "ratio",
+             f"all {len(model.nominal)} columns over one Newton solve of GetDP's loop")
+
+        common.say(f"{SAMPLES + HARD} solves compared with GetDP")
+        size = float(np.linalg.norm(model.nominal.reshape(-1, 2), axis=1).max())
+        hard = size * generator.standard_normal((HARD, len(model.nominal)))
+        worst = 0.0
+        for part, cold in ((draws[:SAMPLES], False), (hard, True)):
+            theirs = newton_readings(study, observation, replace(
+                workshop, folder=folder / "compared"), part, cold)
+            worst = max(worst, float(np.abs(model(part) - theirs).max()))
+        note("nonlinear.engine_error_T", worst, "T", f"largest difference at {len(observation)} "
+             f"readings of {SAMPLES} draws of the prior and {HARD} saturated ones, cold, to "
+             "GetDP's Newton method")
