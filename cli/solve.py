@@ -1,7 +1,8 @@
 """Compute the field of a study's nominal magnet at the study's positions.
 
-Writes field_map.h5, field_map.csv and field_map.vtu (open it in ParaView), readings.csv with the
-study's observation, and the GetDP run folders, which can be run by hand.
+Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
+field_map.vtu (open it in ParaView), readings.csv with the study's observation, and the GetDP run
+folders, which can be run by hand.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
 from halbach_fe.routes import check_points, exact_part, finite_element_part
-from halbach_fe.study import read_study
+from halbach_fe.solve import newton_history
+from halbach_fe.study import is_nonlinear, read_study
 from halbach_fe.update import write_text
 
 
@@ -58,6 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
         "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
+    if is_nonlinear(study):
+        summary["newton_residuals"] = newton_history(arguments.output)
     if arguments.json:
         common.print_json(summary)
     else:

@@ -498,6 +498,12 @@ def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
     return found
 
 
+def newton_history(folder: Path) -> list[float]:
+    """Relative residuals of Newton's method in the run that a workshop's folder keeps."""
+    log = folder / f"getdp-{_variant(False)}" / "getdp.log"
+    return newton_residuals(log.read_text("utf-8").splitlines())[-1]
+
+
 def write_history(folder: Path) -> int:
     """Keep the residuals of a run's log as a table; return the number of steps."""
     history = newton_residuals((folder / "getdp.log").read_text("utf-8").splitlines())

@@ -43,6 +43,16 @@ def test_forgotten_iron_fails(name, workshop):
     assert difference(found, stored(name)) > tolerance(study)
 
 
+@pytest.mark.parametrize("permeability", [100.0, 1000.0])
+def test_linear_iron_in_place_of_the_curve_fails(permeability, workshop):
+    document = CASES["dipole_2d_saturated"].model_dump(exclude_none=True)
+    document["iron_ring"] = {"inner_radius_m": 0.19, "outer_radius_m": 0.192,
+                             "relative_permeability": permeability}
+    study = parse_study(document)
+    found = solve_nominal(study, points_of_case(study), workshop)
+    assert difference(found, stored("dipole_2d_saturated")) > tolerance(study)
+
+
 def test_the_comparison_itself_can_fail():
     field = stored("dipole_3d_reaction")
     assert difference(field, field) == 0
