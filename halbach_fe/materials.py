@@ -35,6 +35,9 @@ SUBDIVISION = 16
 """Points of a law between two of the table: Akima's cubics then keep the table's monotone ones to
 about 1e-5."""
 
+LEAST_START = 0.5
+"""dH/dB at the origin is at least this part of H / B at the table's first point."""
+
 _CLOSED_FORM_POINTS = 800
 _WIDEST_FIELD = 1e7  # A/m; closed forms are followed up to there
 
@@ -147,11 +150,14 @@ def table_curve(field: Floats, flux_density: Floats) -> Curve:
         With what is wrong with the table, see `check_table`.
     """
     field, flux_density = check_table(field, flux_density)
-    smooth = PchipInterpolator(flux_density, field)  # monotone, with a continuous derivative
+    slopes = PchipInterpolator(flux_density, field).derivative()(flux_density)
+    # where H turns up steeply behind the first point it would start flat: no reluctivity at all
+    slopes[0] = max(slopes[0], LEAST_START * field[1] / flux_density[1])
+    smooth = CubicHermiteSpline(flux_density, field, slopes)  # monotone, its derivative continuous
     steps = np.arange(SUBDIVISION) / SUBDIVISION
     inner = flux_density[:-1, None] + np.diff(flux_density)[:, None] * steps
     nodes = np.append(inner.ravel(), flux_density[-1])
-    return _checked(Curve(smooth(nodes), nodes, 1 / (MU_0 * float(smooth.derivative()(0.0)))))
+    return _checked(Curve(smooth(nodes), nodes, 1 / (MU_0 * float(slopes[0]))))
 
 
 def froehlich_kennelly(initial: float, saturation: float) -> Curve:
