@@ -81,8 +81,7 @@ class Law:
         inside = self._spline(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
-        with np.errstate(divide="ignore"):
-            beyond = self.limit + self.excess / np.sqrt(square)
+        beyond = self.limit + self.excess / np.sqrt(np.maximum(square, self.squares[-1]))
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def slope(self, square: Floats) -> Floats:
@@ -90,13 +89,13 @@ class Law:
         inside = self._derivative(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
-        with np.errstate(divide="ignore"):
-            beyond = -self.excess / 2 / square**1.5
+        outside = np.maximum(square, self.squares[-1])
+        beyond = -self.excess / 2 / outside / np.sqrt(outside)  # its cube may be no number
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def differential(self, square: Floats) -> Floats:
         """dy/dx along x: the coefficient plus 2 |x|^2 times its slope."""
-        return self.coefficient(square) + 2 * square * self.slope(square)
+        return self.coefficient(square) + 2 * (square * self.slope(square))
 
 
 def _akima_slopes(x: Floats, y: Floats) -> Floats:

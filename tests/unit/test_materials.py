@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from halbach_fe import materials
 from halbach_fe.materials import MU_0
@@ -15,7 +16,21 @@ def test_a_curve_that_bends_at_its_first_point_has_a_start():
     curve = materials.table_curve(H, B)
     first = B[0] / (MU_0 * H[0])
     assert first <= curve.initial <= first / materials.LEAST_START
-    # the control: where the slope is sound, it stays PCHIP's
-    assert materials.table_curve(H := B * np.exp(B) * 1e3, B).initial == pytest.approx(
-        1 / (MU_0 * float(materials.PchipInterpolator(
-            np.append(0, B), np.append(0, H)).derivative()(0.0))), rel=1e-12)
+    # the control: where PCHIP's slope is sound, it stays
+    B = np.linspace(0, 1.5, 7)
+    H = 200 * B * np.exp(B)
+    slope = float(PchipInterpolator(B, H).derivative()(0.0))
+    assert slope > materials.LEAST_START * H[1] / B[1]
+    assert materials.table_curve(H, B).initial == pytest.approx(1 / (MU_0 * slope), rel=1e-12)
+
+
+@pytest.mark.parametrize("law", ["reluctivity", "permeability"])
+def test_any_argument_is_answered_without_a_warning(law):
+    """From zero to the largest number; warnings are errors here."""
+    law = getattr(materials.froehlich_kennelly(5000, 2.1), law)
+    squares = np.array([0.0, 5e-324, 1e-250, 1.0, law.squares[-1], 1e100, 1e250,
+                        np.finfo(float).max])
+    for found in (law.coefficient(squares), law.slope(squares), law.differential(squares)):
+        assert np.isfinite(found).all()
+    np.testing.assert_allclose(law.coefficient(squares)[[0, -1]], [law.values[0], law.limit])
+    np.testing.assert_allclose(law.differential(squares)[[0, -1]], [law.values[0], law.limit])
