@@ -8,6 +8,10 @@ from scipy.interpolate import PchipInterpolator
 
 from halbach_fe import materials
 from halbach_fe.materials import MU_0
+from halbach_fe.observation import observe
+from halbach_fe.response import _key
+from halbach_fe.solve import Workshop
+from tests.conftest import circle
 
 
 def test_a_curve_that_bends_at_its_first_point_has_a_start():
@@ -34,3 +38,24 @@ def test_any_argument_is_answered_without_a_warning(law):
         assert np.isfinite(found).all()
     np.testing.assert_allclose(law.coefficient(squares)[[0, -1]], [law.values[0], law.limit])
     np.testing.assert_allclose(law.differential(squares)[[0, -1]], [law.values[0], law.limit])
+
+
+def test_a_stored_response_is_that_of_the_steels_numbers(dipole, tmp_path, monkeypatch, getdp):
+    """Another table under the same name is another material."""
+    study = dipole(iron_ring={"inner_radius_m": 0.2, "outer_radius_m": 0.24,
+                              "curve": {"kind": "steel", "name": "aisi_1010"}})
+    points = circle(0.05, 4)
+    workshop = Workshop(getdp, tmp_path)
+
+    def key():
+        return _key(study, observe(study, points, np.ones_like(points, bool)), workshop)
+
+    shipped = key()
+    assert key() == shipped
+    text = materials.steels()["aisi_1010"].read_text()
+    other = tmp_path / "aisi_1010.csv"
+    monkeypatch.setattr(materials, "steels", lambda: {"aisi_1010": other})
+    other.write_text(text)
+    assert key() == shipped
+    other.write_text(text.replace("238.7,", "238.8,"))
+    assert key() != shipped
