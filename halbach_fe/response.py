@@ -31,7 +31,7 @@ from halbach_fe.routes import (
     finite_element_part,
 )
 from halbach_fe.solve import Workshop
-from halbach_fe.study import COMPONENTS, MU_0, Study, is_nonlinear
+from halbach_fe.study import COMPONENTS, MU_0, Study, curve_of, is_nonlinear
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,9 @@ def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
     relevant = study.model_dump(
         mode="json", include={"dimension", "array", "iron_ring", "mesh", "open_boundary", "solver"})
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
+    curve = curve_of(study)  # a steel's name says nothing of its numbers
+    if curve is not None:
+        digest.update(np.array([curve.H, curve.B]).tobytes())
     versions = [metadata.version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]
     digest.update(f"{versions} {workshop.getdp.version} {workshop.getdp.petsc}".encode())
     for package in ("halbach_fe", "halbach_fe.geo", "halbach_fe.pro"):  # a changed formula counts

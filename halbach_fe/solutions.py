@@ -144,6 +144,8 @@ def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
         values = raw[start + 4 * count:start + 12 * count].view(">f8").astype(float)
         if lengths.sum() != count or len(values) != count or len(raw) != start + 12 * count:
             raise ValueError("truncated")
+        if (lengths < 0).any() or (columns < 0).any() or (columns >= unknowns).any():
+            raise ValueError("entries outside the matrix")  # scipy would follow them
     except (OSError, ValueError) as error:
         raise GetDPError(f"GetDP's matrix {path} cannot be read ({error}).") from None
     if not np.isfinite(values).all():

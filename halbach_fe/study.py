@@ -151,6 +151,8 @@ class TableCurve(_Model):
     @model_validator(mode="after")
     def _consistent(self) -> TableCurve:
         if self.file is None:
+            if not (self.H_A_per_m or self.B_T):
+                raise ValueError("give a file, or H_A_per_m and B_T")
             materials.table_curve(np.array(self.H_A_per_m), np.array(self.B_T))
         elif self.H_A_per_m or self.B_T:
             raise ValueError("give either a file, or H_A_per_m and B_T, not both")
@@ -176,7 +178,13 @@ class FroehlichKennellyCurve(_Model):
 
     kind: Literal["froehlich_kennelly"]
     initial_relative_permeability: Annotated[float, Field(ge=2.0, le=1e6)]
-    saturation_polarization_T: Annotated[float, Field(gt=0.0, le=materials.MAX_POLARIZATION)]
+    saturation_polarization_T: Annotated[float, Field(ge=0.01, le=materials.MAX_POLARIZATION)]
+
+    @model_validator(mode="after")
+    def _possible(self) -> FroehlichKennellyCurve:
+        materials.froehlich_kennelly(self.initial_relative_permeability,
+                                     self.saturation_polarization_T)
+        return self
 
 
 class BrauerCurve(_Model):
@@ -479,9 +487,12 @@ def curve_of(study: Study) -> Curve | None:
                                             curve.saturation_polarization_T)
     if curve.kind == "steel":
         table = materials.read_table(materials.steels()[curve.name])
-    else:
-        assert curve.file is None  # a study from a file holds its numbers
+    elif curve.file is None:
         table = curve.H_A_per_m, curve.B_T
+    else:  # no file, no folder that the path would start from
+        raise StudyError(must_be("`iron_ring.curve.file`", f"study {study.name}",
+                                 "read together with the study's own file", f"'{curve.file}'",
+                                 "Use read_study, or give H_A_per_m and B_T."))
     return materials.table_curve(np.array(table[0]), np.array(table[1]))
 
 
@@ -501,12 +512,13 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
         table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:
         raise StudyError(must_be("`iron_ring.curve.file`", where, "a readable file",
-                                 f"'{path}' ({error.strerror})", "Check the path.")) from None
-    except ValidationError as error:
-        reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-        raise StudyError(f"H(B) table {path} of {where} cannot be used: {reason}.") from None
+                                 f"{str(path)!r} ({error.strerror})",
+                                 "Give its path from the study's folder.")) from None
     except ValueError as error:
-        raise StudyError(f"H(B) table {path} of {where} cannot be used: {error}.") from None
+        reason = (error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+                  if isinstance(error, ValidationError) else error)
+        raise StudyError(must_be("`iron_ring.curve.file`", where, "a table of H(B)",
+                                 f"{str(path)!r}, which cannot be used: {reason}")) from None
     return study.model_copy(update={"iron_ring": ring.model_copy(update={"curve": table})})
 
 

@@ -142,6 +142,47 @@ def test_bad_studies(study, tmp_path, capsys, edit, code, said):
     assert not list(out.glob("field_map*"))
 
 
+IRON = """
+[iron_ring]
+inner_radius_m = 0.1
+outer_radius_m = 0.12
+curve = { kind = "table", file = "iron.csv" }
+"""
+TABLE = "H_A_per_m,B_T\n0,0\n100,0.1\n160,0.25\n382,1.0\n758,1.3\n1837,1.5\n"
+
+
+@pytest.mark.parametrize(("edit", "said"), [
+    (("758,", "300,"), "H must rise"), ((",1.3", ",0.9"), "B must rise"),
+    (("0,0\n100,0.1\n160,0.25\n382,1.0\n", ""), "not 2; give more"),
+    ((",1.5", ",1500"), "mT or gauss"), ((",1.5", ",15000"), "mT or gauss"),
+    (("1837,", "1.837,"), "H must rise"), ((",0.1\n", ",-0.1\n"), "is negative"),
+    (("H_A_per_m,B_T", "B_T,H_A_per_m"), "exchanged"), (("382", "inf"), "is not finite"),
+    (("H_A_per_m", "H"), "its header must be H_A_per_m,B_T"), (("160", "many"), "line 4 must hold"),
+    ((TABLE, ""), "it is empty"), ((TABLE, "Fr\xf6hlich"), "UTF-8"), (None, "No such file")])
+def test_bad_iron(study, tmp_path, capsys, monkeypatch, edit, said):
+    """Refused before anything is made, wherever one stands."""
+    monkeypatch.chdir("/")
+    study.write_text(STUDY + IRON)
+    if edit:
+        assert edit[0] in TABLE
+        (tmp_path / "iron.csv").write_text(TABLE.replace(*edit, 1), encoding="latin-1")
+    before = sorted(tmp_path.rglob("*"))
+    code, sentence = refused(["solve", study, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert said in sentence
+    for named in (study, tmp_path / "iron.csv", "`iron_ring.curve.file`"):
+        assert str(named) in sentence
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_good_iron(study, tmp_path, capsys):
+    """The control of the above."""
+    study.write_text(STUDY + IRON)
+    (tmp_path / "iron.csv").write_text(TABLE)
+    assert main(["solve", str(study), "-o", str(tmp_path / "out"), "--json"]) == 0
+    assert 0.5 < json.loads(capsys.readouterr().out)["max_B_T"] < 0.7
+
+
 def test_bad_maps(study, measured, tmp_path, capsys):
     out = tmp_path / "out"
     measured.write_text(measured.read_text().replace("0.55", "nan", 1))

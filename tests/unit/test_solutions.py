@@ -14,7 +14,7 @@ from halbach_fe.errors import GetDPError, PointsOutsideError
 from halbach_fe.evaluation import coordinates, locate, probes_of, shape_functions
 from halbach_fe.mesh import build_meridian, build_mesh, verify_mesh
 from halbach_fe.routes import finite_element_part
-from halbach_fe.solutions import read_solutions, read_unknowns
+from halbach_fe.solutions import read_matrix, read_saved, read_solutions, read_unknowns
 from tests.conftest import circle
 
 
@@ -43,6 +43,119 @@ def test_damaged_solutions_are_refused(tmp_path, content, said):
         path.write_bytes(content)
     with pytest.raises(GetDPError, match=said):
         read_solutions(path, 3, 2)
+
+
+def matrix(rows, unknowns=3, identifier=1211216, lengths=None):
+    """PETSc's binary format of sparse rows, {column: value} each."""
+    lengths = lengths or [len(row) for row in rows]
+    columns = [column for row in rows for column in row]
+    values = [value for row in rows for value in row.values()]
+    return (np.array([identifier, unknowns, unknowns, len(values), *lengths, *columns], ">i4")
+            .tobytes() + np.array(values, ">f8").tobytes())
+
+
+ROWS = [{0: 1.0, 2: 2.0}, {}, {1: -3.5}]
+
+
+def test_a_matrix_comes_back(tmp_path):
+    path = tmp_path / "x.bin"
+    path.write_bytes(matrix(ROWS))
+    assert read_matrix(path, 3).toarray().tolist() == [[1, 0, 2], [0, 0, 0], [0, -3.5, 0]]
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (matrix(ROWS, unknowns=4), "another header"), (matrix(ROWS, identifier=1211214), "another"),
+    (vectors([[1.0, 2.0, 3.0]]), "another header"), (matrix(ROWS) + b"\0", "truncated"),
+    (matrix([{0: 1.0, 2: np.nan}, {}, {1: 1.0}]), "not finite"),
+    (matrix([{0: 1.0, 2: np.inf}, {}, {1: 1.0}]), "not finite"),
+    (matrix([{0: 1.0, 3: 2.0}, {}, {1: 1.0}]), "outside the matrix"),
+    (matrix([{0: 1.0, -1: 2.0}, {}, {1: 1.0}]), "outside the matrix"),
+    (matrix(ROWS, lengths=[4, -1, 0]), "outside the matrix"),
+    (None, "cannot be read")])
+def test_damaged_matrices_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.bin"
+    if content is not None:
+        assert content != matrix(ROWS)
+        path.write_bytes(content)
+    with pytest.raises(GetDPError, match=said):
+        read_matrix(path, 3)
+
+
+def test_every_truncation_of_a_matrix_is_refused(tmp_path):
+    path = tmp_path / "x.bin"
+    for cut in range(len(matrix(ROWS))):
+        path.write_bytes(matrix(ROWS)[:cut])
+        with pytest.raises(GetDPError, match="cannot be read"):
+            read_matrix(path, 3)
+
+
+def saved(rows):
+    """GetDP's .res file."""
+    return "$ResFormat /* GetDP 3.2.0, ascii */\n1.1 0\n$EndResFormat\n" + "".join(
+        f"$Solution  /* DofData #0 */\n0 0 0 {number}\n"
+        + "".join(f"{value!r}\n" for value in row) + "$EndSolution\n"
+        for number, row in enumerate(rows))
+
+
+SOLUTIONS = [[1.0, 2.0, 3e-17], [4.0, -5.0, 6.0]]
+
+
+def test_saved_solutions_come_back(tmp_path):
+    path = tmp_path / "x.res"
+    path.write_text(saved(SOLUTIONS))
+    assert read_saved(path, 3, 2).tolist() == SOLUTIONS
+
+
+def test_getdps_own_file_is_like_that(dipole, workshop, monkeypatch):
+    """What is made by hand here has the format of the real one."""
+    study = dipole(mesh__block_size_m=0.06, mesh__growth=3.0, iron_ring={
+        "inner_radius_m": 0.2, "outer_radius_m": 0.24,
+        "curve": {"kind": "steel", "name": "aisi_1010"}})
+    seen = []
+
+    def keep(path, unknowns, count):
+        seen.append((path.read_text(), unknowns, read_saved(path, unknowns, count)))
+        return seen[-1][2]
+
+    monkeypatch.setattr(solve, "read_saved", keep)
+    finite_element_part(study, circle(0.05, 5), workshop, columns=False)
+    for text, unknowns, solutions in seen:
+        real, ours = text.splitlines(), saved(solutions.tolist()).splitlines()
+        assert len(real) == len(ours)
+        assert real[3].split() == ours[3].split()
+        assert [float(line) for line in real[5:-1]] == [float(line) for line in ours[5:-1]]
+        assert len(ours) == unknowns + 6
+    assert seen
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (saved(SOLUTIONS[:1]), r"\(1, 3\) in place of 2 of 3"),
+    (saved([[1.0, 2.0], [4.0, 5.0]]), r"\(2, 2\) in place"),
+    (saved([[1.0, 2.0, 3.0], [4.0, 5.0]]), "cannot be read"), ("", "in place of 2"),
+    (saved([[1.0, 2.0, 3.0], [4.0, np.nan, 6.0]]).replace("np.", ""), "not finite"),
+    (saved([[1.0, 2.0, 3.0], [4.0, np.inf, 6.0]]), "not finite"),
+    (saved(SOLUTIONS).replace("4.0", "four"), "cannot be read"),
+    (saved(SOLUTIONS).replace("$Sol", "$Dof"), "in place of 2"), ("\xb5", "cannot be read"),
+    (None, "cannot be read")])
+def test_damaged_saved_solutions_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.res"
+    if content is not None:
+        path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(GetDPError, match=said):
+        read_saved(path, 3, 2)
+
+
+def test_every_truncation_of_saved_solutions_is_refused_or_complete(tmp_path):
+    """What ends behind the last line of numbers has them all."""
+    path, text = tmp_path / "x.res", saved(SOLUTIONS)
+    complete = text.rindex("6.0\n") + len("6.0\n")
+    for cut in range(len(text)):
+        path.write_text(text[:cut])
+        if cut < complete:
+            with pytest.raises(GetDPError):
+                read_saved(path, 3, 2)
+        else:
+            assert read_saved(path, 3, 2).tolist() == SOLUTIONS
 
 
 @pytest.mark.parametrize("content", [None, "", "$DofData /* #0 */\n0 0\n", "nonsense\n" * 9])

@@ -10,10 +10,16 @@ from hypothesis import strategies as st
 
 from halbach_fe.blocks import blocks_of
 from halbach_fe.errors import HalbachError, StudyError
-from halbach_fe.study import MU_0, parse_study, read_study
+from halbach_fe.study import MU_0, curve_of, parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed
 
 STUDIES = sorted((ROOT / "studies").rglob("*.toml"))
+H_B = {"H_A_per_m": [100.0, 160.0, 382.0, 758.0, 1837.0], "B_T": [0.1, 0.25, 1.0, 1.3, 1.5]}
+
+
+def iron(**curve):
+    """An iron ring with an H(B) curve."""
+    return {"inner_radius_m": 0.2, "outer_radius_m": 0.24, "curve": curve}
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.parent.name)
@@ -54,6 +60,26 @@ def test_studies_are_frozen(dipole):
      "must be below z_max_m"),
     ({"mesh__block_size_m": 8.0}, "is it in millimetres?"),
     ({"noise": {"regions": [{"name": "all", "sigma_T": -1e-4}]}}, "`noise.regions[0].sigma_T`"),
+    ({"iron_ring": {"inner_radius_m": 0.2, "outer_radius_m": 0.24}},
+     "exactly one of relative_permeability and curve"),
+    ({"iron_ring": iron(kind="table", **H_B) | {"relative_permeability": 100}},
+     "exactly one of relative_permeability and curve"),
+    ({"iron_ring": iron(kind="steel", name="1010")},
+     "there are aisi_1008, aisi_1010, pure_iron_rfe80, vacoflux_50."),
+    ({"iron_ring": iron(kind="steel", nme="aisi_1010")}, "Did you mean `name`?"),
+    ({"iron_ring": iron(kind="table")}, "give a file, or H_A_per_m and B_T."),
+    ({"iron_ring": iron(kind="table", file="x.csv", **H_B)}, "not both"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=H_B["H_A_per_m"], B_T=H_B["B_T"][:-1])},
+     "`iron_ring.curve` of study file x.toml must be consistent: H and B must be lists of equal"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=["a"], B_T=[1])}, "`iron_ring.curve.H_A_per_m[0]`"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=H_B["B_T"], B_T=H_B["H_A_per_m"])},
+     "`iron_ring.curve` of study file x.toml must be consistent: H and B look exchanged"),
+    ({"iron_ring": iron(kind="brauer", k1_m_per_H=1e6, k2_per_T2=1, k3_m_per_H=0)},
+     "k1 + k3 must be a reluctivity"),
+    ({"iron_ring": iron(kind="froehlich_kennelly", initial_relative_permeability=1000,
+                        saturation_polarization_T=2100)}, "Was it meant in millitesla?"),
+    ({"iron_ring": iron(kind="froehlich_kennelly", initial_relative_permeability=1e6,
+                        saturation_polarization_T=0.01)}, "must rise between the points"),
 ])
 def test_bad_values_are_refused_by_name(changes, said):
     with pytest.raises(StudyError) as caught:
@@ -74,6 +100,109 @@ def test_unreadable_files_are_refused(tmp_path, content, said):
     path = tmp_path / "study.toml"
     path.write_bytes(content)
     with pytest.raises(StudyError, match=said):
+        read_study(path)
+
+
+STUDY_WITH_TABLE = """
+name = "iron"
+dimension = 2
+mesh.block_size_m = 0.02
+[array]
+blocks_per_ring = 8
+inner_radius_m = 0.05
+outer_radius_m = 0.09
+remanence_T = 1.0
+block.shape = "sector"
+[iron_ring]
+inner_radius_m = 0.1
+outer_radius_m = 0.12
+curve = { kind = "table", file = "steels/mine.csv" }
+[observation]
+quantity = "flux_density"
+positions = { kind = "circles", radius_m = 0.03, angles = 10 }
+"""
+
+
+@pytest.fixture
+def with_table(tmp_path, monkeypatch):
+    """A study with its H(B) file in a folder beside it, read from elsewhere; and that file."""
+    folder = tmp_path / "study"
+    (folder / "steels").mkdir(parents=True)
+    (folder / "study.toml").write_text(STUDY_WITH_TABLE)
+    table = folder / "steels" / "mine.csv"
+    table.write_text("# made up\nH_A_per_m,B_T\n" + "".join(
+        f"{h},{b}\n" for h, b in zip(H_B["H_A_per_m"], H_B["B_T"], strict=True)))
+    monkeypatch.chdir(tmp_path)
+    return folder / "study.toml", table
+
+
+def test_a_table_is_found_beside_its_study_and_kept_as_numbers(with_table, dipole):
+    """What is downstream depends on what the file holds, not on what it is called."""
+    path, table = with_table
+    study = read_study(path)
+    curve = study.iron_ring.curve
+    assert (curve.file, list(curve.H_A_per_m), list(curve.B_T)) == (None, *H_B.values())
+    inline = dipole(iron_ring=iron(kind="table", **H_B)).iron_ring.curve
+    assert curve == inline
+    table.rename(table.with_name("other.csv"))
+    path.write_text(STUDY_WITH_TABLE.replace("mine.csv", "other.csv"))
+    assert read_study(path) == study
+    other = table.with_name("other.csv")
+    other.write_text(other.read_text().replace("100.0,", "101.0,"))
+    assert read_study(path) != study
+
+
+def test_every_kind_of_curve_is_a_curve(dipole):
+    for kind in ({"kind": "table", **H_B}, {"kind": "steel", "name": "aisi_1008"},
+                 {"kind": "froehlich_kennelly", "initial_relative_permeability": 1000,
+                  "saturation_polarization_T": 2.1},
+                 {"kind": "brauer", "k1_m_per_H": 3.8, "k2_per_T2": 2.17, "k3_m_per_H": 396.2}):
+        curve = curve_of(dipole(iron_ring=iron(**kind)))
+        assert 1.3 < curve.B[-1] - MU_0 * curve.H[-1] < 2.2
+    assert curve_of(dipole()) is None
+
+
+def test_a_file_needs_a_folder(dipole):
+    """A study that was not read from a file does not know where its table is."""
+    with pytest.raises(StudyError, match=r"`iron_ring\.curve\.file` of study dipole .*read_study"):
+        curve_of(dipole(iron_ring=iron(kind="table", file="x.csv")))
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    (b"758.0", b"300.0", "H must rise from point to point"),
+    (b",1.3", b",0.9", "B must rise from point to point"),
+    (b"100.0,0.1\n160.0,0.25\n382.0,1.0\n", b"", "needs 4 to 10000 points"),
+    (b"1837.0,1.5", b"1837.0,1500", "is it in mT or gauss?"),
+    (b"1837.0,1.5", b"1837.0,-1.5", "is negative; give the first quadrant only"),
+    (b"1837.0,1.5", b"1837.0,nan", "is not finite"),
+    (b"H_A_per_m,B_T", b"B_T,H_A_per_m", "H and B look exchanged"),
+    (b"H_A_per_m,B_T", b"H_kA_per_m,B_T", "its header must be H_A_per_m,B_T, not 'H_kA_per_m,B_T'"),
+    (b"160.0,0.25", b"160.0,0.25 about", "line 4 must hold two numbers"),
+    (b"# made up", b"# Fr\xf6hlich", "it must be UTF-8 text"),
+    (None, b"", "it is empty"),
+    (None, None, "No such file")])
+def test_bad_tables_are_refused_with_their_place(with_table, old, new, said):
+    """Study, key and table are named."""
+    path, table = with_table
+    read_study(path)  # the control
+    content = table.read_bytes()
+    assert old is None or old in content
+    table.unlink()
+    if new is not None:
+        table.write_bytes(new if old is None else content.replace(old, new))
+    with pytest.raises(StudyError) as caught:
+        read_study(path)
+    sentence = str(caught.value)
+    assert said in sentence
+    assert sentence.startswith(f"Input `iron_ring.curve.file` of study file {path} must be")
+    assert str(table) in sentence
+
+
+@pytest.mark.parametrize("name", [".", "steels", "no\\u0000name", "two\\nlines"])
+def test_files_that_cannot_be_are_refused_in_one_line(with_table, name):
+    path, _ = with_table
+    path.write_text(STUDY_WITH_TABLE.replace("steels/mine.csv", name))
+    with pytest.raises(StudyError, match=r"^Input `iron_ring\.curve\.file` of .*\.$"):
         read_study(path)
 
 
