@@ -11,8 +11,10 @@ import xarray as xr
 
 from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of, position_angle_deg
-from halbach_fe.errors import MeasurementError, StudyError
+from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.field_map import field_map
+from halbach_fe.nonlinear import newton_readings
+from halbach_fe.observation import observe
 from halbach_fe.report.inference import write_report
 from halbach_fe.study import MU_0
 from halbach_fe.update import infer, write_update
@@ -180,3 +182,41 @@ def test_readings_that_vanish_by_symmetry(short_dipole, workshop):
     write_update(update, workshop.folder)
     write_report(update, workshop.folder)
     assert "Infinity" not in (workshop.folder / "summary.json").read_text()
+
+
+CURVE = {"inner_radius_m": 0.19, "outer_radius_m": 0.192,
+         "curve": {"kind": "steel", "name": "aisi_1010"}}
+
+
+def saturated_campaign(dipole, generator, workshop, spread):
+    """A 2D map of a dipole in a saturated ring, by Newton's method on a finer mesh."""
+    changes = {"iron_ring": CURVE, "noise": NOISE, "observation__components": ["x", "y"],
+               "prior": {"magnitude_sd": spread, "direction_sd_deg": np.degrees(spread)}}
+    study = dipole(**changes, mesh__block_size_m=0.007)
+    points = np.vstack([circle(0.075, 40), circle(0.09, 40)])
+    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    size = np.linalg.norm(nominal[:2])
+    truth = nominal + spread * size * generator.standard_normal(len(nominal))
+    finer = dipole(**changes, mesh__block_size_m=0.005)
+    observation = observe(finer, points, np.ones((len(points), 3), bool))
+    readings = newton_readings(finer, observation, workshop, truth[None])[0]
+    field = np.full((len(points), 3), np.nan)
+    field[:, :2] = readings.reshape(-1, 2) + 1e-5 * generator.standard_normal((len(points), 2))
+    return study, field_map(points, field), truth
+
+
+def test_saturated_iron_is_linearized(dipole, generator, workshop):
+    """Errors of 0.1 % leave the iron's tangent good enough; without the offset nothing fits."""
+    study, data, truth = saturated_campaign(dipole, generator, workshop, 0.001)
+    update = infer(study, data, workshop)
+    score = (update.posterior.mean - truth) / update.posterior.sd
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)  # 32 values: sd 0.13
+    assert update.prior_conflict < update.conflict_limit
+    shift = np.abs(update.response.offset) / update.sigma
+    assert shift.max() > 10
+
+
+def test_iron_that_is_too_far_from_linear_is_said(dipole, generator, workshop):
+    study, data, _ = saturated_campaign(dipole, generator, workshop, 0.05)
+    with pytest.warns(HalbachWarning, match="needs the non-linear posterior"):
+        infer(study, data, workshop)
