@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from halbach_fe.blocks import Floats, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
-from halbach_fe.inference.linear import chi2_per_reading, posterior, predict, prior_conflict
+from halbach_fe.inference import linear
+from halbach_fe.inference.linear import chi2_per_reading, predict
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
@@ -89,6 +90,8 @@ class Update:
     prediction_prior: Prediction
     prediction_posterior: Prediction
     prior_conflict: float
+    parameters_learnt: float
+    log_evidence: float
 
     @property
     def sigma(self) -> Floats:
@@ -193,15 +196,17 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
     before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                          study.prior.direction_sd_deg, study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
-    linear = (readings - model.offset)[~keep]
-    after = posterior(model.matrix[~keep], linear, sigma[~keep], before)
+    learnt = linear.update(
+        model.matrix[~keep], (readings - model.offset)[~keep], sigma[~keep], before)
+    after = learnt.distribution
     if is_nonlinear(study):
         _check_linearization(study, observation, workshop, model, after.mean, sigma)
     return Update(
         study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
-        prior_conflict=prior_conflict(model.matrix[~keep], linear, sigma[~keep], before))
+        prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
+        log_evidence=learnt.log_evidence)
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -269,6 +274,10 @@ def summary(update: Update) -> dict[str, object]:
         "largest_solver_error_over_noise": float((update.response.error / update.noise).max()),
         "prior_conflict": update.prior_conflict,
         "prior_conflict_limit": update.conflict_limit,
+        "parameters_learnt": update.parameters_learnt,
+        "log_evidence": update.log_evidence,
+        "contraction_by_block": linear.contraction(
+            update.prior, update.posterior, update.study.dimension).round(6).tolist(),
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
         "scores": [asdict(score) for score in update.scores],

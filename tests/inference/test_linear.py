@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from halbach_fe.errors import StudyError
+from halbach_fe.inference import linear
 from halbach_fe.inference.linear import (
     chi2_per_reading,
+    contraction,
     posterior,
     predict,
-    prior_conflict,
+    update,
 )
 from halbach_fe.inference.prior import Gaussian, block_prior
 
@@ -65,7 +68,7 @@ def test_against_brute_force_sampling(generator):
 
 def test_sound_where_the_textbook_formula_breaks(generator):
     """Two readings that differ by 1e-7: the normal equations square that and lose the
-    difference in rounding, the QR keeps half of the digits.
+    difference in rounding; the QR, which takes over, keeps half of the digits.
     """
     prior = Gaussian(np.zeros(2), np.eye(2))
     matrix = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]])
@@ -127,7 +130,7 @@ def test_prior_conflict_is_the_prior_predictive_distance(generator):
     covariance = matrix @ prior.covariance @ matrix.T + np.diag(sigma**2)
     residual = readings - matrix @ prior.mean
     expected = residual @ np.linalg.solve(covariance, residual) / len(readings)
-    assert prior_conflict(matrix, readings, sigma, prior) == pytest.approx(expected)
+    assert update(matrix, readings, sigma, prior).conflict == pytest.approx(expected)
 
 
 def test_prior_conflict_sees_noise_that_was_understated(generator):
@@ -137,8 +140,51 @@ def test_prior_conflict_sees_noise_that_was_understated(generator):
     truth = prior.sample(1, generator)[0]
     noise = sigma * generator.standard_normal(40)
     # 40 readings: sd 0.22
-    assert prior_conflict(matrix, matrix @ truth + noise, sigma, prior) < 1.9
-    assert prior_conflict(matrix, matrix @ truth + 10 * noise, sigma, prior) > 1.9
+    assert update(matrix, matrix @ truth + noise, sigma, prior).conflict < 1.9
+    assert update(matrix, matrix @ truth + 10 * noise, sigma, prior).conflict > 1.9
+
+
+def test_evidence_and_parameters_learnt(generator):
+    """Against the density of the readings, and the trace of the textbook's matrices."""
+    matrix, readings, sigma, prior = problem(generator)
+    found = update(matrix, readings, sigma, prior)
+    predictive = stats.multivariate_normal(
+        matrix @ prior.mean, matrix @ prior.covariance @ matrix.T + np.diag(sigma**2))
+    assert found.log_evidence == pytest.approx(predictive.logpdf(readings))
+    learnt = np.trace(np.eye(5) - found.distribution.covariance @ np.linalg.inv(prior.covariance))
+    assert found.learnt == pytest.approx(learnt)
+    # many vague readings teach little, exact ones everything
+    assert update(matrix, readings, sigma * 1e3, prior).learnt < 1e-2
+    assert update(matrix, readings, sigma * 1e-3, prior).learnt == pytest.approx(5, abs=1e-4)
+
+
+def test_chunks_of_readings_add_up(generator, monkeypatch):
+    case = problem(generator, 50, 5)
+    whole = update(*case)
+    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 7)
+    parts = update(*case)
+    np.testing.assert_allclose(parts.distribution.mean, whole.distribution.mean, rtol=1e-10)
+    assert parts.log_evidence == pytest.approx(whole.log_evidence, rel=1e-12)
+    np.testing.assert_allclose(predict(case[0], parts.distribution)[1],
+                               predict(case[0], whole.distribution)[1], rtol=1e-9)
+
+
+def test_both_ways_agree(generator, monkeypatch):
+    """Cholesky and, where it would lose digits, QR."""
+    case = problem(generator, 50, 5)
+    one = update(*case)
+    monkeypatch.setattr(linear, "WORST_CONDITION", 0.0)
+    other = update(*case)
+    np.testing.assert_allclose(other.distribution.covariance, one.distribution.covariance,
+                               rtol=1e-9)
+    assert other.learnt == pytest.approx(one.learnt)
+    assert other.log_evidence == pytest.approx(one.log_evidence)
+
+
+def test_contraction_by_block(generator):
+    prior = Gaussian(np.zeros(4), np.eye(4))
+    after = Gaussian(np.zeros(4), np.diag([1.0, 1.0, 0.1, 0.1]))
+    assert contraction(prior, after, 2) == pytest.approx([0.0, 0.99])
 
 
 def test_block_prior_along_and_across(generator):
