@@ -74,6 +74,12 @@ class OutputError(HalbachError):
     exit_code = 8
 
 
+class SamplingError(HalbachError):
+    """A posterior was not sampled well enough to be reported."""
+
+    exit_code = 10
+
+
 class CheckFailedError(HalbachError):
     """A self-check ran and its figure was out of bounds."""
 
@@ -91,6 +97,7 @@ EXIT_CODES: dict[int, str] = {
     GetDPError.exit_code: "GetDP failed or its answer did not pass verification",
     OutputError.exit_code: "results could not be written or read back",
     CheckFailedError.exit_code: "a self-check failed",
+    SamplingError.exit_code: "the posterior was not sampled well enough",
     130: "interrupted (Ctrl-C)",
 }
 
