@@ -132,11 +132,11 @@ def vector_potential(dipole: Dipole, mesh: ngs.Mesh, order: int, points: np.ndar
         solution.vec.data = inverse_a * right
         solution.vec.data += a.harmonic_extension * solution.vec
         solution.vec.data += a.inner_solve * f.vec
-        fields.append(_at(ngs.curl(solution), mesh, points))
+        fields.append(even_field(ngs.curl(solution), mesh, points))
     return fields[0] - fields[1]
 
 
-def _at(field, mesh: ngs.Mesh, points: np.ndarray) -> np.ndarray:
+def even_field(field, mesh: ngs.Mesh, points: np.ndarray) -> np.ndarray:
     """An even-in-z, symmetric field in the octant at any points, by its symmetries."""
     sign = np.where(points < 0, -1.0, 1.0)
     where = np.abs(points)
