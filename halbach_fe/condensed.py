@@ -138,8 +138,10 @@ class Condensed:
             slope = self._added_slope(parameters, added, self._factorize(own + added))
         return self.linear + self.readings @ slope[self.surface]
 
-    def flux(self, parameters: Floats) -> Floats:
-        """Size (m,) of the field at the iron's Gauss points, in T."""
+    def iron_field(self, parameters: Floats) -> Floats:
+        """Size (m,) in T of what the law starts from at the iron's Gauss points: B by the vector
+        potential, mu_0 H by the scalar one.
+        """
         own = self.potential @ parameters
         added, _ = self._newton(own, self._state.added)
         return np.sqrt(self._square(self._field(own + added)))

@@ -22,7 +22,6 @@ import scipy.linalg as linalg
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import SamplingError
-from halbach_fe.inference import linear
 from halbach_fe.inference.prior import Gaussian
 
 Model = Callable[[Floats], Floats]

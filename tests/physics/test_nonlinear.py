@@ -93,7 +93,7 @@ def test_the_fixture_saturates(saturated):
     """2.07 T, that is J_s and 0.07 T, where nothing but mu_0 is left of the permeability; at the
     nominal dipole's directions the same ring has 0.4 T.
     """
-    flux = saturated.model.condensed.flux(saturated.model.nominal)
+    flux = saturated.model.condensed.iron_field(saturated.model.nominal)
     assert 2.03 < flux.max() < 2.15
     assert flux.min() < 0.2  # and some of it does not
 
@@ -528,7 +528,7 @@ def test_condensed_engine_in_3d(getdp, tmp_path, generator):
         observation__positions={"kind": "circles", "radius_m": 0.05, "angles": 6}))
     workshop, observation = Workshop(getdp, tmp_path, jobs=2), observation_of(study)
     model = nonlinear_model(study, observation, workshop, generator)
-    assert model.condensed.flux(model.nominal).max() > 0.01
+    assert model.condensed.iron_field(model.nominal).max() > 0.01
     samples = 8e5 * generator.standard_normal((2, 12))
     assert verify(model, study, observation, workshop, samples, cold=True) <= AGREEMENT_T
     potential = model.condensed.potential.copy()
