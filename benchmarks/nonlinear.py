@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import resource
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import ngsolve
 import numpy as np
 
 from benchmarks.note import Note
 from halbach_fe import getdp as runner
 from halbach_fe.cli import common
+from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.getdp import find_getdp
 from halbach_fe.inference.prior import block_prior
 from halbach_fe.mesh import build_mesh, verify_mesh
 from halbach_fe.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.observation import observe, points_from
-from halbach_fe.solve import CROSS_SECTION, Workshop, stage
+from halbach_fe.routes import exact_part, finite_element_part
+from halbach_fe.solve import CROSS_SECTION, Workshop, newton_history, stage
 from halbach_fe.study import Study, read_study
+from tests.oracles import dipole_of, iron_of, ngsolve_model, ngsolve_nonlinear
 
-STUDY = Path(__file__).parent.parent / "studies" / "sensitivity" / "study.toml"
+STUDIES = Path(__file__).parent.parent / "studies"
+STUDY, FASER_IRON = STUDIES / "sensitivity" / "study.toml", STUDIES / "faser" / "iron.toml"
 SAMPLES, HARD = 180, 20
 """Magnetizations compared with GetDP: from the prior, and with random directions in all blocks,
 which saturate the iron, from a cold start."""
@@ -47,8 +53,43 @@ def getdp_seconds(study: Study, samples: np.ndarray, folder: Path) -> float:
     return time.monotonic() - started
 
 
+def faser(note: Note) -> None:
+    """The whole dipole in 3D, in a thin tube that saturates, against NGSolve."""
+    study = read_study(FASER_IRON)
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool))
+    common.say("FASER dipole in a tube that saturates, in 3D")
+    with tempfile.TemporaryDirectory() as name:
+        workshop = Workshop(find_getdp(), Path(name), jobs=2)
+        started = time.monotonic()
+        part = finite_element_part(study, points, workshop, columns=False).nominal
+        note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
+             f"Newton's method, {len(newton_history(workshop.folder)) - 1} steps")
+        started = time.monotonic()
+        stated = reading_errors(study, observation, part, error_workshop(workshop))
+        note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
+             "the dual formulation, Newton's method again")
+    note("nonlinear.faser_3d_memory_GiB", sum(resource.getrusage(who).ru_maxrss for who in (
+        resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN, resource.RUSAGE_CHILDREN)) / 2**20,
+        "GiB", "peak of this process and of two of GetDP's")
+    main_field = float(np.abs(exact_part(study, points) + part).max())
+    common.say("the same by NGSolve")
+    dipole, iron = dipole_of(study), iron_of(study.iron_ring)
+    with ngsolve.TaskManager():
+        mesh = ngsolve_model.eighth(dipole, 0.02, bore_size=0.04, far=3.0, grading=0.35)
+        theirs = ngsolve_nonlinear.potential_reaction(dipole, iron, mesh, 3, points)
+    difference = np.abs(observation.apply(part) - observation.apply(theirs))
+    note("nonlinear.faser_3d_error", float(difference.max()) / main_field, "of the main field",
+         "NGSolve, scalar potential of order 3, curved; fringe included")
+    note("nonlinear.faser_3d_stated_error", float(stated.max()) / main_field, "of the main field",
+         "largest error bar")
+    note("nonlinear.faser_3d_within_bars", float(np.mean(difference <= stated)), "of the readings",
+         "NGSolve")
+
+
 def run(note: Note) -> None:
     """Measure and note."""
+    faser(note)
     study = read_study(STUDY)
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool))

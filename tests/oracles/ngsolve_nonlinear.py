@@ -142,16 +142,18 @@ def section_field(section: Section, mesh: ngs.Mesh, order: int, points: np.ndarr
 
 
 def potential_reaction(
-    dipole: Dipole, remanence: tuple[float, float, float], iron: Iron, mesh: ngs.Mesh, order: int,
-    points: np.ndarray,
+    dipole: Dipole, iron: Iron, mesh: ngs.Mesh, order: int, points: np.ndarray,
+    remanence: tuple[float, float, float] | None = None,
 ) -> np.ndarray:
-    """What permeability and iron add to B (n, 3) in T at points of a ring whose blocks are all
-    magnetized along x, by the scalar potential in an octant: real materials minus vacuum.
+    """What permeability and iron add to B (n, 3) in T at points, by the scalar potential in an
+    octant: real materials minus vacuum. With ``remanence`` all blocks have the same, along x.
 
     The potential vanishes on x = 0, which B crosses at right angles.
     """
     space = ngs.H1(mesh, order=order, dirichlet="far|x0")
     u, v = space.TnT()
+    source = mesh.MaterialCF({f"block{b}": remanence or dipole.remanence_of(b)
+                              for b in range(dipole.blocks)}, default=(0.0, 0.0, 0.0))
     fields = []
     for real in (True, False):
         mu = mesh.MaterialCF({"block.*": dipole.permeability if real else 1.0}, default=1.0)
@@ -160,7 +162,7 @@ def potential_reaction(
                                  default=mu)
         form = ngs.BilinearForm(space)
         form += mu * ngs.grad(u) * ngs.grad(v) * ngs.dx
-        form += -ngs.CF(remanence) * ngs.grad(v) * ngs.dx("block.*")
+        form += -source * ngs.grad(v) * ngs.dx("block.*")
         solution = ngs.GridFunction(space)
         newton(form, solution)
         fields.append(even_field(-ngs.grad(solution), mesh, points))

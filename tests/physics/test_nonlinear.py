@@ -270,7 +270,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     with ngsolve.TaskManager():
         mesh = ngsolve_model.eighth(dipole, 0.09)
         theirs, lower, never = (ngsolve_nonlinear.potential_reaction(
-            dipole, (0.4, 0.0, 0.0), law, mesh, order, points)
+            dipole, law, mesh, order, points, (0.4, 0.0, 0.0))
             for order, law in ((3, iron), (2, iron), (2, replace(iron, saturation=200.0))))
     ours = observation.apply(part)
     theirs, lower, never = (observation.apply(field) for field in (theirs, lower, never))
