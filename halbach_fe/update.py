@@ -17,11 +17,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference.linear import chi2_per_reading, posterior, predict, prior_conflict
 from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
     Observation,
@@ -75,7 +77,10 @@ class RegionScore:
 
 @dataclass(frozen=True)
 class Update:
-    """A study, a map, and what the one says about the other."""
+    """A study, a map, and what the one says about the other.
+
+    ``measured_blocks`` is how many blocks the prior was measured of; None if it is the study's.
+    """
 
     study: Study
     observation: Observation
@@ -89,6 +94,7 @@ class Update:
     prediction_prior: Prediction
     prediction_posterior: Prediction
     prior_conflict: float
+    measured_blocks: int | None = None
 
     @property
     def sigma(self) -> Floats:
@@ -136,7 +142,9 @@ class Update:
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 
-def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
+def infer(
+    study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None
+) -> Update:
     """Update the block magnetizations of a study with a measured map.
 
     Parameters
@@ -146,12 +154,15 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         As `halbach_fe.field_map.read_map` returns it.
     workshop : Workshop
         Its folder receives the mesh, the run folders and the response matrix.
+    blocks : BlockTable, optional
+        Measured blocks, whose prior takes the place of the study's.
 
     Raises
     ------
     MeasurementError
-        If the map does not fit the study.
+        If the map or the blocks do not fit the study.
     """
+    measured = None if blocks is None else prior_from_blocks(study, blocks)
     points = points_of(data)
     if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise MeasurementError(must_be(
@@ -190,8 +201,9 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         model = response(study, observation, workshop)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
-    before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
-                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    before = measured.gaussian if measured else block_prior(
+        model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
+        study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
     linear = (readings - model.offset)[~keep]
     after = posterior(model.matrix[~keep], linear, sigma[~keep], before)
@@ -201,7 +213,8 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
-        prior_conflict=prior_conflict(model.matrix[~keep], linear, sigma[~keep], before))
+        prior_conflict=prior_conflict(model.matrix[~keep], linear, sigma[~keep], before),
+        measured_blocks=measured.count if measured else None)
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -264,6 +277,7 @@ def summary(update: Update) -> dict[str, object]:
         "readings": len(update.readings),
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
+        "measured_blocks": update.measured_blocks,
         "superposition_error": update.response.superposition_error,
         "largest_solver_error_T": float(update.response.error.max()),
         "largest_solver_error_over_noise": float((update.response.error / update.noise).max()),
