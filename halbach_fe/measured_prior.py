@@ -116,44 +116,35 @@ def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
     slots = types_of(study)
     _check_places(study, table, slots)
     index = _block_of_rows(study, table, slots)
-    length = np.array([np.linalg.norm(block.magnetization) for block in blocks])
-    axes = np.array([_axes(block) for block in blocks])
     conversion = _conversions(study, table, blocks, index)
-    moment = _at_reference_temperature(study, table)
-    measured = np.einsum("nij,nj->ni", conversion, moment)  # A/m, along the array's axes
-    deviations = np.einsum("nji,nj->ni", axes[index], measured) / length[index, None]
-    deviations[:, 0] -= 1
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    frames = np.array([_frame(block) for block in blocks])
+    deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
     _check_near(table, deviations)
-    deviations = deviations[:, :size]
-    members = {label: np.flatnonzero(np.array(table.type) == label) for label in slots}
+    deviations, frames = deviations[:, :size], frames[:, :size, :size]
+    members = {label: deviations[np.array(table.type) == label] for label in slots}
     placed = bool(table.ring.any())
+    intensities: dict[str, float | None] = dict.fromkeys(slots)
     mean, own = np.zeros((len(blocks), size)), np.zeros((len(blocks), size, size))
-    shared, intensities = np.zeros((len(blocks), size, 0)), dict.fromkeys(slots)
-    frames = axes[:, :size, :size] * length[:, None, None]
-    slot_of = np.array([block.slot for block in blocks])
+    shared = [np.zeros((len(blocks), size, 0))]
     if placed:
         rows = np.flatnonzero(table.ring)
         mean[index[rows]] = measured[rows, :size]
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(study, blocks, slots, length, axes)
-        columns = []
-        for label, rows in members.items():
-            _check_samples(table, label, deviations[rows])
-            covariance, intensities[label] = predictive_covariance(deviations[rows])
-            chosen = np.isin(slot_of, slots[label])
-            mean[chosen] = frames[chosen] @ (np.eye(size)[0] + deviations[rows].mean(axis=0))
-            own[chosen] = frames[chosen] @ covariance @ frames[chosen].transpose(0, 2, 1)
-            root = np.linalg.cholesky(covariance / len(rows))  # of the mean
-            columns.append(np.where(chosen[:, None, None], frames @ root, 0.0))
-        shared = np.concatenate(columns, axis=2)
-    gaussian = measured_prior(mean, own, shared, np.radians(study.prior.mounting_sd_deg),
-                              study.prior.common_mode_sd)
-    tests = np.array([[anderson_darling(column)[1] for column in deviations[rows].T]
-                      for rows in members.values()])
-    types = tuple(TypeSamples(label, deviations[rows], intensities[label], p) for (label, rows), p
-                  in zip(members.items(), holm(tests.ravel()).reshape(tests.shape), strict=True))
+        _check_alike(study, blocks, slots)
+        slot_of = np.array([block.slot for block in blocks])
+        for label, samples in members.items():
+            _check_samples(table, label, samples)
+            covariance, intensities[label] = predictive_covariance(samples)
+            frame = np.where(np.isin(slot_of, slots[label])[:, None, None], frames, 0.0)
+            mean += frame @ (np.eye(size)[0] + samples.mean(axis=0))
+            own += frame @ covariance @ frame.transpose(0, 2, 1)
+            shared.append(frame @ np.linalg.cholesky(covariance / len(samples)))  # of the mean
+    gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
+                              np.radians(study.prior.mounting_sd_deg), study.prior.common_mode_sd)
+    types = _tested(members, intensities)
     odd = [one.label for one in types if not one.normal]
     if odd and not placed:
         warnings.warn(
@@ -164,16 +155,27 @@ def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
     return MeasuredPrior(gaussian, nominal, placed, types)
 
 
+def _tested(
+    members: dict[str, Floats], intensities: dict[str, float | None]
+) -> tuple[TypeSamples, ...]:
+    """The samples of every type with their tests of normality."""
+    p = holm(np.array([anderson_darling(column)[1] for samples in members.values()
+                       for column in samples.T])).reshape(len(members), -1)
+    return tuple(TypeSamples(label, samples, intensities[label], row)
+                 for (label, samples), row in zip(members.items(), p, strict=True))
+
+
 def types_of(study: Study) -> dict[str, tuple[int, ...]]:
     """Slots of every type of block, by its label."""
     return study.prior.types or {
         str(slot): (slot,) for slot in range(1, study.array.blocks_per_ring + 1)}
 
 
-def _axes(block: MagnetBlock) -> Floats:
-    """`DIRECTIONS` of a block as columns (3, 3), in the array's axes."""
+def _frame(block: MagnetBlock) -> Floats:
+    """`DIRECTIONS` of a block as columns (3, 3), as long as its nominal magnetization in A/m."""
     x, y, _ = block.easy_axis
-    return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+    axes = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+    return axes * float(np.linalg.norm(block.magnetization))
 
 
 def _of_block(study: Study, block: MagnetBlock, tensor: Floats) -> Floats:
@@ -294,23 +296,22 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    study: Study, blocks: tuple[MagnetBlock, ...], slots: dict[str, tuple[int, ...]],
-    length: Floats, axes: Floats,
+    study: Study, blocks: tuple[MagnetBlock, ...], slots: dict[str, tuple[int, ...]]
 ) -> None:
-    """Blocks of one type must be the same block, as seen from their own axes."""
-    unit = [replace(block, z_min=-0.5, z_max=0.5) if study.dimension == 2 else block
-            for block in blocks]
-    tensors = demagnetizing_tensors(unit)
-    seen = np.array([
-        axis.T @ _of_block(study, block, tensor) / (block.volume * size)
-        for axis, block, tensor, size in zip(axes, unit, tensors, length, strict=True)])
+    """Blocks of one type must be the same block, as seen from their own axes: a moment must mean
+    the same deviation from the nominal magnetization.
+    """
+    finite = [replace(block, z_min=0.0, z_max=1.0) if study.dimension == 2 else block
+              for block in blocks]
+    tensors = demagnetizing_tensors(finite)
+    seen = np.array([np.linalg.solve(_frame(block), _of_block(study, block, tensor)) / block.volume
+                     for block, tensor in zip(finite, tensors, strict=True)])
     for label, own in slots.items():
-        same = [number for number, block in enumerate(blocks) if block.slot in own]
-        for number in same:
-            if not np.allclose(seen[number], seen[same[0]], rtol=1e-6, atol=1e-6 * np.abs(
-                    seen[same[0]]).max()):
+        first, *others = [number for number, block in enumerate(blocks) if block.slot in own]
+        for number in others:
+            if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():
                 raise StudyError(must_be(
                     f"`prior.types.{label}`", f"study {study.name}",
                     "blocks that are alike from their own axes",
-                    f"{blocks[same[0]].name} and {blocks[number].name}, of another magnetization, "
+                    f"{blocks[first].name} and {blocks[number].name}, of another magnetization, "
                     "permeability or shape", "Give ring and slot of every measured block."))

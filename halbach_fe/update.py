@@ -162,7 +162,7 @@ def infer(
     MeasurementError
         If the map or the blocks do not fit the study.
     """
-    measured = None if blocks is None else prior_from_blocks(study, blocks)
+    of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
     points = points_of(data)
     if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise MeasurementError(must_be(
@@ -201,7 +201,7 @@ def infer(
         model = response(study, observation, workshop)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
-    before = measured.gaussian if measured else block_prior(
+    before = of_blocks.gaussian if of_blocks else block_prior(
         model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
@@ -214,7 +214,7 @@ def infer(
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
         prior_conflict=prior_conflict(model.matrix[~keep], linear, sigma[~keep], before),
-        measured_blocks=measured.count if measured else None)
+        measured_blocks=of_blocks.count if of_blocks else None)
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:

@@ -72,8 +72,8 @@ def write_prior(study: Study, prior: MeasuredPrior, folder: Path) -> None:
     write_text(folder / "prior.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({"prior_qq.png": (
         _quantiles(prior), "Standardized deviations of all blocks from the mean of their type "
-        "against normal quantiles; between the grey lines lie 95 % of normal samples of the same "
-        "numbers")}, folder)
+        "against normal quantiles; each point of normal samples of the same numbers lies between "
+        "the dashed lines 95 times in 100")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=study, prior=prior,
                summary=summary, rows=type_table(prior), level=NOT_NORMAL)
 
