@@ -441,13 +441,13 @@ def test_calibration_of_the_coil_is_not_mistaken_for_a_discovery(dipole, generat
     errors = [(update.posterior.mean - truth).reshape(16, 2) for update in (good, bad)]
     along = [np.sum(error * nominal.reshape(16, 2), axis=1) / np.linalg.norm(nominal[:2]) ** 2
              for error in errors]
-    # 16 blocks of 0.1 %: the mean is known to 0.025 %, 4 sd
-    assert abs(along[0].mean()) < 0.001
-    assert along[1].max() > 0.003
+    # of four draws: mean 5e-5 with the common mode, 1.2e-3 to 1.4e-3 without
+    assert abs(along[0].mean()) < 3e-4
+    assert along[1].mean() > 1e-3
     score = [np.sqrt(np.mean(((update.posterior.mean - truth) / update.posterior.sd) ** 2))
              for update in (good, bad)]
     assert score[0] == pytest.approx(1.0, abs=0.5)  # 32 values: sd 0.13
-    assert score[1] > 2
+    assert score[1] > 2  # 2.2 to 2.6
     assert good.prior_conflict < good.conflict_limit
     assert bad.prior_conflict > bad.conflict_limit
     assert good.measured_blocks == 16
