@@ -25,15 +25,20 @@ from halbach_fe.solve import Workshop
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
     """STUDY, -o, and the options of every verb that solves."""
-    parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
-                        help="folder for results; made if it does not exist")
+    add_study_and_output(parser)
     parser.add_argument("--jobs", type=positive, default=min(2, os.cpu_count() or 1), metavar="N",
                         help="GetDP processes at a time (default: %(default)s)")
     parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
                         help="for each GetDP process (default: %(default)g)")
     add_getdp_argument(parser)
     add_json_argument(parser)
+
+
+def add_study_and_output(parser: argparse.ArgumentParser) -> None:
+    """STUDY and -o."""
+    parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                        help="folder for results; made if it does not exist")
 
 
 def add_getdp_argument(parser: argparse.ArgumentParser) -> None:

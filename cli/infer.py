@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
 from halbach_fe.field_map import read_map
 from halbach_fe.study import read_study
@@ -19,6 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
+    parser.add_argument("--blocks", type=Path, metavar="CSV",
+                        help="moments of the single blocks, in place of the study's prior")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -29,8 +32,9 @@ def run(arguments: argparse.Namespace) -> int:
     )
 
     study, data = read_study(arguments.study), read_map(arguments.measurements)
+    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.workshop(arguments) as workshop:
-        update = infer(study, data, workshop)
+        update = infer(study, data, workshop, blocks)
     if update.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
     write_update(update, arguments.output)

@@ -27,7 +27,7 @@ class StudyError(HalbachError):
 
 
 class MeasurementError(HalbachError):
-    """The measured map cannot be read, or holds values that cannot be readings."""
+    """A measured map or block table cannot be read, or holds what cannot have been measured."""
 
     exit_code = 4
 
@@ -91,7 +91,7 @@ EXIT_CODES: dict[int, str] = {
     1: "unexpected error (a bug: please report it)",
     2: "wrong command line",
     StudyError.exit_code: "study file refused",
-    MeasurementError.exit_code: "measured map refused",
+    MeasurementError.exit_code: "measured map or block table refused",
     MeshError.exit_code: "mesh could not be built or verified",
     GetDPNotFoundError.exit_code: "GetDP not found",
     GetDPError.exit_code: "GetDP failed or its answer did not pass verification",

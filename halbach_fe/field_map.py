@@ -18,7 +18,7 @@ import io
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -91,20 +91,94 @@ def read_map(path: str | Path) -> xr.Dataset:
         With one sentence that names the file, the line and what to do.
     """
     path = Path(path)
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise MeasurementError(must_be("path", f"map {path}", "a readable file",
-                                       f"'{error.strerror}'", "Check the path.")) from None
-    if not raw.strip():
-        raise MeasurementError(must_be("content", f"map {path}", "a table of readings",
-                                       "an empty file"))
+    raw = file_bytes(path, f"map {path}")
     if path.suffix in (".h5", ".hdf5", ".nc"):
         data = _read_hdf5(path)
     else:
         data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
     _check(data, path)
     return data
+
+
+def file_bytes(path: Path, where: str) -> bytes:
+    """Content of a file of measurements; MeasurementError if there is none."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise MeasurementError(must_be("path", where, "a readable file", f"'{error.strerror}'",
+                                       "Check the path.")) from None
+    if not raw.strip():
+        raise MeasurementError(must_be("content", where, "a table of readings", "an empty file"))
+    return raw
+
+
+def csv_table(
+    raw: bytes, where: str
+) -> tuple[dict[str, str], list[str], Iterator[tuple[int, list[str]]]]:
+    """Split CSV into the attributes of its ``# key: value`` comments, its header and its rows,
+    each with its line number.
+
+    Raises
+    ------
+    MeasurementError
+        If it is no text or has no header; from the iterator, which lets the caller judge the
+        header first, if there are no rows or one has another length than the header.
+    """
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise MeasurementError(
+            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
+                    "Save it as UTF-8 text.")) from None
+    attributes: dict[str, str] = {}
+    rows: list[tuple[int, list[str]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        comment = re.match(r"\s*#\s*(?:([^:]+?)\s*:\s*(.*))?", line)
+        if comment:
+            if comment[1]:
+                attributes[comment[1]] = comment[2].strip()
+        elif line.strip():
+            rows.append((number, _cells(line, number, where)))
+    if not rows:
+        raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
+    header = rows[0][1]
+    if len(set(header)) < len(header):
+        raise MeasurementError(must_be("header", where, "without repeated columns",
+                                       ",".join(header)))
+    return attributes, header, _equally_long(len(header), rows[1:], where)
+
+
+def _equally_long(
+    count: int, rows: list[tuple[int, list[str]]], where: str
+) -> Iterator[tuple[int, list[str]]]:
+    if not rows:
+        raise MeasurementError(must_be("content", where, "at least one reading",
+                                       "a header alone"))
+    for number, cells in rows:
+        if len(cells) != count:
+            raise MeasurementError(must_be(f"line {number}", where, f"{count} values",
+                                           str(len(cells)), "Is the file cut short?"))
+        yield number, cells
+
+
+def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> None:
+    """Refuse a header with a column that is not known."""
+    for name in header:
+        if name not in known:
+            raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
+                                           f"column '{name}'", "Rename or remove it."))
+
+
+def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str],
+              path: Path) -> None:
+    """Write columns by name, with attributes as comments; NaN is an empty cell."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for key, value in attributes.items():
+            file.write(f"# {key}: {' '.join(str(value).split())}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([_cell(value) for value in row])
 
 
 def write_hdf5(data: xr.Dataset, path: Path) -> None:
@@ -158,13 +232,7 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
     if "sigma_T" in data:
         columns |= {name: data["sigma_T"].values[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
     columns |= {name: data[name].values for name in ("time_s", "scan") if name in data}
-    with path.open("w", encoding="utf-8", newline="") as file:
-        for key, value in data.attrs.items():
-            file.write(f"# {key}: {' '.join(str(value).split())}\n")
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            writer.writerow([_cell(value) for value in row])
+    write_csv(columns, data.attrs, path)
 
 
 def _cell(value: object) -> str:
@@ -227,34 +295,11 @@ def _read_vtu(path: Path) -> xr.Dataset:
 
 def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise MeasurementError(
-            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
-                    "Save it as UTF-8 text.")) from None
-    attributes: dict[str, str] = {}
-    rows: list[tuple[int, list[str]]] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        comment = re.match(r"\s*#\s*(?:([^:]+?)\s*:\s*(.*))?", line)
-        if comment:
-            if comment[1]:
-                attributes[comment[1]] = comment[2].strip()
-        elif line.strip():
-            rows.append((number, _cells(line, number, where)))
-    if not rows:
-        raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
-    header = rows[0][1]
+    attributes, header, rows = csv_table(raw, where)
     _check_header(header, where)
-    if len(rows) == 1:
-        raise MeasurementError(must_be("content", where, "at least one reading",
-                                       "a header alone"))
     table: dict[str, list[float]] = {name: [] for name in header}
     scans: list[str] = []
-    for number, cells in rows[1:]:
-        if len(cells) != len(header):
-            raise MeasurementError(must_be(f"line {number}", where, f"{len(header)} values",
-                                           str(len(cells)), "Is the file cut short?"))
+    for number, cells in rows:
         for name, cell in zip(header, cells, strict=True):
             if name == "scan":
                 scans.append(cell)
@@ -285,14 +330,8 @@ def _cells(line: str, number: int, where: str) -> list[str]:
 
 
 def _check_header(header: list[str], where: str) -> None:
-    known = (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS)
-    for name in header:
-        if name not in known:
-            raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
-                                           f"column '{name}'", "Rename or remove it."))
-    if len(set(header)) < len(header):
-        raise MeasurementError(must_be("header", where, "without repeated columns",
-                                       ",".join(header)))
+    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS),
+                  where)
     missing = [name for name in POSITION_COLUMNS if name not in header]
     if missing or not any(name in header for name in FIELD_COLUMNS):
         expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T"
@@ -306,13 +345,17 @@ def _check_header(header: list[str], where: str) -> None:
 def _number(cell: str, name: str, number: int, where: str) -> float:
     if not cell and (name in FIELD_COLUMNS or name in SIGMA_COLUMNS):
         return np.nan
+    return finite(cell, f"{name} in line {number}", where, "Leave a missing component empty.")
+
+
+def finite(cell: str, what: str, where: str, hint: str = "") -> float:
+    """The number in a cell; MeasurementError if it is none, or not finite."""
     try:
         value = float(cell)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise MeasurementError(must_be(f"{name} in line {number}", where, "a finite number",
-                                       f"'{cell}'", "Leave a missing component empty."))
+        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'", hint))
     return value
 
 

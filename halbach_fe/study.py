@@ -348,11 +348,29 @@ class Prior(_Model):
     is independent from block to block, the second shared by all (the calibration of the
     Helmholtz coil, or a nominal value that is off). ``direction_sd_deg`` holds for each of the
     two directions across the easy axis.
+
+    Where the blocks themselves were measured (`halbach_fe.block_table`), their moments take the
+    place of ``magnitude_sd`` and ``direction_sd_deg``, and the rest holds: ``mounting_sd_deg`` is
+    how far each block may be turned about each axis when it is mounted. ``types`` are the slots of
+    each type of block (default: each slot is a type, its number the label). Moments m are taken to
+    the reference temperature by ``m(T) = m(T_ref) (1 + coefficient (T - T_ref))``, if both are
+    given.
     """
 
     magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
     direction_sd_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 1.0
     common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
+    types: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}
+    temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
+    reference_temperature_C: Annotated[float, Field(ge=-273.15, le=500.0)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Prior:
+        if (self.temperature_coefficient_per_K is None) != (self.reference_temperature_C is None):
+            raise ValueError("give temperature_coefficient_per_K and reference_temperature_C "
+                             "together, or neither")
+        return self
 
 
 class HeldOut(_Model):
@@ -422,6 +440,10 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        slots = sorted(slot for one in self.prior.types.values() for slot in one)
+        if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
+            raise ValueError(f"prior.types must name every slot from 1 to "
+                             f"{self.array.blocks_per_ring} once, but names {slots}")
         for name, size in self.mesh:
             if name.endswith("size_m") and size is not None and size > self.array.outer_radius_m:
                 raise ValueError(f"mesh.{name} ({size}) must not be larger than the array "

@@ -17,12 +17,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference import linear
 from halbach_fe.inference.linear import chi2_per_reading, predict
 from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
     Observation,
@@ -76,7 +78,10 @@ class RegionScore:
 
 @dataclass(frozen=True)
 class Update:
-    """A study, a map, and what the one says about the other."""
+    """A study, a map, and what the one says about the other.
+
+    ``measured_blocks`` is how many blocks the prior was measured of; None if it is the study's.
+    """
 
     study: Study
     observation: Observation
@@ -92,6 +97,7 @@ class Update:
     prior_conflict: float
     parameters_learnt: float
     log_evidence: float
+    measured_blocks: int | None = None
 
     @property
     def sigma(self) -> Floats:
@@ -139,7 +145,9 @@ class Update:
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 
-def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
+def infer(
+    study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None
+) -> Update:
     """Update the block magnetizations of a study with a measured map.
 
     Parameters
@@ -149,12 +157,15 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         As `halbach_fe.field_map.read_map` returns it.
     workshop : Workshop
         Its folder receives the mesh, the run folders and the response matrix.
+    blocks : BlockTable, optional
+        Measured blocks, whose prior takes the place of the study's.
 
     Raises
     ------
     MeasurementError
-        If the map does not fit the study.
+        If the map or the blocks do not fit the study.
     """
+    of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
     points = points_of(data)
     if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise MeasurementError(must_be(
@@ -193,8 +204,9 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         model = response(study, observation, workshop)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
-    before = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
-                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    before = of_blocks.gaussian if of_blocks else block_prior(
+        model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
+        study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
     learnt = linear.update(
         model.matrix[~keep], (readings - model.offset)[~keep], sigma[~keep], before)
@@ -206,7 +218,8 @@ def infer(study: Study, data: xr.Dataset, workshop: Workshop) -> Update:
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
-        log_evidence=learnt.log_evidence)
+        log_evidence=learnt.log_evidence,
+        measured_blocks=of_blocks.count if of_blocks else None)
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -269,6 +282,7 @@ def summary(update: Update) -> dict[str, object]:
         "readings": len(update.readings),
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
+        "measured_blocks": update.measured_blocks,
         "superposition_error": update.response.superposition_error,
         "largest_solver_error_T": float(update.response.error.max()),
         "largest_solver_error_over_noise": float((update.response.error / update.noise).max()),

@@ -12,10 +12,11 @@ import time
 import numpy as np
 import pytest
 
+from halbach_fe.blocks import blocks_of
 from halbach_fe.cli import main, parser
 from halbach_fe.errors import EXIT_CODES
 from halbach_fe.field_map import field_map, read_map, write_map
-from halbach_fe.study import Study
+from halbach_fe.study import MU_0, Study, read_study
 from tests.conftest import ROOT, circle
 
 STUDY = """
@@ -91,6 +92,68 @@ def test_infer_writes_everything(study, measured, tmp_path, capsys):
             "response.h5"} <= {path.name for path in out.iterdir()}
     assert main([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["parameters"] == 16
+
+
+@pytest.fixture
+def table(study, tmp_path):
+    """Three blocks of every slot, 1 % too weak, and different."""
+    study.write_text(STUDY.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
+    blocks = blocks_of(read_study(study))
+    volume = 0.05 * blocks[0].area
+    rows = ["serial,type,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2,volume_m3"]
+    for number, block in enumerate(blocks * 3):
+        angle = (block.slot - 1) * np.pi / 4  # M turns twice, the block's own axes once
+        strength = volume / MU_0 * (0.98 + 0.005 * np.sin(number))
+        rows.append(f"B{number},{block.slot},{strength * np.cos(angle)},"
+                    f"{strength * (np.sin(angle) + 0.01 * np.cos(7 * number))},0,0.05,{volume}")
+    path = tmp_path / "blocks.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_prior_of_measured_blocks(study, table, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["prior", str(study), str(table), "-o", str(out)]) == 0
+    assert "along in %" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {"prior.h5", "prior.json", "prior.html",
+                                                     "prior_qq.png"}
+    assert main(["prior", str(study), str(table), "-o", str(out), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary == json.loads((out / "prior.json").read_text())
+    assert (summary["blocks"], len(summary["types"])) == (24, 8)
+    # 2 % weaker, and what the lone block's self-demagnetization hides: 0.05 N, N up to 0.6
+    assert -2.5 < summary["types"][0]["mean_percent_deg"][0] < 1.5
+
+
+def test_infer_with_measured_blocks(study, table, measured, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["infer", str(study), "--measurements", str(measured), "-o", str(out), "--json"]
+    assert main([*arguments, "--blocks", str(table)]) == 0
+    assert json.loads(capsys.readouterr().out)["measured_blocks"] == 24
+    assert "24 measured blocks" in (out / "report.html").read_text()
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["measured_blocks"] is None
+
+
+@pytest.mark.parametrize(("edit", "said"), [
+    (("B1,", "B0,"), "serial of block B0"), (("0.05,", "-0.05,"), "sigma_A_m2 of block B0"),
+    (("B0,1,", "B0,9,"), "type of block B0"), (("B0,1,", "B0,2,"), "moment of block B0"),
+    (("sigma_A_m2", "sigma"), "column 'sigma'"), (("volume_m3", "slot"), "slot in line 2"),
+    (None, "readable file")])
+def test_bad_tables(study, table, measured, tmp_path, capsys, edit, said):
+    """Both verbs refuse them in one sentence before anything is made."""
+    if edit:
+        assert edit[0] in table.read_text()
+        table.write_text(table.read_text().replace(*edit, 1))
+    else:
+        table.unlink()
+    out = tmp_path / "out"
+    for arguments in (["prior", study, table, "-o", out],
+                      ["infer", study, "--measurements", measured, "-o", out, "--blocks", table]):
+        code, sentence = refused(arguments, capsys)
+        assert (code, out.exists()) == (4, False)
+        assert said in sentence
+        assert str(table) in sentence
 
 
 def test_schema_is_that_of_the_model(capsys):

@@ -13,9 +13,10 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 
 # Later rooms may import earlier ones, never the other way round.
 ORDER = ["errors", "analytic", "materials", "study", "blocks", "symmetry", "extent", "regions",
-         "exact_field", "geo", "mesh", "field_map", "getdp", "solutions", "evaluation", "condensed",
-         "inference", "solve", "azimuthal", "routes", "observation", "discretization", "response",
-         "nonlinear", "update", "planning", "sensitivity", "verification", "report", "cli"]
+         "exact_field", "geo", "mesh", "field_map", "block_table", "getdp", "solutions",
+         "evaluation", "condensed", "inference", "measured_prior", "solve", "azimuthal", "routes",
+         "observation", "discretization", "response", "nonlinear", "update", "planning",
+         "sensitivity", "verification", "report", "cli"]
 
 
 def imports(path):

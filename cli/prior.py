@@ -1,0 +1,42 @@
+"""Turn moments of single blocks, measured in a Helmholtz coil, into a prior.
+
+Writes prior.h5 (mean and covariance), prior.json, prior.html and its figure. `halbach-fe infer
+--blocks` uses the same prior.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.cli import common
+from halbach_fe.measured_prior import prior_from_blocks
+from halbach_fe.study import read_study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_and_output(parser)
+    parser.add_argument("blocks", type=Path, metavar="BLOCKS",
+                        help="table of measured blocks (CSV)")
+    common.add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Estimate, write everything, print the table of types."""
+    from halbach_fe.report.prior import (  # matplotlib loads when needed
+        prior_summary,
+        type_table,
+        write_prior,
+    )
+
+    study = read_study(arguments.study)
+    prior = prior_from_blocks(study, read_blocks(arguments.blocks))
+    write_prior(study, prior, arguments.output)
+    if arguments.json:
+        common.print_json(prior_summary(study, prior))
+    else:
+        common.print_table(type_table(prior), "Measured blocks relative to the nominal, by type")
+        common.say(f"Report: {arguments.output / 'prior.html'}")
+    return 0
