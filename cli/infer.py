@@ -10,8 +10,9 @@ from pathlib import Path
 
 from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
+from halbach_fe.errors import StudyError
 from halbach_fe.field_map import read_map
-from halbach_fe.study import read_study
+from halbach_fe.study import is_nonlinear, read_study
 from halbach_fe.update import infer, summary, write_update
 
 
@@ -22,6 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="measured field map (CSV or HDF5)")
     parser.add_argument("--blocks", type=Path, metavar="CSV",
                         help="moments of the single blocks, in place of the study's prior")
+    parser.add_argument("--samples", type=common.positive, metavar="N",
+                        help="for iron with an H(B) curve: sample the non-linear posterior, N "
+                        "draws of each of four chains, in place of linearizing")
+    parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
+                        help="of the random numbers of the chains (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -32,9 +38,24 @@ def run(arguments: argparse.Namespace) -> int:
     )
 
     study, data = read_study(arguments.study), read_map(arguments.measurements)
+    if arguments.samples and not is_nonlinear(study):
+        raise StudyError(
+            f"Input --samples must go with iron that has an H(B) curve; study {study.name} is "
+            "linear, and its posterior has a closed form. Leave it out.")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.workshop(arguments) as workshop:
         update = infer(study, data, workshop, blocks)
+        if arguments.samples:
+            from halbach_fe.sampled import (  # ArviZ takes seconds to load
+                sample_posterior,
+                with_samples,
+                write_sampled,
+            )
+
+            sampled = sample_posterior(update, workshop, arguments.samples, seed=arguments.seed,
+                                       say=common.say)
+            update = with_samples(update, sampled)
+            write_sampled(sampled, arguments.output)
     if update.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
     write_update(update, arguments.output)

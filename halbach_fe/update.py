@@ -146,7 +146,8 @@ class Update:
 
 
 def infer(
-    study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None
+    study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
+    prior: Gaussian | None = None,
 ) -> Update:
     """Update the block magnetizations of a study with a measured map.
 
@@ -159,6 +160,8 @@ def infer(
         Its folder receives the mesh, the run folders and the response matrix.
     blocks : BlockTable, optional
         Measured blocks, whose prior takes the place of the study's.
+    prior : Gaussian, optional
+        Of the parameters in A/m, in place of both.
 
     Raises
     ------
@@ -204,9 +207,9 @@ def infer(
         model = response(study, observation, workshop)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
-    before = of_blocks.gaussian if of_blocks else block_prior(
+    before = prior or (of_blocks.gaussian if of_blocks else block_prior(
         model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
-        study.prior.common_mode_sd)
+        study.prior.common_mode_sd))
     sigma = np.hypot(noise, model.error)
     learnt = linear.update(
         model.matrix[~keep], (readings - model.offset)[~keep], sigma[~keep], before)

@@ -14,7 +14,7 @@ C. Fox, J. Comput. Graph. Statist. 14 (2005) 795).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -132,6 +132,21 @@ def laplace(
 
 
 @dataclass(frozen=True)
+class Move:
+    """A proposal that leaves its reference invariant, ``xi' = sqrt(1 - s^2) xi + s eta``.
+
+    Attributes
+    ----------
+    reference : Reference
+    step : float
+        s in (0, 1].
+    """
+
+    reference: Reference
+    step: float
+
+
+@dataclass(frozen=True)
 class Chain:
     """A chain of samples.
 
@@ -141,73 +156,62 @@ class Chain:
         Parameters.
     accepted : float
         Fraction of the proposals.
-    solves : int
-        Of the full model.
-    state : dict
-        Where it ended, to go on from.
+    last : ndarray, shape (k,)
+        z where it ended, to go on from.
     """
 
     samples: Floats
     accepted: float
-    solves: int
-    state: dict[str, object]
+    last: Floats
 
 
 def sample(
-    posterior: Posterior, reference: Reference, step: float, count: int,
-    generator: np.random.Generator, start: Floats, surrogate: Posterior | None = None,
-    centred: bool = True,
+    posterior: Posterior, moves: Sequence[Move], count: int, generator: np.random.Generator,
+    start: Floats, surrogate: Posterior | None = None,
 ) -> Chain:
-    """Run a chain.
+    """Run a chain that takes its moves in turn; each leaves the posterior invariant.
+
+    Laplace's approximation moves fast where the posterior is nearly normal, but its tails may be
+    too light; a move of the prior among them, whose weights are bounded, reaches everywhere.
 
     Parameters
     ----------
-    step : float
-        s in (0, 1].
     count : int
         Steps, of which each gives a sample.
     start : ndarray, shape (k,)
-        xi to start from.
+        z to start from.
     surrogate : Posterior, optional
         Of a cheap model, which screens.
-    centred : bool
-        False moves as the paper prints it, about the origin of p instead of the prior's mean; it
-        does not leave the prior invariant and is here to show that.
     """
     prior = posterior.prior
-    before = posterior.solves
-    keep = np.sqrt(1 - step**2)
-    drift = np.zeros_like(start)
-    if not centred:
-        # sqrt(1 - s^2) p instead of mu_0 + sqrt(1 - s^2) (p - mu_0)
-        shift = (keep - 1) * prior.mean
-        drift = reference.inverse @ np.linalg.lstsq(prior.root, shift, rcond=None)[0]
 
-    def excess(xi: Floats, model: Posterior) -> float:
-        """Log of target over reference."""
-        z = reference.place(xi)
-        return model.log_likelihood(prior.mean + prior.root @ z) - float(
-            z @ z) / 2 + float(xi @ xi) / 2
+    def place(z: Floats) -> Floats:
+        return np.asarray(prior.mean + prior.root @ z)
 
-    xi, value = start, excess(start, posterior)
-    cheap = 0.0 if surrogate is None else excess(start, surrogate)
+    z = start
+    value = posterior.log_likelihood(place(z))
+    cheap = surrogate.log_likelihood(place(z)) if surrogate else 0.0
     samples = np.empty((count, len(prior.mean)))
     accepted = 0
     for number in range(count):
-        proposal = keep * xi + step * generator.standard_normal(len(xi)) + drift
+        move = moves[number % len(moves)]
+        xi = move.reference.white(z)
+        xi_there = (np.sqrt(1 - move.step**2) * xi
+                    + move.step * generator.standard_normal(len(xi)))
+        there = move.reference.place(xi_there)
+        # log of prior over reference, there less here
+        weight = float(z @ z - there @ there - xi @ xi + xi_there @ xi_there) / 2
+        gain, cheap_there = weight, 0.0
         passed = True
         if surrogate is not None:
-            cheap_there = excess(proposal, surrogate)
-            passed = np.log(generator.uniform()) < cheap_there - cheap
+            cheap_there = surrogate.log_likelihood(place(there))
+            screen = weight + cheap_there - cheap
+            passed = np.log(generator.uniform()) < screen
+            gain = cheap - cheap_there  # what the first decision took for granted
         if passed:
-            there = excess(proposal, posterior)
-            gain = there - value
-            if surrogate is not None:
-                gain -= cheap_there - cheap
-            if np.log(generator.uniform()) < gain:
-                xi, value = proposal, there
-                cheap = cheap_there if surrogate is not None else 0.0
+            value_there = posterior.log_likelihood(place(there))
+            if np.log(generator.uniform()) < gain + value_there - value:
+                z, value, cheap = there, value_there, cheap_there
                 accepted += 1
-        samples[number] = prior.mean + prior.root @ reference.place(xi)
-    return Chain(samples, accepted / max(count, 1), posterior.solves - before,
-                 {"xi": xi, "generator": generator.bit_generator.state})
+        samples[number] = place(z)
+    return Chain(samples, accepted / max(count, 1), z)

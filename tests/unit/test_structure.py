@@ -15,8 +15,8 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 ORDER = ["errors", "analytic", "materials", "study", "blocks", "symmetry", "extent", "regions",
          "exact_field", "geo", "mesh", "field_map", "block_table", "getdp", "solutions",
          "evaluation", "condensed", "inference", "measured_prior", "solve", "azimuthal", "routes",
-         "observation", "discretization", "response", "nonlinear", "update", "planning",
-         "sensitivity", "verification", "report", "cli"]
+         "observation", "discretization", "response", "nonlinear", "update", "sampled",
+         "planning", "sensitivity", "verification", "report", "cli"]
 
 
 def imports(path):

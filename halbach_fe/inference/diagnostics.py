@@ -1,0 +1,86 @@
+"""Whether chains have converged: rank-normalized split R-hat, effective samples, Monte Carlo error.
+
+A. Vehtari, A. Gelman, D. Simpson, B. Carpenter, P.-C. Buerkner, Bayesian Anal. 16 (2021) 667; by
+ArviZ.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import SamplingError
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # ArviZ announces its next version
+    import arviz
+
+MAX_R_HAT = 1.01
+MIN_EFFECTIVE = 400.0
+"""What the paper above asks for before R-hat and the quantiles can be trusted."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Of every parameter, arrays of shape (m,).
+
+    Attributes
+    ----------
+    r_hat : ndarray
+    bulk, tail : ndarray
+        Effective samples for the mean and for the 5 and 95 % quantiles.
+    mcse : ndarray
+        Monte Carlo standard error of the mean, in the parameter's unit.
+    samples : int
+        Of all chains.
+    """
+
+    r_hat: Floats
+    bulk: Floats
+    tail: Floats
+    mcse: Floats
+    samples: int
+
+    @property
+    def autocorrelation_time(self) -> Floats:
+        """Samples per effective one, (m,)."""
+        return self.samples / self.bulk
+
+
+def diagnose(samples: Floats) -> Diagnostics:
+    """Diagnostics of samples (chains, draws, m)."""
+    data = xr.Dataset({"x": (("chain", "draw", "parameter"), samples)})
+
+    def figure(found: xr.Dataset) -> Floats:
+        return np.asarray(found["x"].values, float)
+
+    return Diagnostics(
+        figure(arviz.rhat(data)), figure(arviz.ess(data)), figure(arviz.ess(data, method="tail")),
+        figure(arviz.mcse(data)), samples.shape[0] * samples.shape[1])
+
+
+def require_convergence(
+    found: Diagnostics, names: Sequence[str], effective: float = MIN_EFFECTIVE
+) -> None:
+    """Refuse chains that are too short.
+
+    Raises
+    ------
+    SamplingError
+        With the worst parameter, its autocorrelation time, and how many samples would do.
+    """
+    worst = int(np.nanargmin(np.minimum(found.bulk, found.tail)))
+    short = min(found.bulk[worst], found.tail[worst])
+    if short >= effective and np.nanmax(found.r_hat) <= MAX_R_HAT:
+        return
+    time = found.samples / short
+    raise SamplingError(
+        f"The chains are too short: {names[worst]} has {short:.0f} effective samples of "
+        f"{found.samples} (autocorrelation time {time:.0f}), where {effective:.0f} are needed, and "
+        f"the largest R-hat is {np.nanmax(found.r_hat):.3f}, where {MAX_R_HAT} is allowed. Take "
+        f"some {time * effective:.0f} samples.")

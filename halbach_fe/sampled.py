@@ -1,0 +1,264 @@
+"""The posterior of a magnet with iron that saturates, by samples.
+
+The target is the finite-element posterior itself: every likelihood is a non-linear solve, by the
+condensed engine. Laplace's approximation at the mode proposes; every tenth move is by the prior and
+reaches the tails that it may lack. Draws are compared with GetDP's own Newton method before
+they are handed out, and chains that are too short are refused. Work is stored chunk by chunk: an
+interrupted run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.blocks import Floats
+from halbach_fe.errors import OutputError
+from halbach_fe.field_map import atomic
+from halbach_fe.inference.diagnostics import Diagnostics, diagnose, require_convergence
+from halbach_fe.inference.sampling import (
+    Chain,
+    Move,
+    Posterior,
+    Reference,
+    laplace,
+    prior_reference,
+    sample,
+)
+from halbach_fe.nonlinear import NonlinearModel, nonlinear_model, verify
+from halbach_fe.solve import Workshop
+from halbach_fe.update import Prediction, Update, write_text
+
+CHUNK = 250
+"""Draws of every chain between two stored states."""
+
+STEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
+PILOT, ENOUGH_ACCEPTED = 40, 0.25
+"""The largest step is taken of which a pilot run accepts enough."""
+
+PRIOR_STEP, LAPLACE_MOVES = 0.1, 9
+OVERDISPERSED = 2.0
+"""Chains start so many of Laplace's standard deviations away; R-hat is blind otherwise."""
+
+VERIFIED_DRAWS = 3
+PREDICTED_DRAWS = 200
+NOISE_FRACTION = 1e-2
+"""Solves are converged to this part of the smallest error bar of a reading: it moves the log of
+the likelihood by less than 1e-2."""
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Draws of the posterior, and how good they are.
+
+    Attributes
+    ----------
+    draws : ndarray, shape (chains, draws, parameters), in A/m
+    parameters : tuple of str
+    mode : ndarray, shape (parameters,), in A/m
+    step : float
+        Of Laplace's moves.
+    accepted : float
+        Fraction of the proposals.
+    solves : int
+        Non-linear solves of this run.
+    agreement_T : float
+        Largest difference to GetDP's Newton method, draws of the posterior included.
+    diagnostics : Diagnostics
+    prediction : Prediction
+        Of all readings, held-out ones too.
+    """
+
+    draws: Floats
+    parameters: tuple[str, ...]
+    mode: Floats
+    step: float
+    accepted: float
+    solves: int
+    agreement_T: float
+    diagnostics: Diagnostics
+    prediction: Prediction
+
+    @property
+    def mean(self) -> Floats:
+        """(parameters,) in A/m."""
+        return self.draws.mean(axis=(0, 1))
+
+    @property
+    def sd(self) -> Floats:
+        """(parameters,) in A/m."""
+        return self.draws.std(axis=(0, 1))
+
+
+def sample_posterior(
+    update: Update, workshop: Workshop, draws: int, chains: int = 4, seed: int = 1,
+    effective: float = 400.0, say: Callable[[str], None] = lambda text: None,
+) -> Sampled:
+    """Sample the posterior of an update whose iron has an H(B) curve.
+
+    Parameters
+    ----------
+    update : Update
+        The linearized one: its readings, noise and prior are used.
+    draws, chains : int
+        Draws of each chain, of which the first tenth is discarded; chains.
+    effective : float
+        Effective samples that every parameter must reach.
+
+    Raises
+    ------
+    SamplingError
+        If the mode is not found, or the chains are too short.
+    """
+    model = nonlinear_model(update.study, update.observation, workshop, np.random.default_rng(seed))
+    train = ~update.held_out
+    sigma = np.hypot(update.noise, model.error)
+    tolerance = NOISE_FRACTION * float(sigma.min())
+    target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], sigma[train],
+                       update.prior)
+    reference, mode = laplace(target, lambda p: model.jacobian(p)[train])
+    generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
+    step = _step(target, reference, np.random.default_rng(seed))
+    moves = [Move(reference, step)] * LAPLACE_MOVES + [
+        Move(prior_reference(update.prior), PRIOR_STEP)]
+    say(f"mode found; step {step:g}, {chains} chains of {draws} draws")
+    path = workshop.folder / "chains.nc"
+    runs = [_Run(generator, reference.place(
+        OVERDISPERSED * generator.standard_normal(len(reference.centre))))
+        for generator in generators]
+    key = _key(update, model, draws, chains, seed)
+    _resume(path, key, runs)
+    while len(runs[0].samples) < draws:
+        for run in runs:
+            run.go_on(sample(target, moves, min(CHUNK, draws - len(run.samples)), run.generator,
+                             run.last))
+        _store(path, key, runs, model.parameters)
+        say(f"{len(runs[0].samples)} of {draws} draws")
+    kept = np.array([run.samples[draws // 10:] for run in runs])
+    diagnostics = diagnose(kept)
+    require_convergence(diagnostics, model.parameters, effective)
+    flat = kept.reshape(-1, kept.shape[2])
+    chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
+    predicted = model(chosen, tolerance)
+    agreement = verify(model, update.study, update.observation, workshop, chosen[::len(chosen)
+                                                                            // VERIFIED_DRAWS])
+    return Sampled(
+        kept, model.parameters, mode, step, float(np.mean([run.accepted for run in runs])),
+        target.solves, max(agreement, model.agreement_T), diagnostics,
+        Prediction(predicted.mean(axis=0), predicted.std(axis=0)))
+
+
+@dataclass
+class _Run:
+    """A chain in the making."""
+
+    generator: np.random.Generator
+    last: Floats
+    samples: Floats = None  # type: ignore[assignment]
+    accepted: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.samples = np.empty((0, 0))
+
+    def go_on(self, chain: Chain) -> None:
+        """Append."""
+        before = len(self.samples)
+        self.samples = np.vstack([self.samples, chain.samples]) if before else chain.samples
+        total = len(self.samples)
+        self.accepted += (chain.accepted - self.accepted) * (total - before) / total
+        self.last = chain.last
+
+
+def _step(target: Posterior, reference: Reference, generator: np.random.Generator) -> float:
+    for step in STEPS:
+        pilot = sample(target, [Move(reference, step)], PILOT, generator, reference.centre)
+        if pilot.accepted >= ENOUGH_ACCEPTED:
+            return step
+    return STEPS[-1]
+
+
+def _key(update: Update, model: NonlinearModel, draws: int, chains: int, seed: int) -> str:
+    """Digest of all that the chains depend on."""
+    digest = hashlib.sha256(f"{draws} {chains} {seed}".encode())
+    for part in (update.readings, update.noise, update.held_out, update.prior.mean,
+                 update.prior.root, model.error, model.condensed.linear, model.condensed.readings,
+                 model.condensed.law.values):
+        digest.update(np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()
+
+
+def _store(path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...]) -> None:
+    """As ArviZ reads it: group ``posterior``, dimensions chain and draw."""
+    posterior = xr.Dataset(
+        {"magnetization": (("chain", "draw", "parameter"), np.array([r.samples for r in runs]),
+                           {"units": "A/m"})},
+        coords={"chain": np.arange(len(runs)), "draw": np.arange(len(runs[0].samples)),
+                "parameter": list(parameters)})
+    state = xr.Dataset(
+        {"last": (("chain", "coordinate"), np.array([r.last for r in runs])),
+         "accepted": ("chain", np.array([r.accepted for r in runs]))},
+        attrs={"key": key, "generators": json.dumps(
+            [r.generator.bit_generator.state for r in runs])})
+    try:
+        with atomic(path) as temporary:
+            posterior.to_netcdf(temporary, group="posterior", engine="h5netcdf")
+            state.to_netcdf(temporary, group="state", engine="h5netcdf", mode="a")
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
+
+
+def _resume(path: Path, key: str, runs: list[_Run]) -> None:
+    """Go on from what an interrupted run stored, if it is of the same inputs."""
+    try:
+        with xr.open_dataset(path, group="state", engine="h5netcdf") as state:
+            if state.attrs["key"] != key:
+                return
+            last, accepted = state["last"].values, state["accepted"].values
+            generators = json.loads(state.attrs["generators"])
+        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
+            samples = posterior["magnetization"].values
+    except (OSError, KeyError, ValueError, RuntimeError):
+        return
+    for number, run in enumerate(runs):
+        run.last, run.samples, run.accepted = last[number], samples[number], float(accepted[number])
+        run.generator.bit_generator.state = generators[number]
+
+
+def sampled_summary(found: Sampled) -> dict[str, object]:
+    """What a script wants to know of the samples."""
+    return {
+        "chains": found.draws.shape[0], "draws": found.draws.shape[1],
+        "solves": found.solves, "accepted": found.accepted, "step": found.step,
+        "largest_r_hat": float(found.diagnostics.r_hat.max()),
+        "smallest_bulk_ess": float(found.diagnostics.bulk.min()),
+        "smallest_tail_ess": float(found.diagnostics.tail.min()),
+        "largest_mcse_over_sd": float((found.diagnostics.mcse / found.sd).max()),
+        "agreement_with_getdp_T": found.agreement_T,
+    }
+
+
+def write_sampled(found: Sampled, folder: Path) -> None:
+    """Write sampled.json and sampled.csv, a row a parameter; the draws are in chains.nc."""
+    text = json.dumps(sampled_summary(found), indent=1, allow_nan=False)
+    write_text(folder / "sampled.json", text + "\n")
+    columns = (found.parameters, found.mean, found.sd, found.diagnostics.r_hat,
+               found.diagnostics.bulk, found.diagnostics.tail, found.diagnostics.mcse)
+    rows = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+    write_text(folder / "sampled.csv", "\n".join([
+        "parameter,mean_A_per_m,sd_A_per_m,r_hat,bulk_ess,tail_ess,mcse_A_per_m", *rows, ""]))
+
+
+def with_samples(update: Update, found: Sampled) -> Update:
+    """The update with the samples' prediction, and their mean and covariance as its posterior."""
+    flat = found.draws.reshape(-1, found.draws.shape[2])
+    root = (flat - flat.mean(axis=0)).T / np.sqrt(len(flat) - 1)
+    values, vectors = np.linalg.eigh(root @ root.T)
+    from_samples = replace(update.posterior, mean=found.mean,
+                           root=vectors * np.sqrt(np.maximum(values, 0)))
+    return replace(update, posterior=from_samples, prediction_posterior=found.prediction)
