@@ -26,7 +26,6 @@ from halbach_fe.inference.sampling import (
     Chain,
     Move,
     Posterior,
-    Reference,
     laplace,
     prior_reference,
     sample,
@@ -38,11 +37,11 @@ from halbach_fe.update import Prediction, Update, write_text
 CHUNK = 250
 """Draws of every chain between two stored states."""
 
-STEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
-PILOT, ENOUGH_ACCEPTED = 40, 0.25
-"""The largest step is taken of which a pilot run accepts enough."""
+LAPLACE_STEPS = (1.0, 0.6, 0.3) * 3
+"""Long steps where the posterior is nearly normal; short ones leave the tails, where long ones
+are never accepted."""
 
-PRIOR_STEP, LAPLACE_MOVES = 0.1, 9
+PRIOR_STEP = 0.1
 OVERDISPERSED = 2.0
 """Chains start so many of Laplace's standard deviations away; R-hat is blind otherwise."""
 
@@ -62,8 +61,6 @@ class Sampled:
     draws : ndarray, shape (chains, draws, parameters), in A/m
     parameters : tuple of str
     mode : ndarray, shape (parameters,), in A/m
-    step : float
-        Of Laplace's moves.
     accepted : float
         Fraction of the proposals.
     solves : int
@@ -78,7 +75,6 @@ class Sampled:
     draws: Floats
     parameters: tuple[str, ...]
     mode: Floats
-    step: float
     accepted: float
     solves: int
     agreement_T: float
@@ -124,10 +120,9 @@ def sample_posterior(
                        update.prior)
     reference, mode = laplace(target, lambda p: model.jacobian(p)[train])
     generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
-    step = _step(target, reference, np.random.default_rng(seed))
-    moves = [Move(reference, step)] * LAPLACE_MOVES + [
+    moves = [Move(reference, step) for step in LAPLACE_STEPS] + [
         Move(prior_reference(update.prior), PRIOR_STEP)]
-    say(f"mode found; step {step:g}, {chains} chains of {draws} draws")
+    say(f"mode found; {chains} chains of {draws} draws")
     path = workshop.folder / "chains.nc"
     runs = [_Run(generator, reference.place(
         OVERDISPERSED * generator.standard_normal(len(reference.centre))))
@@ -149,7 +144,7 @@ def sample_posterior(
     agreement = verify(model, update.study, update.observation, workshop, chosen[::len(chosen)
                                                                             // VERIFIED_DRAWS])
     return Sampled(
-        kept, model.parameters, mode, step, float(np.mean([run.accepted for run in runs])),
+        kept, model.parameters, mode, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
         Prediction(predicted.mean(axis=0), predicted.std(axis=0)))
 
@@ -173,14 +168,6 @@ class _Run:
         total = len(self.samples)
         self.accepted += (chain.accepted - self.accepted) * (total - before) / total
         self.last = chain.last
-
-
-def _step(target: Posterior, reference: Reference, generator: np.random.Generator) -> float:
-    for step in STEPS:
-        pilot = sample(target, [Move(reference, step)], PILOT, generator, reference.centre)
-        if pilot.accepted >= ENOUGH_ACCEPTED:
-            return step
-    return STEPS[-1]
 
 
 def _key(update: Update, model: NonlinearModel, draws: int, chains: int, seed: int) -> str:
@@ -234,7 +221,7 @@ def sampled_summary(found: Sampled) -> dict[str, object]:
     """What a script wants to know of the samples."""
     return {
         "chains": found.draws.shape[0], "draws": found.draws.shape[1],
-        "solves": found.solves, "accepted": found.accepted, "step": found.step,
+        "solves": found.solves, "accepted": found.accepted,
         "largest_r_hat": float(found.diagnostics.r_hat.max()),
         "smallest_bulk_ess": float(found.diagnostics.bulk.min()),
         "smallest_tail_ess": float(found.diagnostics.tail.min()),

@@ -1,7 +1,12 @@
-"""Write the synthetic campaign of the study: the paper's truth, its field by NGSolve (another
-mesher, order 5, the steel's law written anew), and noise. Needs the tests' dependencies::
+"""Write the synthetic campaigns of the study.
 
-    python -m studies.nonlinear-2d.make_campaign
+Fields are by NGSolve (another mesher, order 5, the steel's law written anew), with noise. Needs the
+tests' dependencies::
+
+    PYTHONPATH=. python studies/nonlinear-2d/make_campaign.py
+
+``map-paper.csv`` is of the truth that the paper publishes; ``map-drawn.csv`` of one drawn from the
+paper's prior, as which the published one, 0.44 of the prior's standard deviations away, is not.
 """
 
 from __future__ import annotations
@@ -23,23 +28,29 @@ SEED = 3
 
 
 def main() -> None:
-    """Write map.csv."""
+    """Write maps and truths."""
     study = read_study(HERE / "study.toml")
     points = points_from(study.observation.positions)
     table = np.genfromtxt(HERE / "fig3_nonlinear_2d_dM.csv", delimiter=",", names=True)
+    generator = np.random.default_rng(SEED)
     nominal = np.array([block.magnetization[:2] for block in blocks_of(study)])
-    truth = nominal + table["truth_A_per_m"].reshape(2, -1).T
-    section = replace(section_of(study), magnetizations=truth)
-    with ngsolve.TaskManager():
-        mesh = ngsolve_nonlinear.disk(section, 0.01)
-        field = ngsolve_nonlinear.section_field(section, mesh, 5, points)
+    sd = np.abs(table["prior_edge_1_A_per_m"] - table["prior_edge_2_A_per_m"]) / 2
+    drawn = table["prior_mean_A_per_m"] + sd * generator.standard_normal(len(sd))
     assert study.noise is not None
     sigma = study.noise.regions[0].sigma_T
-    field[:, :2] += sigma * np.random.default_rng(SEED).standard_normal((len(points), 2))
-    field[:, 2] = np.nan
-    write_map(field_map(points, field, attributes={
-        "source": "NGSolve, order 5, magnetizations of the paper's Fig. 3",
-        "noise": f"{sigma:g} T, seed {SEED}"}), HERE / "map.csv")
+    for name, deviation in (("paper", table["truth_A_per_m"]), ("drawn", drawn)):
+        truth = nominal + deviation.reshape(2, -1).T
+        section = replace(section_of(study), magnetizations=truth)
+        with ngsolve.TaskManager():
+            mesh = ngsolve_nonlinear.disk(section, 0.01)
+            field = ngsolve_nonlinear.section_field(section, mesh, 5, points)
+        field[:, :2] += sigma * generator.standard_normal((len(points), 2))
+        field[:, 2] = np.nan
+        write_map(field_map(points, field, attributes={
+            "source": f"NGSolve, order 5, {name} magnetizations",
+            "noise": f"{sigma:g} T, seed {SEED}"}), HERE / f"map-{name}.csv")
+        np.savetxt(HERE / f"truth-{name}.csv", truth, "%.6f", ",", header="Mx_A_per_m,My_A_per_m",
+                   comments="")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,98 @@
+"""The posteriors: time of the linear one, and effective samples of the non-linear one."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.note import Note
+from halbach_fe.blocks import blocks_of
+from halbach_fe.cli import common
+from halbach_fe.field_map import read_map
+from halbach_fe.getdp import find_getdp
+from halbach_fe.inference import linear
+from halbach_fe.inference.diagnostics import diagnose
+from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.inference.sampling import Move, Posterior, prior_reference, sample
+from halbach_fe.nonlinear import nonlinear_model
+from halbach_fe.sampled import sample_posterior
+from halbach_fe.solve import Workshop
+from halbach_fe.study import read_study
+from halbach_fe.update import infer
+
+STUDIES = Path(__file__).parent.parent / "studies"
+REPEATS = 5
+PCN_STEP, PCN_STEPS = 1 / 80, 18_000  # the paper's
+DRAWS = 1500
+
+
+def posterior_time(note: Note) -> None:
+    """576 parameters from 28 080 readings, over the product that it cannot avoid.
+
+    The time depends on sizes, not on numbers: these are random.
+    """
+    generator = np.random.default_rng(1)
+    blocks = blocks_of(read_study(STUDIES / "faser" / "campaign.toml"))
+    nominal = np.concatenate([block.magnetization for block in blocks])
+    matrix = 1e-9 * generator.standard_normal((28_080, len(nominal)))
+    prior = block_prior(nominal, 3, 0.01, 1.0, 0.02)
+    sigma = np.full(len(matrix), 5e-5)
+    readings = matrix @ prior.sample(1, generator)[0]
+    times: list[tuple[float, float]] = []
+    for _ in range(REPEATS):
+        started = time.monotonic()
+        whitened = matrix / sigma[:, None]
+        whitened.T @ whitened
+        middle = time.monotonic()
+        linear.update(matrix, readings, sigma, prior)
+        times.append((middle - started, time.monotonic() - middle))
+    product, all_ = np.min(times, axis=0)
+    note("inference.posterior_time_over_gram", all_ / product, "ratio",
+         f"whitening and numpy's product in one piece: {product:.2f} s")
+
+
+def nonlinear(note: Note) -> None:
+    """The paper's non-linear case, with the truth drawn from its prior; and the paper's sampler."""
+    folder = STUDIES / "nonlinear-2d"
+    study = read_study(folder / "study.toml")
+    table = np.genfromtxt(folder / "fig3_nonlinear_2d_dM.csv", delimiter=",", names=True)
+    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    mean = table["prior_mean_A_per_m"].reshape(2, -1).T.ravel()
+    sd = np.abs(table["prior_edge_1_A_per_m"] - table["prior_edge_2_A_per_m"]) / 2
+    prior = Gaussian(nominal + mean, np.diag(sd.reshape(2, -1).T.ravel()))
+    truth = np.loadtxt(folder / "truth-drawn.csv", delimiter=",", skiprows=1).ravel()
+    with tempfile.TemporaryDirectory() as name:
+        workshop = Workshop(find_getdp(), Path(name), jobs=2)
+        started = time.monotonic()
+        update = infer(study, read_map(folder / "map-drawn.csv"), workshop, prior=prior)
+        found = sample_posterior(update, workshop, DRAWS, say=common.say)
+        note("inference.nonlinear_seconds", time.monotonic() - started, "s",
+             f"all of it: 4 chains of {DRAWS} draws, {found.solves} solves")
+        note("inference.nonlinear_z_rms", float(np.sqrt(np.mean(
+            ((found.mean - truth) / found.sd) ** 2))), "", "the paper: 1.40")
+        note("inference.nonlinear_min_ess", float(found.diagnostics.bulk.min()),
+             "effective samples", "worst of 32 parameters")
+        note("inference.nonlinear_max_rhat", float(found.diagnostics.r_hat.max()), "", "")
+        model = nonlinear_model(study, update.observation, replace(
+            workshop, folder=workshop.folder / "pcn"), np.random.default_rng(1))
+        sigma = np.hypot(update.noise, model.error)
+        target = Posterior(lambda p: model(p, 1e-7), update.readings, sigma, prior)
+        common.say(f"the paper's sampler, {PCN_STEPS} steps")
+        generator = np.random.default_rng(2)
+        chain = sample(target, [Move(prior_reference(prior), PCN_STEP)], PCN_STEPS, generator,
+                       np.zeros(prior.root.shape[1]))
+        theirs = diagnose(chain.samples[None]).bulk.min() / PCN_STEPS
+        note("inference.ess_per_solve_over_pcn",
+             float(found.diagnostics.bulk.min()) / found.solves / theirs, "ratio",
+             f"pCN with s = 1/80, {PCN_STEPS} steps from the prior's mean: "
+             f"{theirs * PCN_STEPS:.1f} effective samples, an estimate that favours it")
+
+
+def run(note: Note) -> None:
+    """Measure and note."""
+    posterior_time(note)
+    nonlinear(note)

@@ -1,0 +1,101 @@
+"""The paper's non-linear validation: 32 magnetizations in a steel ring, from B on a circle.
+
+The prior is the paper's (Fig. 3); the maps are NGSolve's, of the truth that the paper publishes and
+of one drawn from that prior (make_campaign.py)::
+
+    python studies/nonlinear-2d/run.py -o results/nonlinear-2d
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.cli import common
+from halbach_fe.field_map import read_map
+from halbach_fe.inference.prior import Gaussian
+from halbach_fe.report.magnetizations import write_magnetizations
+from halbach_fe.sampled import sample_posterior, sampled_summary, with_samples, write_sampled
+from halbach_fe.study import Study, read_study
+from halbach_fe.update import infer, write_text
+
+HERE = Path(__file__).parent
+CASES = {"paper": "the paper's truth", "drawn": "a truth drawn from the prior"}
+EFFECTIVE = 1000.0
+
+
+def published(study: Study) -> tuple[Gaussian, dict[str, float]]:
+    """The paper's prior, and its own figures."""
+    table = np.genfromtxt(HERE / "fig3_nonlinear_2d_dM.csv", delimiter=",", names=True)
+
+    def by_block(values: Floats) -> Floats:
+        return values.reshape(2, -1).T.ravel()
+
+    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    sd = {name: np.abs(table[f"{name}_edge_1_A_per_m"] - table[f"{name}_edge_2_A_per_m"]) / 2
+          for name in ("prior", "posterior_B")}
+    error = table["posterior_B_mean_A_per_m"] - table["truth_A_per_m"]
+    prior = Gaussian(nominal + by_block(table["prior_mean_A_per_m"]), np.diag(by_block(
+        sd["prior"])))
+    return prior, {"rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
+                   "largest_error_A_per_m": float(np.abs(error).max()),
+                   "z_rms": float(np.sqrt(np.mean((error / sd["posterior_B"]) ** 2)))}
+
+
+def scores(mean: Floats, sd: Floats, truth: Floats) -> dict[str, float]:
+    """The same figures of a mean and standard deviation."""
+    error = mean - truth
+    return {"rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
+            "largest_error_A_per_m": float(np.abs(error).max()),
+            "z_rms": float(np.sqrt(np.mean((error / sd) ** 2)))}
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run both cases and print their table."""
+    study = read_study(options.study)
+    prior, paper = published(study)
+    results: dict[str, dict[str, object]] = {"paper, posterior": dict(paper)}
+    for case, what in CASES.items():
+        truth = np.loadtxt(HERE / f"truth-{case}.csv", delimiter=",", skiprows=1).ravel()
+        folder = options.output / case
+        with common.workshop(options) as workshop:
+            there = replace(workshop, folder=folder)
+            update = infer(study, read_map(HERE / f"map-{case}.csv"), there, prior=prior)
+            found = sample_posterior(update, there, options.samples, effective=EFFECTIVE,
+                                     say=common.say)
+        write_sampled(found, folder)
+        updated = with_samples(update, found)
+        results[f"{what}: prior"] = dict(scores(prior.mean, prior.sd, truth))
+        results[f"{what}: posterior"] = scores(found.mean, found.sd, truth) | sampled_summary(found)
+        write_magnetizations(updated, truth, folder, sampled_summary(found), what)
+    write_text(options.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
+               + "\n")
+    common.print_table([{"what": name} | {key: f"{row[key]:.4g}" for key in paper}
+                        for name, row in results.items()],
+                       "Magnetizations: error, and error over standard deviation")
+    common.say(f"Reports: {options.output}/*/magnetizations.html")
+    return 0
+
+
+def main() -> int:
+    """Parse the command line and run; return the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.set_defaults(study=HERE / "study.toml")
+    parser.add_argument("-o", "--output", type=Path, default=Path("results/nonlinear-2d"))
+    parser.add_argument("--jobs", type=common.positive, default=2)
+    parser.add_argument("--samples", type=common.positive, default=1500,
+                        help="draws of each chain (default: %(default)s)")
+    parser.add_argument("--time-limit", type=float, default=3600.0)
+    common.add_getdp_argument(parser)
+    options = parser.parse_args()
+    return common.guarded(lambda: run(options))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
