@@ -13,6 +13,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ from halbach_fe.update import Prediction, Update, write_text
 CHUNK = 250
 """Draws of every chain between two stored states."""
 
-LAPLACE_STEPS = (1.0, 0.6, 0.3) * 3
+LAPLACE_STEPS = (1.0, 1.0, 0.6, 1.0, 1.0, 0.3, 1.0, 1.0, 0.6)
 """Long steps where the posterior is nearly normal; short ones leave the tails, where long ones
 are never accepted."""
 
@@ -64,7 +65,7 @@ class Sampled:
     accepted : float
         Fraction of the proposals.
     solves : int
-        Non-linear solves of this run.
+        Non-linear solves, those of interrupted runs included.
     agreement_T : float
         Largest difference to GetDP's Newton method, draws of the posterior included.
     diagnostics : Diagnostics
@@ -128,12 +129,12 @@ def sample_posterior(
         OVERDISPERSED * generator.standard_normal(len(reference.centre))))
         for generator in generators]
     key = _key(update, model, draws, chains, seed)
-    _resume(path, key, runs)
+    target.solves += _resume(path, key, runs)
     while len(runs[0].samples) < draws:
         for run in runs:
             run.go_on(sample(target, moves, min(CHUNK, draws - len(run.samples)), run.generator,
                              run.last))
-        _store(path, key, runs, model.parameters)
+        _store(path, key, runs, model.parameters, target.solves)
         say(f"{len(runs[0].samples)} of {draws} draws")
     kept = np.array([run.samples[draws // 10:] for run in runs])
     diagnostics = diagnose(kept)
@@ -172,7 +173,9 @@ class _Run:
 
 def _key(update: Update, model: NonlinearModel, draws: int, chains: int, seed: int) -> str:
     """Digest of all that the chains depend on."""
-    digest = hashlib.sha256(f"{draws} {chains} {seed}".encode())
+    settings = (draws, chains, seed, LAPLACE_STEPS, PRIOR_STEP, OVERDISPERSED, CHUNK,
+                metadata.version("halbach-fe"))
+    digest = hashlib.sha256(repr(settings).encode())
     for part in (update.readings, update.noise, update.held_out, update.prior.mean,
                  update.prior.root, model.error, model.condensed.linear, model.condensed.readings,
                  model.condensed.law.values):
@@ -180,7 +183,9 @@ def _key(update: Update, model: NonlinearModel, draws: int, chains: int, seed: i
     return digest.hexdigest()
 
 
-def _store(path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...]) -> None:
+def _store(
+    path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...], solves: int
+) -> None:
     """As ArviZ reads it: group ``posterior``, dimensions chain and draw."""
     posterior = xr.Dataset(
         {"magnetization": (("chain", "draw", "parameter"), np.array([r.samples for r in runs]),
@@ -190,7 +195,7 @@ def _store(path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...]) 
     state = xr.Dataset(
         {"last": (("chain", "coordinate"), np.array([r.last for r in runs])),
          "accepted": ("chain", np.array([r.accepted for r in runs]))},
-        attrs={"key": key, "generators": json.dumps(
+        attrs={"key": key, "solves": solves, "generators": json.dumps(
             [r.generator.bit_generator.state for r in runs])})
     try:
         with atomic(path) as temporary:
@@ -200,21 +205,23 @@ def _store(path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...]) 
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
 
 
-def _resume(path: Path, key: str, runs: list[_Run]) -> None:
-    """Go on from what an interrupted run stored, if it is of the same inputs."""
+def _resume(path: Path, key: str, runs: list[_Run]) -> int:
+    """Go on from what an interrupted run stored, if it is of the same inputs; its solves."""
     try:
         with xr.open_dataset(path, group="state", engine="h5netcdf") as state:
             if state.attrs["key"] != key:
-                return
+                return 0
+            solves = int(state.attrs["solves"])
             last, accepted = state["last"].values, state["accepted"].values
             generators = json.loads(state.attrs["generators"])
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
             samples = posterior["magnetization"].values
     except (OSError, KeyError, ValueError, RuntimeError):
-        return
+        return 0
     for number, run in enumerate(runs):
         run.last, run.samples, run.accepted = last[number], samples[number], float(accepted[number])
         run.generator.bit_generator.state = generators[number]
+    return solves
 
 
 def sampled_summary(found: Sampled) -> dict[str, object]:
