@@ -19,8 +19,8 @@ from halbach_fe.routes import solve_nominal
 from halbach_fe.solve import Workshop
 from halbach_fe.study import parse_study
 
-PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "xarray", "pydantic", "jinja2",
-            "matplotlib")
+PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "h5netcdf", "xarray", "pydantic", "jinja2",
+            "matplotlib", "arviz", "rich")
 TOLERANCE = {"direct": 5e-3, "reaction": 5e-4}
 """Of the bore field, on the coarse mesh used here: measured 1.5e-3 and 2e-5, times some safety."""
 

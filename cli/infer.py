@@ -44,8 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
             "linear, and its posterior has a closed form. Leave it out.")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.workshop(arguments) as workshop:
-        update = infer(study, data, workshop, blocks)
+        update = infer(study, data, workshop, blocks, linearized_only=bool(arguments.samples))
         if arguments.samples:
+            write_update(update, arguments.output)  # should the chains not do
             from halbach_fe.sampled import (  # ArviZ takes seconds to load
                 sample_posterior,
                 with_samples,

@@ -223,14 +223,14 @@ class Condensed:
                 differences = np.diff(steps, axis=0)
                 weights = np.linalg.lstsq(differences.T, step, rcond=None)[0]
                 added = added - (np.diff(points, axis=0) + differences).T @ weights
-        return added, MAX_ITERATIONS, tuple(residuals), False
+        return added, len(residuals), tuple(residuals), False
 
     def _newton(self, own: Floats, added: Floats) -> tuple[Floats, tuple[float, ...]]:
         """Newton's method, halving steps until the residual falls; the residuals of every step."""
         scale = self._scale(own)
         residual = self._residual(own, added)
         norms = [float(np.linalg.norm(residual)) / scale]
-        while norms[-1] > NEWTON_RESIDUAL:
+        while not norms[-1] <= NEWTON_RESIDUAL:  # nor is nan
             if len(norms) > MAX_NEWTON_STEPS:
                 raise NotConvergedError(
                     f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
@@ -244,7 +244,7 @@ class Condensed:
                 if norm < norms[-1] * (1 - 1e-4 * length) or length < SMALLEST_STEP:
                     break
                 length /= 2
-            if norm >= norms[-1]:
+            if not norm < norms[-1]:
                 if norms[-1] < 1e3 * NEWTON_RESIDUAL:  # rounding: there is nothing left to gain
                     break
                 raise NotConvergedError(

@@ -83,9 +83,9 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
             break
     if len(missing):
         where = ", ".join(f"{x:g}" for x in points[missing[0]])
-        raise PointsOutsideError(f"Input points of the mesh must lie in its air; instead "
-                                 f"{len(missing)} lie in none of its elements, the first at "
-                                 f"({where}) m.")
+        raise PointsOutsideError(f"Input points of the mesh must lie in its "
+                                 f"{'elements' if anywhere else 'air'}; instead {len(missing)} lie "
+                                 f"in none of its elements, the first at ({where}) m.")
     rows = np.concatenate([row for row, _, _ in found])
     share = 1 / np.bincount(rows, minlength=len(points))[rows]
     mean = sparse.csr_array((share, (rows, np.arange(len(rows)))), shape=(len(points), len(rows)))

@@ -19,7 +19,7 @@ from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError, StudyError
 from halbach_fe.evaluation import locate, quadrature
 from halbach_fe.exact_field import unit_fields
-from halbach_fe.inference.prior import block_prior
+from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.observation import Observation
 from halbach_fe.response import Response, parameter_names, response
 from halbach_fe.routes import check_points, choose_route, finite_element_part, formulation_of
@@ -73,11 +73,12 @@ class NonlinearModel:
 
 def nonlinear_model(
     study: Study, observation: Observation, workshop: Workshop, generator: np.random.Generator,
+    prior: Gaussian | None = None,
 ) -> NonlinearModel:
     """Build the model of a study whose iron ring has an H(B) curve, and verify it.
 
-    ``generator`` draws the magnetizations, from the study's prior, at which it is compared with
-    GetDP's own Newton method.
+    ``generator`` draws the magnetizations, from the study's prior or another, at which it is
+    compared with GetDP's own Newton method.
 
     Raises
     ------
@@ -93,7 +94,7 @@ def nonlinear_model(
     condensed = build(study, observation, workshop, linear)
     error = _error(study, observation, workshop)
     model = NonlinearModel(condensed, parameter_names(study), linear.nominal, error, np.nan)
-    prior = block_prior(
+    prior = prior or block_prior(
         linear.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd)
     samples = prior.sample(VERIFIED_SAMPLES, generator)

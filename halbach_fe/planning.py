@@ -16,8 +16,12 @@ from halbach_fe.inference.linear import posterior
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.observation import observe, points_from, standard_deviations
 from halbach_fe.response import response
+from halbach_fe.routes import check_points
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
+
+CURVE_POINTS = 100
+"""Numbers of points for which the study's own positions are judged."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,10 @@ class MeasurementPlan:
     parameters : tuple of str
     candidates, points, baseline : ndarray, shape (n, 3), in m
         What was chosen from, what was chosen, in order, and the study's positions.
-    gain, baseline_gain : ndarray
-        Expected information in nats after every chosen position; and after as many of the study's
-        positions, spread evenly.
+    gain : ndarray
+        Expected information in nats after every chosen position.
+    baseline_counts, baseline_gain : ndarray
+        Numbers of the study's positions, spread evenly, and what they tell.
     nominal, prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
         Nominal magnetization; sd before, after the plan, and after as many of the study's
         positions.
@@ -42,6 +47,7 @@ class MeasurementPlan:
     points: Floats
     baseline: Floats
     gain: Floats
+    baseline_counts: Ints
     baseline_gain: Floats
     nominal: Floats
     prior_sd: Floats
@@ -59,8 +65,9 @@ class MeasurementPlan:
         """Mean sd (geometric, over the posterior's axes) after the plan over that after as many of
         the study's positions.
         """
-        count = min(len(self.gain), len(self.baseline_gain)) - 1
-        difference = self.gain[count] - self.baseline_gain[count]
+        count = min(len(self.gain), len(self.baseline))
+        own = self.baseline_gain[np.searchsorted(self.baseline_counts, count)]
+        difference = self.gain[count - 1] - own
         return float(np.exp(-difference / len(self.parameters)))
 
 
@@ -90,18 +97,25 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
         raise StudyError(
             f"Input `plan.points` of study {study.name} must be at most the number of candidates, "
             f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
+    check_points(study, baseline)
+    try:
+        check_points(study, candidates)
+    except StudyError as error:
+        raise StudyError(str(error).replace("observation.positions", "plan.candidates")) from None
     points = np.vstack([baseline, candidates])
     observation = observe(study, points, np.ones_like(points, bool))
-    model = response(study, observation, workshop)
     noise = standard_deviations(study, observation, xr.Dataset())
+    model = response(study, observation, workshop)
     prior = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
     sigma = np.hypot(noise, model.error)
     size = len(observation) // len(points)  # readings at a point
     whitened = ((model.matrix @ prior.root) / sigma[:, None]).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)
+    same = min(wanted, len(baseline))
+    counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))
     own = [information(whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2]))
-           for number in range(1, len(baseline) + 1)]
+           for number in counts]
     rows = np.arange(len(observation)).reshape(len(points), size)
 
     def sd_after(positions: Ints) -> Floats:
@@ -109,9 +123,9 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
         return _posterior(model.matrix[index], sigma[index], prior).sd
 
     return MeasurementPlan(
-        model.parameters, candidates, candidates[chosen], baseline, gain, np.array(own),
+        model.parameters, candidates, candidates[chosen], baseline, gain, counts, np.array(own),
         model.nominal, prior.sd, sd_after(chosen + len(baseline)),
-        sd_after(spread(len(baseline), min(wanted, len(baseline)))))
+        sd_after(spread(len(baseline), same)))
 
 
 def spread(total: int, count: int) -> Ints:

@@ -13,14 +13,13 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from halbach_fe.blocks import Floats
-from halbach_fe.errors import OutputError
+from halbach_fe.errors import OutputError, SamplingError
 from halbach_fe.field_map import atomic
 from halbach_fe.inference.diagnostics import Diagnostics, diagnose, require_convergence
 from halbach_fe.inference.sampling import (
@@ -32,6 +31,7 @@ from halbach_fe.inference.sampling import (
     sample,
 )
 from halbach_fe.nonlinear import NonlinearModel, nonlinear_model, verify
+from halbach_fe.response import code_digest
 from halbach_fe.solve import Workshop
 from halbach_fe.update import Prediction, Update, write_text
 
@@ -48,9 +48,12 @@ OVERDISPERSED = 2.0
 
 VERIFIED_DRAWS = 3
 PREDICTED_DRAWS = 200
-NOISE_FRACTION = 1e-2
-"""Solves are converged to this part of the smallest error bar of a reading: it moves the log of
-the likelihood by less than 1e-2."""
+LIKELIHOOD_ERROR = 1e-2
+"""What stopping a solve early may move the log of the likelihood by, about; n readings that miss by
+a standard deviation allow each to be off by this part of it over n."""
+
+SMALLEST_TOLERANCE_T = 1e-9
+MIN_DRAWS = 20
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Sampled:
     accepted : float
         Fraction of the proposals.
     solves : int
-        Non-linear solves, those of interrupted runs included.
+        Likelihoods of the chains and of the search for the mode, interrupted runs included.
     agreement_T : float
         Largest difference to GetDP's Newton method, draws of the posterior included.
     diagnostics : Diagnostics
@@ -113,10 +116,15 @@ def sample_posterior(
     SamplingError
         If the mode is not found, or the chains are too short.
     """
-    model = nonlinear_model(update.study, update.observation, workshop, np.random.default_rng(seed))
+    if draws < MIN_DRAWS:
+        raise SamplingError(f"Input draws must be at least {MIN_DRAWS} of each chain; instead "
+                            f"received {draws}. Some 1500 are usual.")
+    model = nonlinear_model(update.study, update.observation, workshop,
+                            np.random.default_rng(seed), update.prior)
     train = ~update.held_out
     sigma = np.hypot(update.noise, model.error)
-    tolerance = NOISE_FRACTION * float(sigma.min())
+    tolerance = max(SMALLEST_TOLERANCE_T,
+                    LIKELIHOOD_ERROR * float(sigma[train].min()) / int(train.sum()))
     target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], sigma[train],
                        update.prior)
     reference, mode = laplace(target, lambda p: model.jacobian(p)[train])
@@ -128,22 +136,22 @@ def sample_posterior(
     runs = [_Run(generator, reference.place(
         OVERDISPERSED * generator.standard_normal(len(reference.centre))))
         for generator in generators]
-    key = _key(update, model, draws, chains, seed)
+    key = _key(update, model, chains, seed)
     target.solves += _resume(path, key, runs)
     while len(runs[0].samples) < draws:
         for run in runs:
             run.go_on(sample(target, moves, min(CHUNK, draws - len(run.samples)), run.generator,
-                             run.last))
+                             run.last, first=len(run.samples)))
         _store(path, key, runs, model.parameters, target.solves)
         say(f"{len(runs[0].samples)} of {draws} draws")
-    kept = np.array([run.samples[draws // 10:] for run in runs])
+    kept = np.array([run.samples[draws // 10:draws] for run in runs])
     diagnostics = diagnose(kept)
     require_convergence(diagnostics, model.parameters, effective)
     flat = kept.reshape(-1, kept.shape[2])
     chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
     predicted = model(chosen, tolerance)
-    agreement = verify(model, update.study, update.observation, workshop, chosen[::len(chosen)
-                                                                            // VERIFIED_DRAWS])
+    some = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
+    agreement = verify(model, update.study, update.observation, workshop, some)
     return Sampled(
         kept, model.parameters, mode, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
@@ -171,14 +179,14 @@ class _Run:
         self.last = chain.last
 
 
-def _key(update: Update, model: NonlinearModel, draws: int, chains: int, seed: int) -> str:
-    """Digest of all that the chains depend on."""
-    settings = (draws, chains, seed, LAPLACE_STEPS, PRIOR_STEP, OVERDISPERSED, CHUNK,
-                metadata.version("halbach-fe"))
-    digest = hashlib.sha256(repr(settings).encode())
+def _key(update: Update, model: NonlinearModel, chains: int, seed: int) -> str:
+    """Digest of all that the chains depend on, but their length."""
+    digest = hashlib.sha256(f"{chains} {seed}".encode() + code_digest())
+    iron = model.condensed
     for part in (update.readings, update.noise, update.held_out, update.prior.mean,
-                 update.prior.root, model.error, model.condensed.linear, model.condensed.readings,
-                 model.condensed.law.values):
+                 update.prior.root, model.error, iron.linear, iron.readings, iron.potential,
+                 iron.weights, iron.stiffness.data, iron.gradient.data, iron.law.squares,
+                 iron.law.values):
         digest.update(np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
 
@@ -255,4 +263,5 @@ def with_samples(update: Update, found: Sampled) -> Update:
     values, vectors = np.linalg.eigh(root @ root.T)
     from_samples = replace(update.posterior, mean=found.mean,
                            root=vectors * np.sqrt(np.maximum(values, 0)))
-    return replace(update, posterior=from_samples, prediction_posterior=found.prediction)
+    return replace(update, kind="samples", posterior=from_samples,
+                   prediction_posterior=found.prediction)

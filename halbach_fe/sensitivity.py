@@ -29,8 +29,9 @@ def derivative(study: Study, block: int, points: Floats, workshop: Workshop) -> 
     if not 0 <= block < len(blocks):
         raise StudyError(f"Input block of study {study.name} must be one of its {len(blocks)}; "
                          f"instead received {block + 1}.")
-    direct = study.model_copy(update={  # the field in materials has no exact form
-        "solver": study.solver.model_copy(update={"method": "direct"})})
+    # the field in materials has no exact form, and the scalar potential gives H there
+    direct = study.model_copy(update={
+        "solver": study.solver.model_copy(update={"method": "direct", "route": "auto"})})
     formulation = formulation_of(direct, choose_route(direct, points))
     if is_nonlinear(study):
         fields = solve_tangent(direct, points, (block,), workshop, formulation, anywhere=True)[1]

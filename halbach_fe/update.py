@@ -12,6 +12,7 @@ import json
 import warnings
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -97,6 +98,7 @@ class Update:
     prior_conflict: float
     parameters_learnt: float
     log_evidence: float
+    kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
 
     @property
@@ -127,9 +129,8 @@ class Update:
 
     def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
         figures: dict[str, float | None] = {}
-        for name, model, prediction in (
-                ("prior", self.prior, self.prediction_prior),
-                ("posterior", self.posterior, self.prediction_posterior)):
+        for name, prediction in (("prior", self.prediction_prior),
+                                 ("posterior", self.prediction_posterior)):
             errors = self.relative_error(prediction)[chosen]
             errors = errors[~np.isnan(errors)]
             figures[f"median_relative_error_{name}"] = (
@@ -139,15 +140,14 @@ class Update:
             inside = np.abs(self.readings - prediction.mean)[chosen] <= COVERAGE_Z * total
             figures[f"coverage95_{name}"] = float(np.mean(inside)) if unseen else None
             figures[f"chi2_{name}"] = chi2_per_reading(
-                self.response.matrix[chosen],
-                (self.readings - self.response.offset)[chosen], self.sigma[chosen],
-                model) if unseen else None
+                self.readings[chosen], self.sigma[chosen], prediction.mean[chosen],
+                prediction.sd[chosen]) if unseen else None
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 
 def infer(
     study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
-    prior: Gaussian | None = None,
+    prior: Gaussian | None = None, linearized_only: bool = False,
 ) -> Update:
     """Update the block magnetizations of a study with a measured map.
 
@@ -162,6 +162,8 @@ def infer(
         Measured blocks, whose prior takes the place of the study's.
     prior : Gaussian, optional
         Of the parameters in A/m, in place of both.
+    linearized_only : bool
+        Do not solve the updated magnet to see whether linearizing its iron was good enough.
 
     Raises
     ------
@@ -214,7 +216,7 @@ def infer(
     learnt = linear.update(
         model.matrix[~keep], (readings - model.offset)[~keep], sigma[~keep], before)
     after = learnt.distribution
-    if is_nonlinear(study):
+    if is_nonlinear(study) and not linearized_only:
         _check_linearization(study, observation, workshop, model, after.mean, sigma)
     return Update(
         study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
@@ -222,7 +224,8 @@ def infer(
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
         log_evidence=learnt.log_evidence,
-        measured_blocks=of_blocks.count if of_blocks else None)
+        kind="linearized" if is_nonlinear(study) else "closed form",
+        measured_blocks=of_blocks.count if of_blocks and not prior else None)
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -285,6 +288,7 @@ def summary(update: Update) -> dict[str, object]:
         "readings": len(update.readings),
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
+        "posterior": update.kind,
         "measured_blocks": update.measured_blocks,
         "superposition_error": update.response.superposition_error,
         "largest_solver_error_T": float(update.response.error.max()),

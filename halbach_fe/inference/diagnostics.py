@@ -36,20 +36,16 @@ class Diagnostics:
         Effective samples for the mean and for the 5 and 95 % quantiles.
     mcse : ndarray
         Monte Carlo standard error of the mean, in the parameter's unit.
-    samples : int
-        Of all chains.
+    chains, samples : int
+        Chains, and samples of all of them.
     """
 
     r_hat: Floats
     bulk: Floats
     tail: Floats
     mcse: Floats
+    chains: int
     samples: int
-
-    @property
-    def autocorrelation_time(self) -> Floats:
-        """Samples per effective one, (m,)."""
-        return self.samples / self.bulk
 
 
 def diagnose(samples: Floats) -> Diagnostics:
@@ -61,7 +57,7 @@ def diagnose(samples: Floats) -> Diagnostics:
 
     return Diagnostics(
         figure(arviz.rhat(data)), figure(arviz.ess(data)), figure(arviz.ess(data, method="tail")),
-        figure(arviz.mcse(data)), samples.shape[0] * samples.shape[1])
+        figure(arviz.mcse(data)), samples.shape[0], samples.shape[0] * samples.shape[1])
 
 
 def require_convergence(
@@ -74,13 +70,22 @@ def require_convergence(
     SamplingError
         With the worst parameter, its autocorrelation time, and how many samples would do.
     """
-    worst = int(np.nanargmin(np.minimum(found.bulk, found.tail)))
-    short = min(found.bulk[worst], found.tail[worst])
-    if short >= effective and np.nanmax(found.r_hat) <= MAX_R_HAT:
-        return
-    time = found.samples / short
-    raise SamplingError(
-        f"The chains are too short: {names[worst]} has {short:.0f} effective samples of "
-        f"{found.samples} (autocorrelation time {time:.0f}), where {effective:.0f} are needed, and "
-        f"the largest R-hat is {np.nanmax(found.r_hat):.3f}, where {MAX_R_HAT} is allowed. Take "
-        f"some {time * effective:.0f} samples.")
+    if not all(np.isfinite(one).all() for one in (found.r_hat, found.bulk, found.tail)):
+        raise SamplingError(
+            f"The chains cannot be judged: {found.samples // found.chains} draws each are too few, "
+            "or one does not move at all. Take some hundreds.")
+    smallest = np.minimum(found.bulk, found.tail)
+    worst = int(np.argmin(smallest))
+    if smallest[worst] < effective:
+        time = found.samples / smallest[worst]
+        raise SamplingError(
+            f"The chains are too short: {names[worst]} has {smallest[worst]:.0f} effective samples "
+            f"of {found.samples} (autocorrelation time {time:.0f}), where {effective:.0f} are "
+            f"needed. Take some {time * effective / found.chains:.0f} draws of each chain, and a "
+            "tenth more that is discarded.")
+    apart = int(np.argmax(found.r_hat))
+    if found.r_hat[apart] > MAX_R_HAT:
+        raise SamplingError(
+            f"The chains do not agree on {names[apart]}: its R-hat is {found.r_hat[apart]:.3f}, "
+            f"where {MAX_R_HAT} is allowed. Take more draws; if that does not help, the posterior "
+            "has several modes.")

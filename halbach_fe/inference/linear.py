@@ -117,10 +117,10 @@ def predict(matrix: Floats, parameters: Gaussian) -> tuple[Floats, Floats]:
     return mean, np.sqrt(variance)
 
 
-def chi2_per_reading(matrix: Floats, readings: Floats, sigma: Floats, model: Gaussian) -> float:
-    """Mean squared error over the variance of prediction and noise, about 1 if all is well.
+def chi2_per_reading(readings: Floats, sigma: Floats, mean: Floats, sd: Floats) -> float:
+    """Mean squared error of a prediction (mean and sd) over its variance and the noise's, about 1
+    if all is well.
 
     For readings that the model has not seen; those that it was fitted to lie nearer.
     """
-    mean, sd = predict(matrix, model)
     return float(np.mean((readings - mean) ** 2 / (sd**2 + sigma**2)))

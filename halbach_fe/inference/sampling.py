@@ -167,7 +167,7 @@ class Chain:
 
 def sample(
     posterior: Posterior, moves: Sequence[Move], count: int, generator: np.random.Generator,
-    start: Floats, surrogate: Posterior | None = None,
+    start: Floats, surrogate: Posterior | None = None, first: int = 0,
 ) -> Chain:
     """Run a chain that takes its moves in turn; each leaves the posterior invariant.
 
@@ -182,6 +182,8 @@ def sample(
         z to start from.
     surrogate : Posterior, optional
         Of a cheap model, which screens.
+    first : int
+        Number of the first step, by which the moves are taken in turn.
     """
     prior = posterior.prior
 
@@ -194,7 +196,7 @@ def sample(
     samples = np.empty((count, len(prior.mean)))
     accepted = 0
     for number in range(count):
-        move = moves[number % len(moves)]
+        move = moves[(first + number) % len(moves)]
         xi = move.reference.white(z)
         xi_there = (np.sqrt(1 - move.step**2) * xi
                     + move.step * generator.standard_normal(len(xi)))

@@ -93,7 +93,7 @@ def _information(plan: MeasurementPlan) -> Figure:
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), plan.gain, color=POSTERIOR, label="plan")
-    axis.plot(range(1, len(plan.baseline_gain) + 1), plan.baseline_gain, color=PRIOR,
+    axis.plot(plan.baseline_counts, plan.baseline_gain, color=PRIOR,
               label="positions of the study")
     axis.axhline(plan.baseline_gain[-1], color=PUBLISHED, lw=0.8, ls=":")
     axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, Ints
 from halbach_fe.report.page import IRON, POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
 from halbach_fe.study import Study
 from halbach_fe.update import write_text
@@ -39,7 +39,7 @@ class Sensitivity:
         Largest relative error on the circle of the derivative by the formula that the paper
         prints, whose iron is that of the derivative's own field.
     information : mapping
-        Expected information in nats against the number of points, by name.
+        Numbers of points and expected information in nats, by name.
     """
 
     block: int
@@ -50,7 +50,7 @@ class Sensitivity:
     along: Floats
     across: Floats
     printed_form: float
-    information: Mapping[str, Floats]
+    information: Mapping[str, tuple[Ints, Floats]]
 
 
 def write_sensitivity(
@@ -115,9 +115,9 @@ def _information(found: Sensitivity) -> Figure:
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axis = figure.subplots()
     colours = (PRIOR, POSTERIOR, PUBLISHED, IRON)
-    for (name, gain), colour in zip(found.information.items(), colours, strict=False):
+    for (name, (counts, gain)), colour in zip(found.information.items(), colours, strict=False):
         # plans may tell hardly more than what they are compared with
-        axis.plot(range(1, len(gain) + 1), gain, color=colour, label=name,
+        axis.plot(counts, gain, color=colour, label=name,
                   ls="--" if colour == PRIOR else "-", zorder=3 if colour == PRIOR else 2)
     axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
     axis.grid(alpha=0.3)

@@ -93,8 +93,10 @@ def run(options: argparse.Namespace) -> int:
                  "wherever the probe can go": plan(study, room("plan"))}
         error = printed_form_error(study, model, workshop)
     along, across = by_block(study, model)
-    information = {"equally spaced circle": plans["on the circle"].baseline_gain} | {
-        f"plan {name}": found.gain for name, found in plans.items()}
+    one = plans["on the circle"]
+    information = {"equally spaced circle": (one.baseline_counts, one.baseline_gain)} | {
+        f"plan {name}": (np.arange(1, len(found.gain) + 1), found.gain)
+        for name, found in plans.items()}
     write_plan(on_circle, plans["on the circle"], options.output / "plan-circle")
     write_plan(study, plans["wherever the probe can go"], options.output / "plan")
     summaries = {name: plan_summary(found) for name, found in plans.items()}

@@ -121,8 +121,9 @@ def test_prediction_and_chi2(generator):
     certain = Gaussian(prior.mean, np.zeros((5, 1)))
     readings = mean + sigma * generator.standard_normal(400)
     # sd of chi2/n over 400 readings is 0.07
-    assert chi2_per_reading(matrix, readings, sigma, certain) == pytest.approx(1.0, abs=0.3)
-    assert chi2_per_reading(matrix, readings + 3 * sigma, sigma, certain) > 3
+    model = predict(matrix, certain)
+    assert chi2_per_reading(readings, sigma, *model) == pytest.approx(1.0, abs=0.3)
+    assert chi2_per_reading(readings + 3 * sigma, sigma, *model) > 3
 
 
 def test_prior_conflict_is_the_prior_predictive_distance(generator):

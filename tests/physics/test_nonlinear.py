@@ -514,6 +514,13 @@ def test_a_wrong_model_is_refused(saturated, part):
     assert saturated.model.agreement_T <= AGREEMENT_T  # the right one was not
 
 
+@pytest.mark.parametrize("newton", [True, False])
+def test_what_is_no_number_does_not_converge(saturated, newton):
+    model = saturated.model
+    with pytest.raises(NotConvergedError):
+        model.condensed.solve(np.full(len(model.nominal), np.nan), newton=newton)
+
+
 def test_condensed_engine_in_3d(getdp, tmp_path, generator):
     """The scalar potential, on a mesh that is coarse but saturates: mu_0 H up to 0.017 T, a B of
     1.9 T. Cold starts at random magnetizations: measured 3e-11 T; one block's potential 0.1 % off
