@@ -231,10 +231,10 @@ class Condensed:
         residual = self._residual(own, added)
         norms = [float(np.linalg.norm(residual)) / scale]
         while not norms[-1] <= NEWTON_RESIDUAL:  # nor is nan
-            if len(norms) > MAX_NEWTON_STEPS:
+            if len(norms) > MAX_NEWTON_STEPS or not np.isfinite(norms[-1]):
                 raise NotConvergedError(
                     f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
-                    f"{MAX_NEWTON_STEPS} steps. Smooth the H(B) curve, or refine the mesh.",
+                    f"{len(norms) - 1} steps. Smooth the H(B) curve, or refine the mesh.",
                     tuple(norms))
             step = -self._factorize(own + added).solve(residual)
             length = 1.0
