@@ -1,13 +1,17 @@
 # make demo     the main job: the FASER dipole, before and after its measurement
 # make test     all tests
+# make verify-calibration  are the posteriors as sure as they may be?
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
+.PHONY: demo verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
+
+verify-calibration: setup
+	.venv/bin/python studies/calibration/run.py -o results/calibration
 
 study-nonlinear-2d: setup
 	.venv/bin/python studies/nonlinear-2d/run.py -o results/nonlinear-2d

@@ -1,0 +1,32 @@
+"""Rank histograms of a simulation-based calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from halbach_fe.blocks import Ints
+from halbach_fe.inference.calibration import BINS
+from halbach_fe.report.page import POSTERIOR, PUBLISHED, save, write_page
+
+
+def write_calibration(
+    ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, object]],
+    folder: Path,
+) -> None:
+    """Write calibration.html and ranks.png: ranks (repeats, parameters) by case, among draws."""
+    figure = Figure(figsize=(3.6 * len(ranks), 3.2), layout="constrained")
+    for axis, (name, found) in zip(figure.subplots(1, len(ranks), squeeze=False)[0],
+                                   ranks.items(), strict=True):
+        edges = np.linspace(0, draws + 1, BINS + 1)
+        axis.hist(found.ravel(), edges, density=True, color=POSTERIOR)
+        axis.axhline(1 / (draws + 1), color=PUBLISHED)
+        axis.set(title=name, xlabel="rank of the truth", yticks=[])
+        axis.title.set_fontsize(9)
+    pictures = save({"ranks.png": (figure, "Ranks of the truth among draws of the posterior, all "
+                                   "parameters; the line is what a calibrated posterior gives")},
+                    folder)
+    write_page(folder / "calibration.html", "calibration.html.j2", pictures, results=results)
