@@ -26,12 +26,17 @@ from halbach_fe.solve import Workshop
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
     """STUDY, -o, and the options of every verb that solves."""
     add_study_and_output(parser)
+    add_solver_arguments(parser)
+    add_json_argument(parser)
+
+
+def add_solver_arguments(parser: argparse.ArgumentParser) -> None:
+    """--jobs, --time-limit, --getdp."""
     parser.add_argument("--jobs", type=positive, default=min(2, os.cpu_count() or 1), metavar="N",
                         help="GetDP processes at a time (default: %(default)s)")
     parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
                         help="for each GetDP process (default: %(default)g)")
     add_getdp_argument(parser)
-    add_json_argument(parser)
 
 
 def add_study_and_output(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +44,24 @@ def add_study_and_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
                         help="folder for results; made if it does not exist")
+
+
+def run_study(
+    description: str, study: Path, output: str, run: Callable[[argparse.Namespace], int],
+    options: Callable[[argparse.ArgumentParser], object] = lambda parser: None,
+) -> int:
+    """Parse the command line of a shipped study and run it; return the exit code.
+
+    ``options`` adds the study's own.
+    """
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.set_defaults(study=study)
+    parser.add_argument("-o", "--output", type=Path, default=Path("results", output),
+                        metavar="DIR", help="folder for results (default: %(default)s)")
+    add_solver_arguments(parser)
+    options(parser)
+    arguments = parser.parse_args()
+    return guarded(lambda: run(arguments))
 
 
 def add_getdp_argument(parser: argparse.ArgumentParser) -> None:

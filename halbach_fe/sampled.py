@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,6 @@ class Sampled:
     ----------
     draws : ndarray, shape (chains, draws, parameters), in A/m
     parameters : tuple of str
-    mode : ndarray, shape (parameters,), in A/m
     accepted : float
         Fraction of the proposals.
     solves : int
@@ -78,7 +77,6 @@ class Sampled:
 
     draws: Floats
     parameters: tuple[str, ...]
-    mode: Floats
     accepted: float
     solves: int
     agreement_T: float
@@ -127,7 +125,7 @@ def sample_posterior(
                     LIKELIHOOD_ERROR * float(sigma[train].min()) / int(train.sum()))
     target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], sigma[train],
                        update.prior)
-    reference, mode = laplace(target, lambda p: model.jacobian(p)[train])
+    reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
     generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
     moves = [Move(reference, step) for step in LAPLACE_STEPS] + [
         Move(prior_reference(update.prior), PRIOR_STEP)]
@@ -153,7 +151,7 @@ def sample_posterior(
     some = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
     agreement = verify(model, update.study, update.observation, workshop, some)
     return Sampled(
-        kept, model.parameters, mode, float(np.mean([run.accepted for run in runs])),
+        kept, model.parameters, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
         Prediction(predicted.mean(axis=0), predicted.std(axis=0)))
 
@@ -164,11 +162,8 @@ class _Run:
 
     generator: np.random.Generator
     last: Floats
-    samples: Floats = None  # type: ignore[assignment]
+    samples: Floats = field(default_factory=lambda: np.empty((0, 0)))
     accepted: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.samples = np.empty((0, 0))
 
     def go_on(self, chain: Chain) -> None:
         """Append."""

@@ -40,16 +40,16 @@ PASS, FAIL = 0.01, 1e-4
 """p-values, corrected for 32 parameters: above the first is calibrated, below the second is not."""
 
 
-def run(options: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Run all three, write the ranks, print the table; CheckFailedError if one is off."""
-    study = read_study(options.study)
+    study = read_study(arguments.study)
     study = study.model_copy(update={"mesh": study.mesh.model_copy(
-        update={"block_size_m": options.block_size_m})})
+        update={"block_size_m": arguments.block_size_m})})
     points = points_from(study.observation.positions)[::2]
     measured = np.ones_like(points, bool)
     observation = observe(study, points, measured)
-    generator = np.random.default_rng(options.seed)
-    with common.workshop(options) as workshop:
+    generator = np.random.default_rng(arguments.seed)
+    with common.workshop(arguments) as workshop:
         model = nonlinear_model(study, observation, replace(
             workshop, folder=workshop.folder / "model"), generator)
     prior = block_prior(model.nominal, 2, 0.01, 1.0)
@@ -76,10 +76,10 @@ def run(options: argparse.Namespace) -> int:
         return chain.samples[:: PCN_STEPS // DRAWS][:DRAWS]
 
     cases = {
-        "linear, closed form": (lambda p: tangent @ p, closed_form, options.repeats, True),
-        "non-linear, chains": (lambda p: model(p, TOLERANCE_T), chains, options.repeats, True),
+        "linear, closed form": (lambda p: tangent @ p, closed_form, arguments.repeats, True),
+        "non-linear, chains": (lambda p: model(p, TOLERANCE_T), chains, arguments.repeats, True),
         "control: the paper's chain, too short": (
-            lambda p: model(p, TOLERANCE_T), short, max(40, options.repeats // 5), False)}
+            lambda p: model(p, TOLERANCE_T), short, max(40, arguments.repeats // 5), False)}
     results, found = {}, {}
     for name, (forward, sampler, repeats, good) in cases.items():
         common.say(f"{name}: {repeats} truths")
@@ -88,8 +88,8 @@ def run(options: argparse.Namespace) -> int:
         results[name] = {"repeats": repeats, "p_value": together,
                          "smallest_p_of_a_parameter": float(values.min()),
                          "as_expected": together > PASS if good else together < FAIL}
-    write_calibration(found, DRAWS, results, options.output)
-    write_text(options.output / "calibration.json", json.dumps(results, indent=1) + "\n")
+    write_calibration(found, DRAWS, results, arguments.output)
+    write_text(arguments.output / "calibration.json", json.dumps(results, indent=1) + "\n")
     common.print_table([{"what": name} | {key: f"{value:.3g}" if isinstance(value, float)
                                           else str(value) for key, value in row.items()}
                         for name, row in results.items()], "Ranks of the truth: uniform?")
@@ -99,20 +99,14 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def main() -> int:
-    """Parse the command line and run; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.set_defaults(study=STUDY)
-    parser.add_argument("-o", "--output", type=Path, default=Path("results/calibration"))
-    parser.add_argument("--jobs", type=common.positive, default=2)
-    parser.add_argument("--repeats", type=common.positive, default=200)
-    parser.add_argument("--seed", type=common.positive, default=5)
-    parser.add_argument("--block-size-m", type=float, default=0.02)
-    parser.add_argument("--time-limit", type=float, default=3600.0)
-    common.add_getdp_argument(parser)
-    options = parser.parse_args()
-    return common.guarded(lambda: run(options))
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add this study's own options."""
+    parser.add_argument("--repeats", type=common.positive, default=200, metavar="N",
+                        help="truths drawn (default: %(default)s)")
+    parser.add_argument("--seed", type=common.positive, default=5, metavar="N")
+    parser.add_argument("--block-size-m", type=float, default=0.02,
+                        help="of the mesh (default: %(default)s)")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(common.run_study(__doc__ or "", STUDY, "calibration", run, options))

@@ -79,36 +79,28 @@ def assumptions(update: Update, z_step: float) -> list[str]:
     ]
 
 
-def run(options: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Run the study and print its table."""
-    measured = options.output / "measured.csv"
-    published = profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, options.z_step_m)
-    study = with_step(read_study(options.study), options.z_step_m)
+    measured = arguments.output / "measured.csv"
+    published = profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, arguments.z_step_m)
+    study = with_step(read_study(arguments.study), arguments.z_step_m)
     common.say(f"FASER dipole: {study.array.rings * study.array.blocks_per_ring} blocks, "
                f"{len(published.z)} readings.")
-    with common.workshop(options) as workshop:
+    with common.workshop(arguments) as workshop:
         update = infer(study, read_map(measured), workshop)
-    write_update(update, options.output)
-    write_report(update, options.output, published, assumptions(update, options.z_step_m))
+    write_update(update, arguments.output)
+    write_report(update, arguments.output, published, assumptions(update, arguments.z_step_m))
     common.print_table(score_table(update, published),
                        "Median relative error of B_x on the axis, before and after the update")
-    common.say(f"Report: {options.output / 'report.html'}")
+    common.say(f"Report: {arguments.output / 'report.html'}")
     return 0
 
 
-def main() -> int:
-    """Parse the command line and run; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.set_defaults(study=HERE / "study.toml")
-    parser.add_argument("-o", "--output", type=Path, default=Path("results/faser"))
-    parser.add_argument("--jobs", type=common.positive, default=2)
-    parser.add_argument("--time-limit", type=float, default=3600.0)
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add this study's own options."""
     parser.add_argument("--z-step-m", type=float, default=Z_STEP_M,
                         help="assumed distance of the readings (default: %(default)g m)")
-    common.add_getdp_argument(parser)
-    options = parser.parse_args()
-    return common.guarded(lambda: run(options))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(common.run_study(__doc__ or "", HERE / "study.toml", "faser", run, options))

@@ -56,46 +56,38 @@ def scores(mean: Floats, sd: Floats, truth: Floats) -> dict[str, float]:
             "z_rms": float(np.sqrt(np.mean((error / sd) ** 2)))}
 
 
-def run(options: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Run both cases and print their table."""
-    study = read_study(options.study)
+    study = read_study(arguments.study)
     prior, paper = published(study)
     results: dict[str, dict[str, object]] = {"paper, posterior": dict(paper)}
     for case, what in CASES.items():
         truth = np.loadtxt(HERE / f"truth-{case}.csv", delimiter=",", skiprows=1).ravel()
-        folder = options.output / case
-        with common.workshop(options) as workshop:
+        folder = arguments.output / case
+        with common.workshop(arguments) as workshop:
             there = replace(workshop, folder=folder)
             update = infer(study, read_map(HERE / f"map-{case}.csv"), there, prior=prior)
-            found = sample_posterior(update, there, options.samples, effective=EFFECTIVE,
+            found = sample_posterior(update, there, arguments.samples, effective=EFFECTIVE,
                                      say=common.say)
         write_sampled(found, folder)
         updated = with_samples(update, found)
         results[f"{what}: prior"] = dict(scores(prior.mean, prior.sd, truth))
         results[f"{what}: posterior"] = scores(found.mean, found.sd, truth) | sampled_summary(found)
         write_magnetizations(updated, truth, folder, sampled_summary(found), what)
-    write_text(options.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
+    write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     common.print_table([{"what": name} | {key: f"{row[key]:.4g}" for key in paper}
                         for name, row in results.items()],
                        "Magnetizations: error, and error over standard deviation")
-    common.say(f"Reports: {options.output}/*/magnetizations.html")
+    common.say(f"Reports: {arguments.output}/*/magnetizations.html")
     return 0
 
 
-def main() -> int:
-    """Parse the command line and run; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.set_defaults(study=HERE / "study.toml")
-    parser.add_argument("-o", "--output", type=Path, default=Path("results/nonlinear-2d"))
-    parser.add_argument("--jobs", type=common.positive, default=2)
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add this study's own options."""
     parser.add_argument("--samples", type=common.positive, default=1500,
                         help="draws of each chain (default: %(default)s)")
-    parser.add_argument("--time-limit", type=float, default=3600.0)
-    common.add_getdp_argument(parser)
-    options = parser.parse_args()
-    return common.guarded(lambda: run(options))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(common.run_study(__doc__ or "", HERE / "study.toml", "nonlinear-2d", run, options))

@@ -112,17 +112,5 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def main() -> int:
-    """Parse the command line and run; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.set_defaults(study=HERE / "study.toml")
-    parser.add_argument("-o", "--output", type=Path, default=Path("results/sensitivity"))
-    parser.add_argument("--jobs", type=common.positive, default=2)
-    parser.add_argument("--time-limit", type=float, default=3600.0)
-    common.add_getdp_argument(parser)
-    options = parser.parse_args()
-    return common.guarded(lambda: run(options))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(common.run_study(__doc__ or "", HERE / "study.toml", "sensitivity", run))
