@@ -7,17 +7,22 @@ from the blocks listed here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.errors import StudyError
-from halbach_fe.study import MU_0, Array, Study
+from halbach_fe.study import MU_0, Array, BlockException, Study
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+CORNER = 1 / 6
+"""Share of a block's width and thickness that is a corner."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,10 @@ Outline = tuple[Edge, ...]
 class MagnetBlock:
     """One block; ``ring`` and ``slot`` count from 1. Lengths in m, remanence in T.
 
-    The recoil permeability is relative, along the easy axis and across it.
+    The recoil permeability is relative, along the easy axis and across it. Outline and z limits are
+    the block's place; it stands off it by ``shift`` in m, turned by the rotation vector ``turn`` in
+    rad about its middle. ``factor``, ``gradient`` and ``corner_loss`` are of its magnetization, see
+    `halbach_fe.study.BlockException`.
     """
 
     ring: int
@@ -82,6 +90,46 @@ class MagnetBlock:
     remanence: float
     recoil_permeability: float
     recoil_permeability_across: float
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gradient: float = 0.0
+    corner_loss: float = 0.0
+    mounted_from: tuple[int, int] | None = None
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it stands where it should."""
+        return not (any(self.shift) or any(self.turn))
+
+    @property
+    def middle(self) -> Floats:
+        """Mean of its corners, (3,) in m; z is 0 if it is infinitely long."""
+        x, y = np.mean([edge.start for edge in self.outline], axis=0)
+        z = 0.0 if np.isinf(self.z_max) else (self.z_min + self.z_max) / 2
+        return np.array([x, y, z])
+
+    def to_place(self, points: Floats) -> Floats:
+        """Where points (n, 3) in m lie as seen from the block if it stood in its place."""
+        return np.asarray((points - self.middle - self.shift) @ turn_of(self.turn) + self.middle)
+
+    @cached_property
+    def parts(self) -> tuple[tuple[float, MagnetBlock], ...]:
+        """The block, or pieces of it, and how much of its magnetization each has."""
+        if not (self.gradient or self.corner_loss):
+            return ((1.0, self),)
+        whole = replace(self, gradient=0.0, corner_loss=0.0)
+
+        def part(*limits: float) -> MagnetBlock:
+            return replace(whole, outline=_part(self.outline, *limits))
+
+        found = [(1.0, whole)]
+        if self.gradient:
+            found += [(-self.gradient / 2, part(0.0, 0.5, 0.0, 1.0)),
+                      (self.gradient / 2, part(0.5, 1.0, 0.0, 1.0))]
+        if self.corner_loss:
+            found += [(-self.corner_loss, part(0.0, CORNER, 0.0, CORNER)),
+                      (-self.corner_loss, part(0.0, CORNER, 1 - CORNER, 1.0))]
+        return tuple(found)
 
     @property
     def isotropic(self) -> bool:
@@ -124,6 +172,8 @@ class MagnetBlock:
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m lie inside the block or on its end faces."""
+        if not self.in_place:
+            points = self.to_place(points)
         inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)
         inside[inside] = outline_contains(self.outline, points[inside, :2])
         return inside
@@ -173,27 +223,100 @@ def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
 def _block(
     array: Array, ring: int, slot: int, outline: Outline, limits: tuple[float, float]
 ) -> MagnetBlock:
-    """One block, as its array or an exception to it has it; the last exception counts."""
+    """One block, as its array or the exceptions to it have it."""
+    ours = _exceptions_of(array, ring, slot)
     angle, remanence = magnetization_angle_deg(array, slot), array.remanence_T
     permeability = array.recoil_permeability
     across = array.recoil_permeability_across or permeability
-    for exception in array.exceptions:
-        if exception.ring in (None, ring) and exception.slot in (None, slot):
-            if exception.magnetization_angle_deg is not None:
-                angle = exception.magnetization_angle_deg
-            if exception.recoil_permeability is not None:
-                permeability = across = exception.recoil_permeability
-            across = exception.recoil_permeability_across or across
-            remanence = exception.remanence_T or remanence
+    meant: tuple[int, int] | None = None
+    gradient = corner_loss = 0.0
+    for exception in ours:
+        if exception.mounted_from is not None:
+            meant = exception.mounted_from
+            angle = (magnetization_angle_deg(array, meant[1]) + position_angle_deg(array, slot)
+                     - position_angle_deg(array, meant[1]))
+        if exception.magnetization_angle_deg is not None:
+            angle = exception.magnetization_angle_deg
+        if exception.recoil_permeability is not None:
+            permeability = across = exception.recoil_permeability
+        across = exception.recoil_permeability_across or across
+        remanence = exception.remanence_T or remanence
+        if exception.magnetization_gradient is not None:
+            gradient = exception.magnetization_gradient
+        if exception.inner_corner_loss is not None:
+            corner_loss = exception.inner_corner_loss
     direction = np.radians(angle)
+    easy_axis = np.array([np.cos(direction), np.sin(direction), 0.0])
     block = MagnetBlock(
         ring=ring, slot=slot, outline=outline, z_min=limits[0], z_max=limits[1],
-        easy_axis=(float(np.cos(direction)), float(np.sin(direction)), 0.0),
-        remanence=np.nan if remanence is None else remanence, recoil_permeability=permeability,
-        recoil_permeability_across=across)
-    if remanence is not None:
+        easy_axis=_three(easy_axis), remanence=np.nan if remanence is None else remanence,
+        recoil_permeability=permeability, recoil_permeability_across=across, gradient=gradient,
+        corner_loss=corner_loss, mounted_from=meant)
+    if remanence is None:
+        block = replace(block, remanence=_remanence_of_moment(array, block))
+    factor = _factor(ours)
+    if factor != 1.0:
+        block = replace(block, remanence=block.remanence * factor)
+    return _posed(block, array, ours)
+
+
+def _posed(
+    block: MagnetBlock, array: Array, exceptions: Sequence[BlockException]
+) -> MagnetBlock:
+    """The block where its exceptions put it; its easy axis turns with it."""
+    axes = turn_of((0.0, 0.0, np.radians(position_angle_deg(array, block.slot))))
+    shift, turn = np.zeros(3), np.zeros(3)
+    for one in exceptions:
+        twist = np.array([0.0, 0.0, np.radians(one.twist_deg)])
+        shift += axes @ one.displacement_m + one.shift_m
+        shift += turn_of(_three(twist)) @ block.middle - block.middle
+        turn += axes @ np.radians(one.rotation_deg) + twist
+    if not (shift.any() or turn.any()):
         return block
-    return replace(block, remanence=_remanence_of_moment(array, block))
+    return replace(block, shift=_three(shift), turn=_three(turn),
+                   easy_axis=_three(turn_of(_three(turn)) @ block.easy_axis))
+
+
+def mountings(study: Study) -> list[tuple[int, Floats]]:
+    """By block: the number of the block that was meant for where this one comes from, and the
+    matrix (3, 3) from its magnetization there to the one here (0 for a missing block).
+    """
+    array, found = study.array, []
+    for block in blocks_of(study):
+        ring, slot = block.mounted_from or (block.ring, block.slot)
+        moved = position_angle_deg(array, block.slot) - position_angle_deg(array, slot)
+        turn = turn_of(block.turn) @ turn_of((0.0, 0.0, np.radians(moved)))
+        factor = _factor(_exceptions_of(array, block.ring, block.slot))
+        found.append(((ring - 1) * array.blocks_per_ring + slot - 1, factor * turn))
+    return found
+
+
+def as_meant(study: Study) -> Study:
+    """The study with every block as it was meant to be mounted."""
+    meant = {"mounted_from": None, "magnetization_factor": 1.0, "rotation_deg": (0.0, 0.0, 0.0),
+             "twist_deg": 0.0}
+    array = study.array.model_copy(update={"exceptions": tuple(
+        one.model_copy(update=meant) for one in study.array.exceptions)})
+    return study.model_copy(update={"array": array})
+
+
+def _exceptions_of(array: Array, ring: int, slot: int) -> list[BlockException]:
+    return [one for one in array.exceptions
+            if one.ring in (None, ring) and one.slot in (None, slot)]
+
+
+def _factor(exceptions: Sequence[BlockException]) -> float:
+    return float(np.prod([one.magnetization_factor for one in exceptions]))
+
+
+def turn_of(vector: tuple[float, float, float]) -> Floats:
+    """Matrix (3, 3) of a rotation vector in rad."""
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def _three(values: Floats) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def position_angle_deg(array: Array, slot: int) -> float:
@@ -310,6 +433,19 @@ def _outline(array: Array, slot: int) -> Outline:
 
 def _turn(angle: float) -> Floats:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _part(outline: Outline, inner: float, outer: float, start: float, stop: float) -> Outline:
+    """The part of an outline between two fractions of its thickness, from the inner side, and of
+    its width.
+    """
+    def at(depth: float, width: float) -> Floats:
+        far, near = outline[1].at(np.array([width]))[0][0], outline[3].at(
+            np.array([1 - width]))[0][0]
+        return np.asarray((1 - depth) * near + depth * far)
+
+    corners = np.array([at(inner, start), at(outer, start), at(outer, stop), at(inner, stop)])
+    return _edges(corners, tuple(number for number in (1, 3) if outline[number].arc))
 
 
 def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:

@@ -27,7 +27,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from halbach_fe.blocks import Edge, Floats, Ints, MagnetBlock, Outline
+from halbach_fe.blocks import Edge, Floats, Ints, MagnetBlock, Outline, turn_of
 from halbach_fe.symmetry import Frame, frame_of, turn_matrix, unique_points
 
 _ORDER = 12
@@ -75,19 +75,32 @@ def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Float
 
 
 def _fields_of_some(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
-    frames = [frame_of(block) for block in blocks]
+    seen_by = [points if block.in_place else block.to_place(points) for block in blocks]
+    pieces = [(number, factor, part) for number, block in enumerate(blocks)
+              for factor, part in block.parts]
+    frames = [frame_of(part) for _, _, part in pieces]
     groups: dict[tuple[object, ...], list[int]] = {}
     for number, frame in enumerate(frames):
         groups.setdefault(frame.shape, []).append(number)
     fields: dict[tuple[object, ...], Floats] = {}
     places: dict[int, Ints] = {}
     for shape, members in groups.items():
-        seen = np.vstack([frames[number].local(points)[0] for number in members])
+        seen = np.vstack([frames[number].local(seen_by[pieces[number][0]])[0]
+                          for number in members])
         union, inverse = unique_points(seen)
-        fields[shape] = unit_field(_in_frame(blocks[members[0]], frames[members[0]]), union)
+        fields[shape] = unit_field(_in_frame(pieces[members[0]][2], frames[members[0]]), union)
         places.update(zip(members, inverse.reshape(len(members), len(points)), strict=True))
-    for number, frame in enumerate(frames):
-        yield frame.unfold(fields[frame.shape][places[number]], frame.local(points)[1])
+    for number, block in enumerate(blocks):
+        total = np.zeros((len(points), 3, 3))
+        for piece, (owner, factor, _) in enumerate(pieces):
+            if owner == number:
+                frame = frames[piece]
+                signs = frame.local(seen_by[number])[1]
+                total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
+        if not block.in_place:
+            turn = turn_of(block.turn)
+            total = turn @ total @ turn.T
+        yield total
 
 
 def _in_frame(block: MagnetBlock, frame: Frame) -> MagnetBlock:

@@ -20,7 +20,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats, Ints, MagnetBlock, blocks_of, position_angle_deg
+from halbach_fe.blocks import (
+    Floats,
+    Ints,
+    MagnetBlock,
+    as_meant,
+    blocks_of,
+    mountings,
+    position_angle_deg,
+)
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import demagnetizing_tensors
 from halbach_fe.inference.prior import Gaussian
@@ -112,6 +120,20 @@ def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
     HalbachWarning
         If a type's samples stand for its blocks, but do not look normal.
     """
+    meant = _prior_as_meant(as_meant(study), table)
+    size = study.dimension
+    mounted = mountings(study)
+    sources = np.array([source for source, _ in mounted])
+    turns = np.array([matrix for _, matrix in mounted])[:, :size, :size]
+    before = meant.gaussian.root.reshape(len(mounted), size, -1)[sources]
+    mean = meant.gaussian.mean.reshape(len(mounted), size, 1)[sources]
+    nominal = np.concatenate([block.magnetization[:size] for block in blocks_of(study)])
+    return replace(meant, nominal=nominal, gaussian=Gaussian(
+        (turns @ mean).ravel(), (turns @ before).reshape(nominal.size, -1)))
+
+
+def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
+    """The same of a magnet whose blocks were mounted as meant."""
     blocks, size = blocks_of(study), study.dimension
     slots = types_of(study)
     _check_places(study, table, slots)

@@ -19,6 +19,7 @@ from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError, StudyError
 from halbach_fe.evaluation import locate, quadrature
 from halbach_fe.exact_field import unit_fields
+from halbach_fe.external import external_field
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.observation import Observation
 from halbach_fe.response import Response, parameter_names, response
@@ -42,6 +43,8 @@ class NonlinearModel:
     Attributes
     ----------
     condensed : Condensed
+    offset : ndarray, shape (readings,), in T
+        Fields that are not the magnet's.
     parameters : tuple of str
         As of `halbach_fe.response.Response`.
     nominal : ndarray, shape (parameters,), in A/m
@@ -52,6 +55,7 @@ class NonlinearModel:
     """
 
     condensed: Condensed
+    offset: Floats
     parameters: tuple[str, ...]
     nominal: Floats
     error: Floats
@@ -64,7 +68,7 @@ class NonlinearModel:
         """
         flat = magnetizations.reshape(-1, len(self.parameters))
         found = [self.condensed.solve(row, tolerance_T)[0] for row in flat]
-        return np.array(found).reshape(*magnetizations.shape[:-1], -1)
+        return self.offset + np.array(found).reshape(*magnetizations.shape[:-1], -1)
 
     def jacobian(self, magnetization: Floats) -> Floats:
         """dq/dp (readings, parameters) in T m/A at a magnetization (parameters,) in A/m."""
@@ -93,7 +97,8 @@ def nonlinear_model(
     linear = response(base, observation, replace(workshop, folder=workshop.folder / "linear"))
     condensed = build(study, observation, workshop, linear)
     error = _error(study, observation, workshop)
-    model = NonlinearModel(condensed, parameter_names(study), linear.nominal, error, np.nan)
+    model = NonlinearModel(condensed, linear.offset, parameter_names(study), linear.nominal, error,
+                           np.nan)
     prior = prior or block_prior(
         linear.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd)
@@ -148,7 +153,7 @@ def newton_readings(
         units = unit_fields(blocks_of(study), observation.points)
         for unit, vectors in zip(units, remanence, strict=True):
             fields = fields + np.einsum("nck,sk->snc", unit, vectors)
-    return observation.apply(fields)
+    return observation.apply(fields + external_field(study, observation.points))
 
 
 def verify(

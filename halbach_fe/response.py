@@ -1,4 +1,5 @@
-"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p.
+"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p (and the offset of
+fields that are not the magnet's).
 
 With non-linear iron H is the derivative at the nominal magnetization, and q = offset + H p near it.
 
@@ -22,6 +23,7 @@ from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError
 from halbach_fe.exact_field import unit_fields
+from halbach_fe.external import external_field
 from halbach_fe.field_map import write_hdf5
 from halbach_fe.observation import Observation
 from halbach_fe.routes import (
@@ -46,7 +48,7 @@ class Response:
     nominal : ndarray, shape (parameters,), in A/m
         The study's nominal magnetization.
     offset : ndarray, shape (readings,), in T
-        What linearizing leaves; 0 where the problem is linear.
+        Fields that are not the magnet's, and what linearizing iron leaves.
     error : ndarray, shape (readings,), in T
         Error bar of the finite elements, for the nominal array; see
         `halbach_fe.discretization.reading_errors`.
@@ -103,7 +105,7 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     error = reading_errors(study, observation, parts.nominal, error_workshop(workshop))
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
-    offset = np.zeros(len(observation))
+    offset = observation.apply(external_field(study, observation.points))
     if is_nonlinear(study):
         field = exact_part(study, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
@@ -136,7 +138,8 @@ def verify_superposition(
 def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
     """Digest of all that the matrix depends on."""
     relevant = study.model_dump(
-        mode="json", include={"dimension", "array", "iron_ring", "mesh", "open_boundary", "solver"})
+        mode="json", include={
+            "dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"})
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
     curve = curve_of(study)  # a steel's name says nothing of its numbers
     if curve is not None:

@@ -18,6 +18,7 @@ from halbach_fe.extent import (
     magnet_half_length,
     magnet_radius,
 )
+from halbach_fe.external import external_field
 from halbach_fe.solve import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
@@ -91,10 +92,11 @@ def solve_nominal(study: Study, points: Floats, workshop: Workshop) -> Floats:
 
 
 def exact_part(study: Study, points: Floats) -> Floats:
-    """What is not left to finite elements of the nominal array's field, (n, 3) in T."""
+    """What is not left to finite elements of the field with the nominal array, (n, 3) in T."""
+    external = external_field(study, points)
     if study.solver.method == "direct":
-        return np.zeros((len(points), 3))
-    return field_of(blocks_of(study), points)
+        return external
+    return external + field_of(blocks_of(study), points)
 
 
 def is_vacuum(study: Study) -> bool:

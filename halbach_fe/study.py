@@ -37,6 +37,14 @@ Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
 RecoilPermeability = Annotated[float, Field(ge=1.0, le=2.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
+Offset = Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)]
+Displacement = tuple[Offset, Offset, Offset]
+Rotation = tuple[Angle, Angle, Angle]
+Moment = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False)]
+Fractions = tuple[Fraction, Fraction, Fraction]
+FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
@@ -81,7 +89,20 @@ class BlockException(_Model):
     """What is different in the blocks of one ring, or one slot, or both, from the array's.
 
     ``magnetization_angle_deg`` turns the magnetization, never the shape. A recoil permeability
-    alone is that in all directions.
+    alone is that in all directions. ``mounted_from`` is the ring and slot that the block was meant
+    for: its magnetization comes with it, in its own axes.
+
+    ``magnetization_factor`` is 0 for a block that is missing, -1 for one upside down.
+    ``magnetization_gradient`` is by how much the magnetization of the outer half exceeds that of
+    the inner one, as a fraction of their mean; ``inner_corner_loss`` the fraction that both corners
+    of the bore have lost, over a sixth of the block's width and a sixth of its thickness.
+
+    A block stands off its place by ``displacement_m`` along its own axes (radial, azimuthal,
+    axial), turned by ``rotation_deg`` about them through its middle; ``shift_m`` is along x, y, z,
+    and ``twist_deg`` turns it about the magnet's axis. Several exceptions of a block add up in
+    these, and multiply in ``magnetization_factor``; of the other keys the last counts. Finite
+    elements, which know the reaction of permeability and iron only, take blocks to be in their
+    places, whole and uniform.
     """
 
     ring: Annotated[int, Field(ge=1)] | None = None
@@ -90,6 +111,14 @@ class BlockException(_Model):
     recoil_permeability_across: RecoilPermeability | None = None
     remanence_T: Remanence | None = None
     magnetization_angle_deg: Angle | None = None
+    mounted_from: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
+    magnetization_factor: Annotated[float, Field(ge=-2.0, le=2.0)] = 1.0
+    magnetization_gradient: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
+    inner_corner_loss: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
+    displacement_m: Displacement = (0.0, 0.0, 0.0)
+    rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    shift_m: Displacement = (0.0, 0.0, 0.0)
+    twist_deg: Angle = 0.0
 
 
 class Array(_Model):
@@ -133,6 +162,11 @@ class Array(_Model):
             if (one.ring or 1) > self.rings or (one.slot or 1) > self.blocks_per_ring:
                 raise ValueError(
                     f"an exception names ring {one.ring}, slot {one.slot} of an array of "
+                    f"{self.rings} rings of {self.blocks_per_ring} blocks")
+            ring, slot = one.mounted_from or (1, 1)
+            if ring > self.rings or slot > self.blocks_per_ring:
+                raise ValueError(
+                    f"an exception's block was meant for ring {ring}, slot {slot} of an array of "
                     f"{self.rings} rings of {self.blocks_per_ring} blocks")
         return self
 
@@ -224,6 +258,63 @@ class IronRing(_Model):
         if (self.relative_permeability is None) == (self.curve is None):
             raise ValueError("give exactly one of relative_permeability and curve")
         return self
+
+
+class Neighbour(_Model):
+    """Another magnet like this one, in vacuum: its middle on the axis at ``z_m``, turned about the
+    axis, and stronger or weaker by ``factor``.
+    """
+
+    z_m: Coordinate
+    turn_deg: Angle = 0.0
+    factor: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
+
+
+class PointDipole(_Model):
+    """A magnetized object, as a point."""
+
+    position_m: Point
+    moment_A_m2: tuple[Moment, Moment, Moment]
+
+
+class External(_Model):
+    """Fields that are not the magnet's, added to it: they magnetize no iron."""
+
+    background_T: FluxDensityVector = (0.0, 0.0, 0.0)
+    neighbours: tuple[Neighbour, ...] = ()
+    dipoles: tuple[PointDipole, ...] = ()
+
+
+class Instrument(_Model):
+    """How the mapper's readings differ from B where it says it was; taken out of the map before
+    anything else is done with it.
+
+    The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
+    by ``1 + radius_scale`` and z by ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m``
+    at the far end (largest z of the map), with the square of the distance from the near one; T
+    turns by ``rotation_rad`` (a rotation vector) about the origin and moves by ``translation_m``.
+    The sensor of component i is ``sensor_position_m[i]`` from there. With B' the field in the
+    turned axes, the reading of component i is
+    ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
+    + cubic_i B'_i^3 + offset_i + drift_i t``, j and k being the other two, and t running from 0 to
+    1 over the map (its time_s, or its order). ``crosstalk`` is by name: ``zx`` is what the z sensor
+    sees of x.
+    """
+
+    translation_m: Displacement = (0.0, 0.0, 0.0)
+    rotation_rad: Fractions = (0.0, 0.0, 0.0)
+    z_scale: Fraction = 0.0
+    radius_scale: Fraction = 0.0
+    arm_sag_m: Offset = 0.0
+    sensor_position_m: tuple[Displacement, Displacement, Displacement] = (
+        (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    gain: Fractions = (0.0, 0.0, 0.0)
+    crosstalk: dict[Literal["xy", "xz", "yx", "yz", "zx", "zy"], Fraction] = {}
+    planar_hall_per_T: Fractions = (0.0, 0.0, 0.0)
+    quadratic_per_T: Fractions = (0.0, 0.0, 0.0)
+    cubic_per_T2: Fractions = (0.0, 0.0, 0.0)
+    offset_T: FluxDensityVector = (0.0, 0.0, 0.0)
+    drift_T: FluxDensityVector = (0.0, 0.0, 0.0)
 
 
 class Mesh(_Model):
@@ -425,6 +516,8 @@ class Study(_Model):
     dimension: Literal[2, 3] = 3
     array: Array
     iron_ring: IronRing | None = None
+    external: External = External()
+    instrument: Instrument = Instrument()
     mesh: Mesh
     open_boundary: OpenBoundary = OpenBoundary()
     solver: Solver = Solver()

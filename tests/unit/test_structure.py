@@ -13,7 +13,7 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 
 # Later rooms may import earlier ones, never the other way round.
 ORDER = ["errors", "analytic", "materials", "study", "blocks", "symmetry", "extent", "regions",
-         "exact_field", "geo", "mesh", "field_map", "block_table", "getdp", "solutions",
+         "exact_field", "external", "geo", "mesh", "field_map", "instrument", "block_table", "getdp", "solutions",
          "evaluation", "condensed", "inference", "measured_prior", "solve", "azimuthal", "routes",
          "observation", "discretization", "response", "nonlinear", "update", "sampled",
          "planning", "sensitivity", "verification", "report", "cli"]

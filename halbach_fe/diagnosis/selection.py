@@ -1,0 +1,168 @@
+"""Which effects are missing: their probabilities, and those that the readings cannot tell apart.
+
+A candidate is an effect at one place (a block, a seam), with one or more amplitudes. An effect's
+prior probability is shared by its candidates, so that the search among hundreds of blocks pays for
+itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.diagnosis.evidence import Evidence
+
+FOUND = 5.0
+"""Log of the posterior odds, of an effect being missing, from which it is called found."""
+
+ALIKE = 3.0
+"""Log evidence by which candidates must differ to be told apart."""
+
+EFFECT_ODDS = 1 / 50
+"""Prior odds of each effect being there."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at one place.
+
+    Attributes
+    ----------
+    effect : str
+    place : str
+        Which block or seam; empty where there is but one.
+    columns : tuple of int
+        Of the evidence.
+    certain : bool
+        Whether its amplitude is 1 if it is there, as of a missing block.
+    """
+
+    effect: str
+    place: str
+    columns: tuple[int, ...]
+    certain: bool = False
+
+    @property
+    def name(self) -> str:
+        """Effect and place."""
+        return f"{self.effect} {self.place}".strip()
+
+
+@dataclass(frozen=True)
+class Found:
+    """A candidate that is missing from the model, and those that would do as well.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    log_bayes_factor : float
+        Of the readings, with it over without it, the other found ones being there.
+    log_odds : float
+        The same, with the prior odds of its effect at its place.
+    alternatives : tuple of (Candidate, float)
+        Others that explain the readings as well, with their log Bayes factors.
+    """
+
+    candidate: Candidate
+    log_bayes_factor: float
+    log_odds: float
+    alternatives: tuple[tuple[Candidate, float], ...]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of effects that the readings cannot tell apart, the likeliest first."""
+        return tuple(dict.fromkeys(
+            (self.candidate.effect, *(other.effect for other, _ in self.alternatives))))
+
+
+def prior_log_odds(candidates: Sequence[Candidate]) -> Floats:
+    """Log prior odds (candidates,) of each being there."""
+    names = [candidate.effect for candidate in candidates]
+    counts = {name: names.count(name) for name in set(names)}
+    return np.array([np.log(EFFECT_ODDS / counts[name]) for name in names])
+
+
+def gains(evidence: Evidence, candidates: Sequence[Candidate]) -> Floats:
+    """Log Bayes factor (candidates,) of each candidate over none."""
+    found = np.empty(len(candidates))
+    free = [number for number, one in enumerate(candidates) if not one.certain]
+    found[free] = evidence.log_evidences([candidates[number].columns for number in free])
+    for number, one in enumerate(candidates):
+        if one.certain:
+            (column,) = one.columns
+            found[number] = evidence.score[column] - evidence.information[column, column] / 2
+    return found
+
+
+def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """The evidence with some candidates in the model, their amplitudes integrated out."""
+    for one in candidates:
+        if one.certain:
+            evidence = evidence.shifted(one.columns[0])
+    return evidence.given([column for one in candidates if not one.certain
+                           for column in one.columns])
+
+
+def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -> list[Found]:
+    """Find missing effects one after the other; drop those that later ones make needless.
+
+    ``most`` is how many effects are looked for.
+    """
+    prior = prior_log_odds(candidates)
+    chosen: list[int] = []
+    while len(chosen) < most:
+        now = with_candidates(evidence, [candidates[number] for number in chosen])
+        odds = gains(now, candidates) + prior
+        odds[chosen] = -np.inf
+        best = int(np.argmax(odds))
+        if odds[best] < FOUND:
+            break
+        before = len(chosen)
+        chosen = _needed(evidence, candidates, [*chosen, best], prior)
+        if best not in chosen or len(chosen) <= before - 1:
+            break  # adding and dropping would go on for ever
+    return [_found(evidence, candidates, chosen, number, prior) for number in chosen]
+
+
+def _needed(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int], prior: Floats
+) -> list[int]:
+    """Drop, the least needed first, what the others make needless."""
+    while len(chosen) > 1:
+        odds = [float(gains(with_candidates(evidence, [candidates[k] for k in chosen if k != one]),
+                            [candidates[one]])[0]) + prior[one] for one in chosen]
+        worst = int(np.argmin(odds))
+        if odds[worst] >= FOUND:
+            break
+        chosen = chosen[:worst] + chosen[worst + 1:]
+    return chosen
+
+
+def _found(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], number: int,
+    prior: Floats,
+) -> Found:
+    """One found candidate, and what would do in its place."""
+    others = [candidates[k] for k in chosen if k != number]
+    now = with_candidates(evidence, others)
+    factors = gains(now, candidates)
+    odds = factors + prior
+    alike = [k for k in np.argsort(-odds) if k != number and k not in chosen
+             and odds[k] > odds[number] - ALIKE]
+    return Found(candidates[number], float(factors[number]), float(odds[number]),
+                 tuple((candidates[k], float(factors[k])) for k in alike))
+
+
+def probabilities(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[str, float]:
+    """Posterior probability of each effect, and of ``none``, if at most one is missing."""
+    log_odds = gains(evidence, candidates) + prior_log_odds(candidates)
+    top = max(0.0, float(log_odds.max(initial=0.0)))
+    weights = np.exp(log_odds - top)
+    total = float(np.exp(-top) + weights.sum())
+    found = {"none": float(np.exp(-top)) / total}
+    for candidate, weight in zip(candidates, weights, strict=True):
+        found[candidate.effect] = found.get(candidate.effect, 0.0) + float(weight) / total
+    return found
