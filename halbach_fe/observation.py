@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import MeasurementError, StudyError, must_be
-from halbach_fe.study import COMPONENTS, FourierCoefficients, Noise, Positions, Study
+from halbach_fe.inference.noise import Noise, independent
+from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
+from halbach_fe.study import Noise as NoiseSettings
+
+ROUNDING = 1e-12
+"""Correlations below it are none: sums over a circle's points cancel to 1e-15."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +153,7 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
     return Observation(points, operator, tuple(labels), np.array(positions))
 
 
-def noise_regions(noise: Noise, z: Floats) -> NDArray[np.int64]:
+def noise_regions(noise: NoiseSettings, z: Floats) -> NDArray[np.int64]:
     """Index of the noise region of each z in m: the first whose window holds it.
 
     Raises
@@ -168,21 +173,35 @@ def noise_regions(noise: Noise, z: Floats) -> NDArray[np.int64]:
     return region
 
 
-def standard_deviations(study: Study, observation: Observation, data: xr.Dataset) -> Floats:
-    """Noise of each reading (readings,) in T: from the map where it says, else by region.
+def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> Noise:
+    """Noise of the readings: of the map's points where it says, else by region.
 
-    For Fourier coefficients a map's own point noise is propagated; the regions' sigma is that of
-    the coefficients themselves.
+    For Fourier coefficients a map's point noise is propagated, with the correlations that it
+    leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
+    coefficients themselves.
     """
     if "sigma_T" in data:
-        variance = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
-        return np.sqrt(np.asarray((observation.operator**2) @ variance))
+        points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
+        operator = observation.operator
+        return Noise(_without_rounding(operator @ sparse.diags_array(points) @ operator.T))
     if study.noise is None:
         raise StudyError(
             f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
             "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
     sigma = np.array([region.sigma_T for region in study.noise.regions])
-    return sigma[noise_regions(study.noise, observation.positions[:, 2])]
+    return independent(sigma[noise_regions(study.noise, observation.positions[:, 2])])
+
+
+def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
+    """The covariance without correlations below `ROUNDING`: equal noise all around a circle leaves
+    its coefficients independent.
+    """
+    entries = covariance.tocoo()
+    rows, columns = entries.coords
+    variance = covariance.diagonal()
+    kept = np.abs(entries.data) > ROUNDING * np.sqrt(variance[rows] * variance[columns])
+    return sparse.csr_array((entries.data[kept], (rows[kept], columns[kept])),
+                            shape=covariance.shape)
 
 
 def held_out(study: Study, z: Floats) -> NDArray[np.bool_]:

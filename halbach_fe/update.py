@@ -10,7 +10,9 @@ import csv
 import io
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +25,8 @@ from halbach_fe.blocks import Floats, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference import linear
-from halbach_fe.inference.linear import chi2_per_reading, predict
+from halbach_fe.inference.linear import predict, whitened
+from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
@@ -32,7 +35,7 @@ from halbach_fe.observation import (
     held_out,
     noise_regions,
     observe,
-    standard_deviations,
+    reading_noise,
 )
 from halbach_fe.response import Response, response
 from halbach_fe.solve import Workshop
@@ -51,10 +54,18 @@ COVERAGE_Z = 1.959964
 
 @dataclass(frozen=True)
 class Prediction:
-    """Readings as a model foretells them: mean and sd (readings,) in T, without noise."""
+    """Readings as a model foretells them, without noise.
+
+    Attributes
+    ----------
+    mean, sd : ndarray, shape (readings,), in T
+    root : callable
+        Mask of readings (readings,) to a root (chosen, k) of their covariance, in T.
+    """
 
     mean: Floats
     sd: Floats
+    root: Callable[[NDArray[np.bool_]], Floats]
 
 
 @dataclass(frozen=True)
@@ -63,7 +74,8 @@ class RegionScore:
 
     Relative errors are ``|measured - predicted| / |measured|``, of readings that are not 0;
     coverage is the fraction of readings within the 95 % band of prediction and noise; chi2 is per
-    reading. Both are None for training readings, which the posterior has seen.
+    reading, by the full covariance of both. Both are None for training readings, which the
+    posterior has seen.
     """
 
     region: str
@@ -87,7 +99,7 @@ class Update:
     study: Study
     observation: Observation
     readings: Floats
-    noise: Floats
+    noise: Noise
     held_out: NDArray[np.bool_]
     regions: tuple[str, ...]
     response: Response
@@ -101,10 +113,15 @@ class Update:
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
 
+    @cached_property
+    def errors(self) -> Noise:
+        """What readings may differ by from the model: their noise and the solver's error."""
+        return self.noise.plus(self.response.error)
+
     @property
     def sigma(self) -> Floats:
-        """What readings may differ by from the model: their noise and the solver's error."""
-        return np.hypot(self.noise, self.response.error)
+        """Standard deviations (readings,) of `errors`, in T."""
+        return self.errors.sd
 
     @property
     def scores(self) -> tuple[RegionScore, ...]:
@@ -127,6 +144,13 @@ class Update:
         measured = np.where(self.readings != 0, np.abs(self.readings), np.nan)
         return np.asarray(np.abs(self.readings - prediction.mean) / measured)
 
+    def whitened(self, prediction: Prediction, chosen: NDArray[np.bool_]) -> Floats:
+        """Residuals (chosen,) of some readings, whitened by the covariance of prediction, noise
+        and solver together.
+        """
+        residual = (self.readings - prediction.mean)[chosen]
+        return whitened(residual, self.errors.part(chosen), prediction.root(chosen))
+
     def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
         figures: dict[str, float | None] = {}
         for name, prediction in (("prior", self.prediction_prior),
@@ -139,9 +163,8 @@ class Update:
             total = np.hypot(prediction.sd, self.sigma)[chosen]
             inside = np.abs(self.readings - prediction.mean)[chosen] <= COVERAGE_Z * total
             figures[f"coverage95_{name}"] = float(np.mean(inside)) if unseen else None
-            figures[f"chi2_{name}"] = chi2_per_reading(
-                self.readings[chosen], self.sigma[chosen], prediction.mean[chosen],
-                prediction.sd[chosen]) if unseen else None
+            figures[f"chi2_{name}"] = float(
+                np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 
@@ -187,7 +210,7 @@ def infer(
             "Check the study's radii and the map's axes and units."))
     measured = ~np.isnan(data["B_T"].values)
     observation = observe(study, points, measured)
-    noise = standard_deviations(study, observation, data)
+    noise = reading_noise(study, observation, data)
     keep = held_out(study, observation.positions[:, 2])
     if study.inference.held_out is not None and not keep.any():
         raise MeasurementError(must_be(
@@ -212,12 +235,12 @@ def infer(
     before = prior or (of_blocks.gaussian if of_blocks else block_prior(
         model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd))
-    sigma = np.hypot(noise, model.error)
+    errors = noise.plus(model.error)
     learnt = linear.update(
-        model.matrix[~keep], (readings - model.offset)[~keep], sigma[~keep], before)
+        model.matrix[~keep], (readings - model.offset)[~keep], errors.part(~keep), before)
     after = learnt.distribution
     if is_nonlinear(study) and not linearized_only:
-        _check_linearization(study, observation, workshop, model, after.mean, sigma)
+        _check_linearization(study, observation, workshop, model, after.mean, errors.sd)
     return Update(
         study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
         regions=regions, response=model, prior=before, posterior=after,
@@ -230,7 +253,7 @@ def infer(
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
     mean, sd = predict(model.matrix, parameters)
-    return Prediction(model.offset + mean, sd)
+    return Prediction(model.offset + mean, sd, lambda rows: model.matrix[rows] @ parameters.root)
 
 
 def _check_linearization(
@@ -266,7 +289,7 @@ def write_update(update: Update, folder: Path) -> None:
     columns = {
         "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
         "region": np.array(update.regions), "held_out": update.held_out.astype(int),
-        "measured_T": update.readings, "sigma_T": update.noise,
+        "measured_T": update.readings, "sigma_T": update.noise.sd,
         "solver_error_T": update.response.error,
         "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
         "posterior_mean_T": update.prediction_posterior.mean,
@@ -292,7 +315,7 @@ def summary(update: Update) -> dict[str, object]:
         "measured_blocks": update.measured_blocks,
         "superposition_error": update.response.superposition_error,
         "largest_solver_error_T": float(update.response.error.max()),
-        "largest_solver_error_over_noise": float((update.response.error / update.noise).max()),
+        "largest_solver_error_over_noise": float((update.response.error / update.noise.sd).max()),
         "prior_conflict": update.prior_conflict,
         "prior_conflict_limit": update.conflict_limit,
         "parameters_learnt": update.parameters_learnt,

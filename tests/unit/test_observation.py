@@ -7,7 +7,7 @@ import pytest
 
 from halbach_fe.errors import MeasurementError, StudyError
 from halbach_fe.field_map import field_map
-from halbach_fe.observation import held_out, observe, points_from, standard_deviations
+from halbach_fe.observation import held_out, observe, points_from, reading_noise
 from tests.conftest import circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
@@ -62,23 +62,38 @@ def test_noise_by_region_and_from_the_map(dipole):
     points = np.array([[0, 0, 0.0], [0, 0, 0.2]])
     observation = observe(study, points, np.ones((2, 3), bool))
     data = field_map(points, np.ones((2, 3)))
-    assert standard_deviations(study, observation, data).tolist() == [1e-5] * 3 + [1e-3] * 3
+    assert reading_noise(study, observation, data).sd == pytest.approx([1e-5] * 3 + [1e-3] * 3)
     data["sigma_T"] = (("point", "component"), np.full((2, 3), 7e-5))
-    assert standard_deviations(study, observation, data) == pytest.approx(7e-5)
+    assert reading_noise(study, observation, data).sd == pytest.approx(7e-5)
     with pytest.raises(StudyError, match="cover every reading"):
-        standard_deviations(dipole(noise={"regions": regions[:1]}), observation,
+        reading_noise(dipole(noise={"regions": regions[:1]}), observation,
                             data.drop_vars("sigma_T"))
     with pytest.raises(StudyError, match="how noisy"):
-        standard_deviations(dipole(), observation, data.drop_vars("sigma_T"))
+        reading_noise(dipole(), observation, data.drop_vars("sigma_T"))
 
 
-def test_point_noise_propagates_to_fourier_coefficients(dipole, generator):
-    """Against sampling: 4000 draws know a standard deviation to 1.1 %; 5 % is over 4 sigma."""
-    study, points = dipole(observation=FOURIER), circle(0.075)
-    observation = observe(study, points, np.ones((24, 3), bool))
-    data = field_map(points, np.ones((24, 3)), np.full((24, 3), 1e-4))
-    draws = observation.apply(1e-4 * generator.standard_normal((4000, 24, 3)))
-    assert standard_deviations(study, observation, data) == pytest.approx(draws.std(0), rel=0.05)
+@pytest.mark.parametrize("equal", [True, False])
+def test_point_noise_propagates_to_fourier_coefficients(dipole, generator, equal):
+    """Against sampling. 4000 draws know a covariance, over the two sd's, to at most
+    sqrt(2/4000) = 2.2 %; 5 sigma. Unequal noise around the circle correlates the coefficients:
+    without that the comparison fails, and equal noise leaves none.
+    """
+    study = dipole(observation=FOURIER)
+    points = np.vstack([circle(0.075, 24, z, z) for z in (0.0, 0.3)])
+    observation = observe(study, points, np.ones((48, 3), bool))
+    sigma = np.full((48, 3), 1e-4)
+    if not equal:
+        sigma[:, 0] = 3e-4  # Bx is worse than By
+        sigma[:24] *= 1 + 0.8 * np.cos(np.arange(24))[:, None] ** 2
+    noise = reading_noise(study, observation, field_map(points, np.ones((48, 3)), sigma))
+    draws = observation.apply(sigma * generator.standard_normal((4000, 48, 3)))
+    scale = np.outer(noise.sd, noise.sd)
+    found = noise.covariance.toarray()
+    np.testing.assert_allclose(np.cov(draws.T) / scale, found / scale, atol=0.11)
+    alone = np.abs(np.cov(draws.T) - np.diag(noise.sd**2)) / scale
+    assert (alone.max() < 0.11) == equal
+    assert noise.independent == equal
+    assert found[:10, 10:].max() == 0  # circles are independent
 
 
 def test_held_out_pattern(dipole):
