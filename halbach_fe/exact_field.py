@@ -31,6 +31,7 @@ from halbach_fe.blocks import Edge, Floats, Ints, MagnetBlock, Outline, turn_of
 from halbach_fe.symmetry import Frame, frame_of, turn_matrix, unique_points
 
 _ORDER = 12
+_STEP = 1e-3  # of the outer radius; central differences are then off by some 1e-5
 _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
 _AT_ONCE = 4_000_000  # blocks times points whose places are compared at once
 
@@ -122,6 +123,29 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     for block, field in zip(blocks, unit_fields(blocks, points), strict=True):
         total += field @ (np.array(block.easy_axis) * block.remanence)
     return total
+
+
+def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
+    """Yield the gradient of every nominal block's field at points (n, 3) in m, (n, 3, 3) in T/m.
+
+    ``[i, c, k]`` is the derivative of component c along k. By central differences, radially and
+    azimuthally, for which points on circles share integrals; along z by curl B = 0 and div B = 0.
+    """
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    zero = np.zeros(len(points))
+    radial = np.column_stack([np.cos(angle), np.sin(angle), zero])
+    azimuthal = np.column_stack([-np.sin(angle), np.cos(angle), zero])
+    step = _STEP * max(edge.radius for block in blocks for edge in block.outline)
+    places = np.vstack([points + sign * step * along for along in (radial, azimuthal)
+                        for sign in (1, -1)])
+    for block, unit in zip(blocks, unit_fields(blocks, places), strict=True):
+        fields = (unit @ (np.array(block.easy_axis) * block.remanence)).reshape(2, 2, -1, 3)
+        by_radius, by_angle = (fields[:, 0] - fields[:, 1]) / (2 * step)
+        expansion = np.sum(by_radius * radial + by_angle * azimuthal, axis=1)
+        by_z = by_radius[:, 2:] * radial + by_angle[:, 2:] * azimuthal
+        by_z[:, 2] = -expansion
+        yield (by_radius[:, :, None] * radial[:, None] + by_angle[:, :, None] * azimuthal[:, None]
+               + by_z[:, :, None] * np.eye(3)[2])
 
 
 def demagnetizing_tensors(blocks: Sequence[MagnetBlock]) -> list[Floats]:

@@ -1,5 +1,5 @@
-"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p (and the offset of
-fields that are not the magnet's).
+"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p, and the offset
+of fields that are not the magnet's.
 
 With non-linear iron H is the derivative at the nominal magnetization, and q = offset + H p near it.
 

@@ -1,0 +1,147 @@
+"""What every effect has: a name, parameters with priors, a signature, and its way into a study."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.scene import Scene
+from halbach_fe.study import COMPONENTS, BlockException, Instrument, Study
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An amplitude of an effect: its name, unit, and prior standard deviation about 0."""
+
+    name: str
+    unit: str
+    sd: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect may be: a ring, a slot of it (0 is all), or coordinates or lengths in m."""
+
+    ring: int = 0
+    slot: int = 0
+    at_m: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Label in reports."""
+        ring, slot = (f"{letter}{number:02d}" if number else ""
+                      for letter, number in (("r", self.ring), ("s", self.slot)))
+        if self.at_m:
+            return f"at {', '.join(f'{one:.4g}' for one in self.at_m)} m"
+        return ring + slot
+
+
+class Effect(ABC):
+    """Something that a model may lack.
+
+    Attributes
+    ----------
+    name : str
+        Standard name.
+    title : str
+        In words, for a report.
+    kind : str
+        ``field``: the magnet or what is around it; ``instrument``: the mapper.
+    parameters : tuple of Parameter
+    certain : bool
+        Whether it is there with amplitude 1 or not at all, as a block upside down.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    kind: ClassVar[Literal["field", "instrument"]]
+    parameters: tuple[Parameter, ...]
+    certain: ClassVar[bool] = False
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """Where in a study it may be; none if the study rules it out."""
+        return [Place()]
+
+    @abstractmethod
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """Change of the readings of a map, (k, n, 3) in T per unit of each parameter."""
+
+    @abstractmethod
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """The study with the effect, in full, its amplitudes (k,) added to what is there."""
+
+
+class InstrumentEffect(Effect):
+    """An effect of the mapper: a change of the study's instrument."""
+
+    kind = "instrument"
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        change = self.change(study.instrument, values)
+        instrument = Instrument.model_validate(study.instrument.model_dump() | dict(change))
+        return study.model_copy(update={"instrument": instrument})
+
+    @abstractmethod
+    def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
+        """The instrument's keys that change, with their new values."""
+
+
+def added(values: Sequence[float], change: Sequence[float]) -> tuple[float, ...]:
+    """Sum of two vectors, for a key of a study."""
+    return tuple(float(one) + float(other) for one, other in zip(values, change, strict=True))
+
+
+def along(axis: str, value: float) -> tuple[float, float, float]:
+    """A vector along x, y or z."""
+    x, y, z = (value if name == axis else 0.0 for name in COMPONENTS)
+    return x, y, z
+
+
+def with_exceptions(study: Study, exceptions: Sequence[BlockException]) -> Study:
+    """The study with more exceptions to its blocks."""
+    array = study.array.model_copy(
+        update={"exceptions": (*study.array.exceptions, *exceptions)})
+    return study.model_copy(update={"array": array})
+
+
+def with_array(study: Study, **keys: Any) -> Study:
+    """The study with other keys of its array."""
+    return study.model_copy(update={"array": study.array.model_copy(update=keys)})
+
+
+def blocks_at(scene: Scene, place: Place) -> list[int]:
+    """Numbers of the blocks of a place."""
+    return [number for number, block in enumerate(scene.blocks)
+            if place.ring in (0, block.ring) and place.slot in (0, block.slot)]
+
+
+def each_block(study: Study) -> list[Place]:
+    """A place for every block."""
+    array = study.array
+    return [Place(ring, slot) for ring in range(1, array.rings + 1)
+            for slot in range(1, array.blocks_per_ring + 1)]
+
+
+def each_ring(study: Study) -> list[Place]:
+    """A place for every ring; none in a cross-section."""
+    return [] if study.dimension == 2 else [Place(ring) for ring in range(1, study.array.rings + 1)]
+
+
+def with_remanence(study: Study) -> Study:
+    """The study with its remanence in place of a moment, which would change with the blocks."""
+    if study.array.remanence_T is not None:
+        return study
+    bare = with_array(study, exceptions=())
+    return with_array(study, block_moment_A_m2=None, remanence_T=blocks_of(bare)[0].remanence)
+
+
+def changed(scene: Scene, study: Study) -> Floats:
+    """How B (n, 3) in T of the nominal blocks differs in another study."""
+    return np.asarray(scene.block_fields_of(study).sum(axis=0)
+                      - scene.block_fields.sum(axis=0))

@@ -1,0 +1,36 @@
+"""A block that has lost magnetization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.blocks import Floats
+from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.scene import Scene
+from halbach_fe.study import BlockException, Study
+
+
+class BlockDemagnetized(Effect):
+    """One block weaker by far more than its own tolerance."""
+
+    name = "block_demagnetized"
+    title = "demagnetized block"
+    kind = "field"
+    parameters = (Parameter("loss", "1", 0.1),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_block(study)
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        (block,) = blocks_at(scene, place)
+        return -scene.block_fields[block][None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, slot=place.slot, magnetization_factor=1.0 - float(values[0]))])
+
+
+EFFECTS = (BlockDemagnetized(),)

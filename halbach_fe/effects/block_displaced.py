@@ -1,0 +1,41 @@
+"""A block that is not where it should be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, position_angle_deg, turn_of
+from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.scene import Scene
+from halbach_fe.study import BlockException, Study
+
+
+class BlockDisplaced(Effect):
+    """Displacement of one block along its own axes."""
+
+    name = "block_displaced"
+    title = "displacement of a block"
+    kind = "field"
+    parameters = (
+        Parameter("radial", "m", 0.0002), Parameter("azimuthal", "m", 0.0002), Parameter("axial", "m", 0.0002),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_block(study)
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        (block,) = blocks_at(scene, place)
+        axes = turn_of((0.0, 0.0, np.radians(position_angle_deg(scene.study.array, place.slot))))
+        return np.array([scene.moved(block, axis) for axis in axes.T])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        radial, azimuthal, axial = map(float, values)
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, slot=place.slot, displacement_m=(radial, azimuthal, axial))])
+
+
+EFFECTS = (BlockDisplaced(),)

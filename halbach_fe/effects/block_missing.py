@@ -1,0 +1,37 @@
+"""A block that is not there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.blocks import Floats
+from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.scene import Scene
+from halbach_fe.study import BlockException, Study
+
+
+class BlockMissing(Effect):
+    """One block missing."""
+
+    name = "block_missing"
+    title = "missing block"
+    kind = "field"
+    parameters = (Parameter("there", "1", 1.0),)
+    certain = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_block(study)
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        (block,) = blocks_at(scene, place)
+        return -scene.block_fields[block][None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, slot=place.slot, magnetization_factor=0.0)])
+
+
+EFFECTS = (BlockMissing(),)

@@ -1,0 +1,43 @@
+"""A block that is turned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.blocks import Floats, position_angle_deg, turn_of
+from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.scene import Scene
+from halbach_fe.study import BlockException, Study
+
+
+class BlockTurned(Effect):
+    """Rotation of one block, with its magnetization, about its own axes through its middle."""
+
+    name = "block_turned"
+    title = "rotation of a block"
+    kind = "field"
+    parameters = (
+        Parameter("radial", "rad", 0.02), Parameter("azimuthal", "rad", 0.02),
+        Parameter("axial", "rad", 0.02))
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_block(study)
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        (block,) = blocks_at(scene, place)
+        axes = turn_of((0.0, 0.0, np.radians(position_angle_deg(scene.study.array, place.slot))))
+        middle = scene.blocks[block].middle
+        return np.array([scene.turned(block, axis, middle) for axis in axes.T])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        radial, azimuthal, axial = np.degrees(values).tolist()
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, slot=place.slot, rotation_deg=(radial, azimuthal, axial))])
+
+
+EFFECTS = (BlockTurned(),)

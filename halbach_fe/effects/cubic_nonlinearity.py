@@ -1,0 +1,35 @@
+"""A sensor with a cubic term."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.effects.base import InstrumentEffect, Parameter, Place, added, along
+from halbach_fe.scene import Scene
+from halbach_fe.study import COMPONENTS, Instrument
+
+
+class CubicNonlinearity(InstrumentEffect):
+    """One axis shows more by the cube of what it sees."""
+
+    title = "cubic non-linearity of a sensor"
+    parameters = (Parameter("coefficient", "1/T^2", 5e-3),)
+
+    def __init__(self, axis: str) -> None:
+        self.axis = axis
+        self.name = f"cubic_nonlinearity_{axis}"  # type: ignore[misc]
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return np.asarray(scene.field**3 * along(self.axis, 1.0))[None]
+
+    def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
+        """See `InstrumentEffect.change`."""
+        return {"cubic_per_T2": added(instrument.cubic_per_T2, along(self.axis, values[0]))}
+
+
+EFFECTS = tuple(CubicNonlinearity(axis) for axis in COMPONENTS)

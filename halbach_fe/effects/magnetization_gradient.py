@@ -1,0 +1,40 @@
+"""Blocks magnetized unevenly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.scene import Scene
+from halbach_fe.study import BlockException, Study
+
+
+class MagnetizationGradient(Effect):
+    """Outer halves stronger than inner ones, in all blocks or in one."""
+
+    name = "magnetization_gradient"
+    title = "magnetization gradient inside the blocks"
+    kind = "field"
+    parameters = (Parameter("gradient", "1", 0.02),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return [Place(), *each_block(study)]
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        per_unit = scene.gradient_fields
+        chosen = blocks_at(scene, place)
+        return np.asarray(per_unit[chosen].sum(axis=0))[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        return with_exceptions(study, [BlockException(
+            ring=place.ring or None, slot=place.slot or None,
+            magnetization_gradient=float(values[0]))])
+
+
+EFFECTS = (MagnetizationGradient(),)

@@ -1,0 +1,39 @@
+"""Axes that are not perpendicular."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from halbach_fe.blocks import Floats
+from halbach_fe.effects.base import InstrumentEffect, Parameter, Place, along
+from halbach_fe.scene import Scene
+from halbach_fe.study import COMPONENTS, Instrument
+
+
+class Misalignment(InstrumentEffect):
+    """One sensor sees a little of another component."""
+
+    title = "sensors that are not perpendicular"
+    parameters = (Parameter("crosstalk", "rad", 2e-3),)
+
+    def __init__(self, seer: str, seen: str) -> None:
+        self.seer, self.seen = seer, seen
+        self.name = f"misalignment_{seer}{seen}"  # type: ignore[misc]
+
+    def signature(self, scene: Scene, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        seen = scene.field[:, COMPONENTS.index(self.seen)]  # type: ignore[arg-type]
+        return np.asarray(seen[:, None] * along(self.seer, 1.0))[None]
+
+    def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
+        """See `InstrumentEffect.change`."""
+        name = self.seer + self.seen
+        there = {str(key): value for key, value in instrument.crosstalk.items()}
+        return {"crosstalk": there | {name: there.get(name, 0.0) + values[0]}}
+
+
+EFFECTS = tuple(Misalignment(one, other) for one in COMPONENTS for other in COMPONENTS
+                if one != other)
