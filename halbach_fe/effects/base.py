@@ -55,6 +55,8 @@ class Effect(ABC):
     parameters : tuple of Parameter
     certain : bool
         Whether it is there with amplitude 1 or not at all, as a block upside down.
+    discrete : bool
+        Whether `apply` puts all of it into a study, whatever its amplitude.
     """
 
     name: ClassVar[str]
@@ -62,6 +64,7 @@ class Effect(ABC):
     kind: ClassVar[Literal["field", "instrument"]]
     parameters: tuple[Parameter, ...]
     certain: ClassVar[bool] = False
+    discrete: ClassVar[bool] = False
 
     def places(self, study: Study) -> Sequence[Place]:
         """Where in a study it may be; none if the study rules it out."""

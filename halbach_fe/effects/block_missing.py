@@ -18,6 +18,7 @@ class BlockMissing(Effect):
     kind = "field"
     parameters = (Parameter("there", "1", 1.0),)
     certain = True
+    discrete = True
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""

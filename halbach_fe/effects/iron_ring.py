@@ -19,6 +19,7 @@ class IronRingEffect(Effect):
     title = "iron ring around the magnet"
     kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
+    discrete = True
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""

@@ -1,0 +1,258 @@
+"""From a disagreement to its name: which effects a study lacks, and the study that has them.
+
+Effects are searched with their signatures, linear and cheap; those found go into the study in full
+and are solved for again, which moves the point of linearization, until nothing changes: a
+Gauss-Newton method whose model is the real one. In every round all effects compete anew, the found
+ones with their signatures at that point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.block_table import BlockTable
+from halbach_fe.blocks import Floats
+from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.residuals import Group, groups, left_out
+from halbach_fe.diagnosis.selection import Candidate, Found, probabilities, select
+from halbach_fe.effects import catalogue
+from halbach_fe.effects.base import Effect, Place
+from halbach_fe.field_map import points_of
+from halbach_fe.instrument import map_time
+from halbach_fe.routes import solve_nominal
+from halbach_fe.scene import Scene
+from halbach_fe.solve import Workshop
+from halbach_fe.study import Study
+from halbach_fe.update import Update, infer
+
+MOST_ROUNDS = 6
+SETTLED = 0.2
+"""Of an amplitude's standard deviation: less between rounds is no change."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect at a place."""
+
+    effect: Effect
+    place: Place
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that is missing from the study.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    values, sd : ndarray, shape (k,)
+        Its amplitudes, in the units of its parameters.
+    found : Found
+        Odds, and what could be meant instead.
+    """
+
+    hypothesis: Hypothesis
+    values: Floats
+    sd: Floats
+    found: Found
+
+
+@dataclass(frozen=True)
+class Search:
+    """All effects compared at one point of linearization."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    candidates: tuple[Candidate, ...]
+    evidence: Evidence
+    marginal: Marginal
+    residual: Floats
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a study lacks.
+
+    Attributes
+    ----------
+    before, after : Update
+        The inference with the study as it was, and with the effects that were named.
+    named : tuple of Named
+    probabilities : dict
+        Of each effect, and of none, if at most one is missing.
+    groups_before, groups_after : list of Group
+        Where readings disagree.
+    left_out_before, left_out_after : ndarray, shape (n,)
+        Standardized residuals of the training readings.
+    rounds : int
+    """
+
+    before: Update
+    after: Update
+    named: tuple[Named, ...]
+    probabilities: dict[str, float]
+    groups_before: list[Group]
+    groups_after: list[Group]
+    left_out_before: Floats
+    left_out_after: Floats
+    rounds: int
+
+    @property
+    def study(self) -> Study:
+        """The study with what was missing."""
+        return self.after.study
+
+
+def diagnose(
+    study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
+    effects: Sequence[Effect] | None = None, say: Say = lambda text: None,
+) -> Diagnosis:
+    """Find which effects a study lacks to explain a map.
+
+    Parameters
+    ----------
+    effects : sequence of Effect, optional
+        To choose from; default the whole catalogue.
+    """
+    effects = catalogue() if effects is None else effects
+    named: tuple[Named, ...] = ()
+    first: tuple[Update, Search] | None = None
+    for number in range(MOST_ROUNDS):
+        say(f"round {number + 1}: the model with "
+            f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
+        now = applied(study, named)
+        update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks)
+        search = look(study, update, data, workshop, effects, named)
+        first = first or (update, search)
+        found = _amplitudes(search, select(search.evidence, search.candidates))
+        if _settled(named, found):
+            break
+        named = found
+    assert first is not None
+    return Diagnosis(
+        before=first[0], after=update, named=named,
+        probabilities=probabilities(first[1].evidence, first[1].candidates),
+        groups_before=_groups(first[0], first[1].marginal, _residual(first[0])),
+        groups_after=_groups(update, _marginal(update), _residual(update)),
+        left_out_before=left_out(first[1].marginal, first[1].residual),
+        left_out_after=left_out(_marginal(update), _residual(update)), rounds=number + 1)
+
+
+def applied(study: Study, named: Sequence[Named]) -> Study:
+    """The study with effects in full."""
+    for one in named:
+        study = one.hypothesis.effect.apply(study, one.hypothesis.place, one.values.tolist())
+    return study
+
+
+def look(
+    study: Study, update: Update, data: xr.Dataset, workshop: Workshop,
+    effects: Sequence[Effect], named: Sequence[Named],
+) -> Search:
+    """Compare all effects at the point where some are in the model already.
+
+    The residual is that of the study without them: what they do is added back, by their signatures
+    at this point.
+    """
+    scene = scene_of(update.study, data, workshop)
+    bare = scene_of(study, data, workshop) if named else scene
+    marginal, residual = _marginal(update), _residual(update)
+    there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
+    hypotheses: list[Hypothesis] = []
+    candidates: list[Candidate] = []
+    columns: list[Floats] = []
+    width = 0
+    for effect in effects:
+        scale = np.array([parameter.sd for parameter in effect.parameters])
+        for place in effect.places(study):
+            present = there.get((effect.name, place))
+            whole = present is not None and effect.discrete
+            signature = effect.signature(bare if whole else scene, place)
+            readings = update.observation.read(signature)
+            if present is not None:
+                amount = np.ones(1) if effect.discrete else present.values
+                residual = residual + whitened(update, amount @ readings)
+            columns.append(whitened(update, (scale[:, None] * readings).T))
+            hypotheses.append(Hypothesis(effect, place))
+            candidates.append(Candidate(effect.name, place.name, tuple(
+                range(width, width + len(scale))), effect.certain))
+            width += len(scale)
+    evidence = marginal.evidence(np.hstack(columns), residual)
+    return Search(tuple(hypotheses), tuple(candidates), evidence, marginal, residual)
+
+
+def scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
+    """The scene of a map."""
+    points = points_of(data)
+    return Scene(study, points, map_time(data),
+                 lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
+
+
+def whitened(update: Update, readings: Floats) -> Floats:
+    """Training readings (n,) or (n, k) of all (readings,) or (readings, k), whitened."""
+    return update.errors.part(~update.held_out).whiten(readings[~update.held_out])
+
+
+def _marginal(update: Update) -> Marginal:
+    return Marginal.of(whitened(update, update.response.matrix @ update.prior.root))
+
+
+def _residual(update: Update) -> Floats:
+    return whitened(update, update.readings - update.response.offset
+                    - update.response.matrix @ update.prior.mean)
+
+
+def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
+    """Amplitudes of found effects, all together."""
+    evidence = search.evidence
+    for one in found:
+        if one.candidate.certain:
+            evidence = evidence.shifted(one.candidate.columns[0])
+    free = [one for one in found if not one.candidate.certain]
+    fit = evidence.fit([column for one in free for column in one.candidate.columns])
+    deviation = np.sqrt(np.diag(fit.covariance))
+    named, first = [], 0
+    for one in found:
+        hypothesis = search.hypotheses[search.candidates.index(one.candidate)]
+        scale = np.array([parameter.sd for parameter in hypothesis.effect.parameters])
+        if one.candidate.certain:
+            named.append(Named(hypothesis, np.ones(1), np.zeros(1), one))
+            continue
+        part = slice(first, first + len(scale))
+        named.append(Named(hypothesis, scale * fit.mean[part], scale * deviation[part], one))
+        first += len(scale)
+    return tuple(named)
+
+
+def _settled(old: Sequence[Named], new: Sequence[Named]) -> bool:
+    """Tell whether a round changed nothing."""
+    if [one.found.candidate for one in old] != [one.found.candidate for one in new]:
+        return False
+    return all((np.abs(one.values - other.values) <= SETTLED * other.sd).all()
+               or one.hypothesis.effect.discrete for one, other in zip(old, new, strict=True))
+
+
+def _groups(update: Update, marginal: Marginal, residual: Floats) -> list[Group]:
+    """Disagreement by z window, angle, radius, component."""
+    chosen = ~update.held_out
+    x, y, z = update.observation.positions[chosen].T
+    angle, radius = np.degrees(np.arctan2(y, x)) % 360, np.hypot(x, y)
+    edges = np.linspace(z.min(), z.max() + 1e-9, 13)
+    window = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, 11)
+    members = {
+        "z": [f"{edges[k]:.3f} ... {edges[k + 1]:.3f} m" for k in window],
+        "angle": [f"{30 * int(one // 30)} ... {30 * int(one // 30) + 30} deg" for one in angle],
+        "radius": [f"{one:.4f} m" for one in radius],
+        "label": [label for label, keep in zip(update.observation.labels, chosen, strict=True)
+                  if keep]}
+    used = {kind: names for kind, names in members.items() if 1 < len(set(names)) <= 40}
+    return groups(marginal, residual, used)
+
+
+def _room(workshop: Workshop, name: str) -> Workshop:
+    return replace(workshop, folder=workshop.folder / name)
