@@ -6,6 +6,7 @@ by point) into readings: a selection for flux densities, a Fourier analysis for 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,10 @@ import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
-from halbach_fe.inference.noise import Noise, independent
+from halbach_fe.exact_field import gradient_of
+from halbach_fe.inference.noise import Noise
 from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
 from halbach_fe.study import Noise as NoiseSettings
 
@@ -45,6 +47,11 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """x, y or z of each reading; nothing for a Fourier coefficient."""
+        return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
 
     def apply(self, fields: Floats) -> Floats:
         """Readings of fields (..., n, 3) in T; shape (..., readings)."""
@@ -153,43 +160,69 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
     return Observation(points, operator, tuple(labels), np.array(positions))
 
 
-def noise_regions(noise: NoiseSettings, z: Floats) -> NDArray[np.int64]:
-    """Index of the noise region of each z in m: the first whose window holds it.
+def noise_regions(
+    noise: NoiseSettings, z: Floats, components: Sequence[str]
+) -> NDArray[np.int64]:
+    """Index of the noise region of each reading, at z in m and of a component: the first that
+    fits.
 
     Raises
     ------
     StudyError
-        If some z is in none.
+        If some reading is in none.
     """
     region = np.full(len(z), -1)
     for number, window in reversed(list(enumerate(noise.regions))):
         low = -np.inf if window.z_min_m is None else window.z_min_m
         high = np.inf if window.z_max_m is None else window.z_max_m
-        region[(z >= low) & (z <= high)] = number
+        region[(z >= low) & (z <= high) & np.isin(components, ["", *window.components])] = number
     if (region < 0).any():
+        first = int(np.argmin(region))
+        which = f", component {components[first]}," if components[first] else ""
         raise StudyError(
             f"Input `noise.regions` of study must cover every reading; instead z = "
-            f"{z[np.argmin(region)]:g} m is in none. Add a last region without limits.")
+            f"{z[first]:g} m{which} is in none. Add a last region without limits.")
     return region
 
 
 def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> Noise:
-    """Noise of the readings: of the map's points where it says, else by region.
+    """Noise of the readings: of the map's points where it says, else by region; and in both cases
+    what uncertain positions add.
 
-    For Fourier coefficients a map's point noise is propagated, with the correlations that it
+    For Fourier coefficients the noise of points is propagated, with the correlations that it
     leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
     coefficients themselves.
     """
+    settings = study.noise
     if "sigma_T" in data:
         points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
         operator = observation.operator
-        return Noise(_without_rounding(operator @ sparse.diags_array(points) @ operator.T))
-    if study.noise is None:
+        covariance = operator @ sparse.diags_array(points) @ operator.T
+    elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
             "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
-    sigma = np.array([region.sigma_T for region in study.noise.regions])
-    return independent(sigma[noise_regions(study.noise, observation.positions[:, 2])])
+    else:
+        sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
+            settings, observation.positions[:, 2], observation.components)]
+        covariance = sparse.diags_array(sigma**2)
+    if settings is not None and settings.position_sd_m is not None:
+        moved = _displacement(study, observation, np.array(settings.position_sd_m))
+        covariance = covariance + moved @ moved.T
+    return Noise(_without_rounding(sparse.csr_array(covariance)))
+
+
+def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+    """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
+    (3,) in m along each axis.
+
+    The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
+    the bore some per cent of the field, is left out of this scale of the noise.
+    """
+    gradient = gradient_of(blocks_of(study), observation.points) * sd
+    number = np.arange(len(gradient) + 1)
+    return sparse.csr_array(
+        observation.operator @ sparse.bsr_array((gradient, number[:-1], number)))
 
 
 def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:

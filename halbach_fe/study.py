@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from halbach_fe import materials
 from halbach_fe.errors import StudyError, must_be
@@ -37,8 +37,15 @@ Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
 RecoilPermeability = Annotated[float, Field(ge=1.0, le=2.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
+PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+_ONE_OR_LIST = BeforeValidator(
+    lambda value: value if isinstance(value, list | tuple) else (value,),
+    json_schema_input_type=float | list[float])
+"""A number stands for a list of one."""
 
 
 class _Model(BaseModel):
@@ -318,14 +325,16 @@ Observation = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="
 
 
 class NoiseRegion(_Model):
-    """A z window with one standard deviation per reading. The first region that fits is used.
+    """A z window with one standard deviation per reading, of all components or of some.
 
-    A limit that is left out is none.
+    The first region that fits a reading is used. A limit that is left out is none. Regions of one
+    name are one region in reports.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
     z_min_m: Coordinate | None = None
     z_max_m: Coordinate | None = None
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
     sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
 
     @model_validator(mode="after")
@@ -336,9 +345,25 @@ class NoiseRegion(_Model):
 
 
 class Noise(_Model):
-    """Measurement noise by region; a map that carries its own sigma overrides it."""
+    """Measurement noise by region, which a map that carries its own sigma overrides, and what the
+    positions add to either.
 
-    regions: Annotated[tuple[NoiseRegion, ...], Field(min_length=1)]
+    ``position_sd_m`` is how far each point may be from where the map has it, along x, y and z
+    (one value: the same along each). It moves a reading by the local gradient of the nominal
+    field, all components of a point together: much in the fringe, little in the homogeneous field.
+    """
+
+    regions: tuple[NoiseRegion, ...] = ()
+    position_sd_m: Annotated[tuple[PositionSd, ...], _ONE_OR_LIST] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Noise:
+        if not self.regions and self.position_sd_m is None:
+            raise ValueError("give regions, position_sd_m, or both")
+        if self.position_sd_m is not None and len(self.position_sd_m) not in (1, 3):
+            raise ValueError(f"position_sd_m must be one value or three, for x, y and z, not "
+                             f"{len(self.position_sd_m)}")
+        return self
 
 
 class Prior(_Model):
@@ -440,6 +465,11 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        fourier = self.observation.quantity == "fourier_coefficients"
+        regions = self.noise.regions if self.noise else ()
+        if fourier and any(set(one.components) != set(COMPONENTS) for one in regions):
+            raise ValueError("noise.regions may name components of flux_density only; Fourier "
+                             "coefficients have none")
         slots = sorted(slot for one in self.prior.types.values() for slot in one)
         if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
             raise ValueError(f"prior.types must name every slot from 1 to "
@@ -586,6 +616,7 @@ def _more(errors: list[Any]) -> str:
 def _unit_hint(key: str, value: float) -> str:
     """Guess a unit that is wrong by a factor of 1000."""
     wrong = {"_m": "millimetres", "_T": "millitesla"}
+    key = key.partition("[")[0] if key.endswith("]") else key
     for suffix, unit in wrong.items():
         if key.endswith(suffix) and abs(value) > 1:
             return f"Was it meant in {unit}? Then write {value / 1000:g}."
