@@ -37,7 +37,7 @@ class Observation:
     labels : tuple of str
         Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
     positions : ndarray, shape (readings, 3), in m
-        Where each reading belongs; a circle's centre for a Fourier coefficient.
+        Where each reading belongs; for a Fourier coefficient where its circle begins, at angle 0.
     """
 
     points: Floats
@@ -53,6 +53,11 @@ class Observation:
         """x, y or z of each reading; nothing for a Fourier coefficient."""
         return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
 
+    @property
+    def radii(self) -> Floats:
+        """Distance of each reading from the z axis, (readings,) in m: of its point or circle."""
+        return np.hypot(self.positions[:, 0], self.positions[:, 1])
+
     def apply(self, fields: Floats) -> Floats:
         """Readings of fields (..., n, 3) in T; shape (..., readings)."""
         flat = fields.reshape(-1, 3 * len(self.points))
@@ -64,8 +69,8 @@ class Observation:
         """
         if self.operator.nnz == len(self):  # one component at one point each
             return np.linalg.norm(field, axis=1)[self.operator.indices // len(COMPONENTS)]
-        circles = len(np.unique(self.positions[:, 2]))
-        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K
+        circles = len(np.unique(self.positions, axis=0))
+        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K of each
         return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
 
 
@@ -77,8 +82,10 @@ def points_from(positions: Positions) -> Floats:
         return np.array(positions.points_m, float)
     angle = 2 * np.pi * np.arange(positions.angles) / positions.angles
     z = np.linspace(positions.z_min_m, positions.z_max_m, positions.count)
-    circle = positions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.column_stack([np.tile(circle, (len(z), 1)), np.repeat(z, len(circle))])
+    radii = np.array(positions.radius_m)
+    circles = radii[:, None, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.tile(circles, (1, len(z), 1)).reshape(-1, 2),
+                            np.tile(np.repeat(z, len(angle)), len(radii))])
 
 
 def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observation:
@@ -109,32 +116,38 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
     return fourier_of(points, study.observation)
 
 
-def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.int64]]:
-    """Group points into full circles of the study's radius; indices by angle, one row a circle.
+def circles(
+    points: Floats, settings: FourierCoefficients
+) -> list[tuple[float, NDArray[np.int64]]]:
+    """Group points into full circles of the study's radii: for each its radius in m and the
+    indices of its points by angle.
 
     Raises
     ------
     MeasurementError
         If the points are not circles of equally spaced points about the z axis.
     """
-    radius = settings.positions.radius_m
-    if not np.allclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=1e-6):
+    radii = np.array(settings.positions.radius_m)
+    on_circle = np.isclose(np.hypot(points[:, 0], points[:, 1])[:, None], radii, rtol=1e-6)
+    if not on_circle.any(axis=1).all():
         raise MeasurementError(must_be(
-            "points", "map", f"on circles of radius {radius:g} m, as the study's Fourier "
-            "coefficients need", "points at other radii", "Observe flux_density instead."))
+            "points", "map", f"on circles of radius {', '.join(f'{one:g}' for one in radii)} m, "
+            "as the study's Fourier coefficients need", "points at other radii",
+            "Observe flux_density instead."))
     found = []
-    for z in np.unique(np.round(points[:, 2], 9)):
-        index = np.flatnonzero(np.abs(points[:, 2] - z) < 1e-9)
+    own = radii[np.argmax(on_circle, axis=1)]
+    for radius, z in np.unique(np.column_stack([own, np.round(points[:, 2], 9)]), axis=0):
+        index = np.flatnonzero((own == radius) & (np.abs(points[:, 2] - z) < 1e-9))
         angle = np.arctan2(points[index, 1], points[index, 0]) % (2 * np.pi)
         order = np.argsort(angle)
         steps = np.diff(angle[order], append=angle[order][0] + 2 * np.pi)
         if len(index) <= 2 * settings.harmonics or not np.allclose(
                 steps, 2 * np.pi / len(index), atol=1e-6):
             raise MeasurementError(must_be(
-                f"circle at z = {z:g} m", "map",
+                f"circle of radius {radius:g} m at z = {z:g} m", "map",
                 f"more than {2 * settings.harmonics} equally spaced points", f"{len(index)} points"
             ))
-        found.append(index[order])
+        found.append((float(radius), index[order]))
     return found
 
 
@@ -144,7 +157,7 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
     rows, columns, values = [], [], []
     labels: list[str] = []
     positions = []
-    for index in circles(points, settings):
+    for radius, index in circles(points, settings):
         angle = np.arctan2(points[index, 1], points[index, 0])
         wave = np.vstack([np.cos(np.outer(order, angle)), np.sin(np.outer(order, angle))])
         wave *= 2 / len(index)
@@ -153,7 +166,7 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
             columns.append(np.tile(3 * index + axis, len(wave)))
             rows.append(len(labels) + np.repeat(np.arange(len(wave)), len(index)))
         labels += [f"A{k}" for k in order] + [f"B{k}" for k in order]
-        positions += [(0.0, 0.0, points[index[0], 2])] * (2 * len(order))
+        positions += [(radius, 0.0, points[index[0], 2])] * (2 * len(order))
     operator = sparse.csr_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(labels), 3 * len(points)))

@@ -42,10 +42,10 @@ Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
 
-_ONE_OR_LIST = BeforeValidator(
-    lambda value: value if isinstance(value, list | tuple) else (value,),
-    json_schema_input_type=float | list[float])
-"""A number stands for a list of one."""
+def _one_or_list(kind: Any) -> BeforeValidator:
+    """Let a single value stand for a list of one."""
+    return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
+                           json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
 
 
 class _Model(BaseModel):
@@ -264,10 +264,12 @@ class LinePositions(_Model):
 
 
 class CirclePositions(_Model):
-    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z."""
+    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z, of one
+    radius or of each of several.
+    """
 
     kind: Literal["circles"]
-    radius_m: Length
+    radius_m: Annotated[tuple[Length, ...], Field(min_length=1), _one_or_list(Length)]
     angles: Annotated[int, Field(ge=1, le=10_000)]
     z_min_m: Coordinate = 0.0
     z_max_m: Coordinate = 0.0
@@ -281,6 +283,8 @@ class CirclePositions(_Model):
                 f"z_max_m = {self.z_max_m} make no sense; one circle needs equal limits, "
                 "several need z_min_m < z_max_m"
             )
+        if len(set(self.radius_m)) < len(self.radius_m):
+            raise ValueError(f"radius_m must name each radius once, but is {self.radius_m}")
         return self
 
 
@@ -354,7 +358,7 @@ class Noise(_Model):
     """
 
     regions: tuple[NoiseRegion, ...] = ()
-    position_sd_m: Annotated[tuple[PositionSd, ...], _ONE_OR_LIST] | None = None
+    position_sd_m: Annotated[tuple[PositionSd, ...], _one_or_list(PositionSd)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Noise:

@@ -10,7 +10,7 @@ from halbach_fe.errors import MeasurementError, StudyError
 from halbach_fe.exact_field import field_of
 from halbach_fe.field_map import field_map
 from halbach_fe.observation import held_out, observe, points_from, reading_noise
-from tests.conftest import circle
+from tests.conftest import changed, circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
            "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}}
@@ -33,6 +33,36 @@ def test_fourier_coefficients_of_a_pure_multipole(dipole, order, generator):
         multipole_field(points, order, 0.3, -0.2)), strict=True))
     expected = dict.fromkeys(observation.labels, 0.0) | {f"A{order}": 0.3, f"B{order}": -0.2}
     assert readings == pytest.approx(expected, abs=1e-14)
+
+
+def test_circles_of_several_radii(dipole, generator):
+    """Each reading tells its radius and z; the amplitude of each harmonic is its own circle's."""
+    study = dipole(observation=changed(FOURIER, positions__radius_m=[0.075, 0.05]))
+    points = points_from(study.observation.positions.model_copy(update={
+        "z_min_m": -0.1, "z_max_m": 0.1, "count": 2}))
+    assert points.shape == (96, 3)
+    field = multipole_field(points, 3, 0.3, -0.2) * np.hypot(*points[:, :2].T)[:, None]
+    field *= 1 + points[:, 2:]
+    order = generator.permutation(96)  # any order of points
+    observation = observe(study, points[order], np.ones((96, 3), bool))
+    assert len(observation) == 40
+    found = observation.apply(field[order])
+    assert len({(label, radius, z) for label, radius, z in zip(
+        observation.labels, observation.radii, observation.positions[:, 2], strict=True)}) == 40
+    for label, part in (("A3", 0.3), ("B3", -0.2), ("A1", 0.0)):
+        rows = np.array(observation.labels) == label
+        assert sorted(observation.radii[rows]) == pytest.approx([0.05, 0.05, 0.075, 0.075])
+        z = observation.positions[rows, 2]
+        assert found[rows] == pytest.approx(part * observation.radii[rows] * (1 + z), abs=1e-15)
+    third = np.array([label[1:] == "3" for label in observation.labels])
+    size = observation.magnitude(field[order])
+    assert size[third] == pytest.approx(np.hypot(0.3, 0.2) * (
+        observation.radii * (1 + observation.positions[:, 2]))[third])
+    assert size[~third] == pytest.approx(0, abs=1e-15)
+    with pytest.raises(MeasurementError, match=r"on circles of radius 0\.075, 0\.05 m"):
+        observe(study, circle(0.06), np.ones((24, 3), bool))
+    with pytest.raises(MeasurementError, match=r"circle of radius 0\.05 m at z = -0\.1 m"):
+        observe(study, np.delete(points, 60, axis=0), np.ones((95, 3), bool))
 
 
 def test_fourier_needs_full_circles_of_the_radius(dipole):

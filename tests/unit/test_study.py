@@ -50,6 +50,12 @@ def test_studies_are_frozen(dipole):
     ({"name": "../../etc"}, "`name`"),
     ({"observation__positions": {"kind": "circles", "radius_m": 0.07, "angles": 8, "count": 3}},
      "make no sense"),
+    ({"observation__positions": {"kind": "circles", "radius_m": [0.07, 50], "angles": 8}},
+     "Was it meant in millimetres? Then write 0.05."),
+    ({"observation__positions": {"kind": "circles", "radius_m": [0.07, 0.07], "angles": 8}},
+     "name each radius once"),
+    ({"observation__positions": {"kind": "circles", "radius_m": [], "angles": 8}},
+     "`observation.positions.radius_m`"),
     ({"observation": {"quantity": "fourier_coefficients", "harmonics": 8, "positions": {
         "kind": "circles", "radius_m": 0.07, "angles": 16}}}, "more than 16 angles"),
     ({"iron_ring": {"inner_radius_m": 0.3, "outer_radius_m": 0.2, "relative_permeability": 100}},
