@@ -1,11 +1,12 @@
 """From B at points to the readings that an inference compares: labelled rows of numbers.
 
-An `Observation` is a set of points and a sparse matrix that turns B there (all components, point
-by point) into readings: a selection for flux densities, a Fourier analysis for circles.
+The mapper's probe turns B where it was into a map (`halbach_fe.instrument`); an analysis turns the
+map into readings: a selection for flux densities, Fourier's for circles. An `Observation` is both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,11 @@ import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
-from halbach_fe.inference.noise import Noise, independent
+from halbach_fe.exact_field import gradient_of
+from halbach_fe.inference.noise import Noise
+from halbach_fe.instrument import probe
 from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
 from halbach_fe.study import Noise as NoiseSettings
 
@@ -30,35 +33,56 @@ class Observation:
     Attributes
     ----------
     points : ndarray, shape (n, 3), in m
+        Where sensors were.
     operator : sparse array, shape (readings, 3 n)
-        Applied to B in T, flattened point by point.
+        Applied to B in T there, flattened point by point.
+    analysis : sparse array, shape (readings, 3 m)
+        Applied to a map of m points, flattened point by point.
     labels : tuple of str
         Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
     positions : ndarray, shape (readings, 3), in m
-        Where each reading belongs; a circle's centre for a Fourier coefficient.
+        Where each reading belongs; for a Fourier coefficient where its circle begins, at angle 0.
     """
 
     points: Floats
     operator: sparse.csr_array
+    analysis: sparse.csr_array
     labels: tuple[str, ...]
     positions: Floats
 
     def __len__(self) -> int:
         return len(self.labels)
 
+    @property
+    def components(self) -> tuple[str, ...]:
+        """x, y or z of each reading; nothing for a Fourier coefficient."""
+        return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
+
+    @property
+    def radii(self) -> Floats:
+        """Distance of each reading from the z axis, (readings,) in m: of its point or circle."""
+        return np.hypot(self.positions[:, 0], self.positions[:, 1])
+
     def apply(self, fields: Floats) -> Floats:
         """Readings of fields (..., n, 3) in T; shape (..., readings)."""
         flat = fields.reshape(-1, 3 * len(self.points))
         return np.asarray(self.operator @ flat.T).T.reshape(*fields.shape[:-2], len(self))
 
+    def read(self, map_fields: Floats) -> Floats:
+        """Readings (..., readings) of what a map shows, (..., m, 3) in T."""
+        flat = map_fields.reshape(-1, self.analysis.shape[1])
+        return np.asarray(self.analysis @ flat.T).T.reshape(*map_fields.shape[:-2], len(self))
+
     def magnitude(self, field: Floats) -> Floats:
         """Size of a field (n, 3) in T as every reading sees it, whatever its direction or phase:
         |B| at the point, or the amplitude of the harmonic.
         """
-        if self.operator.nnz == len(self):  # one component at one point each
-            return np.linalg.norm(field, axis=1)[self.operator.indices // len(COMPONENTS)]
-        circles = len(np.unique(self.positions[:, 2]))
-        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K
+        if self.analysis.nnz == len(self):  # one component at one point each
+            sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
+            norms = np.linalg.norm(field, axis=1)[::sensors]
+            return np.asarray(norms[self.analysis.indices // len(COMPONENTS)])
+        circles = len(np.unique(self.positions, axis=0))
+        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K of each
         return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
 
 
@@ -70,8 +94,10 @@ def points_from(positions: Positions) -> Floats:
         return np.array(positions.points_m, float)
     angle = 2 * np.pi * np.arange(positions.angles) / positions.angles
     z = np.linspace(positions.z_min_m, positions.z_max_m, positions.count)
-    circle = positions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.column_stack([np.tile(circle, (len(z), 1)), np.repeat(z, len(circle))])
+    radii = np.array(positions.radius_m)
+    circles = radii[:, None, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.tile(circles, (1, len(z), 1)).reshape(-1, 2),
+                            np.tile(np.repeat(z, len(angle)), len(radii))])
 
 
 def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observation:
@@ -83,61 +109,74 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
     measured : ndarray of bool, shape (n, 3)
         Which components the map holds at each point.
     """
-    if study.observation.quantity == "flux_density":
+    if study.observation.quantity == "fourier_coefficients":
+        if not measured[:, :2].all():
+            raise MeasurementError(must_be("components", "map",
+                                           "Bx and By at every point, for the Fourier "
+                                           "coefficients of B_r", "points without them"))
+        analysis, labels, positions = fourier_analysis(points, study.observation)
+    else:
         wanted = np.array([name in study.observation.components for name in COMPONENTS])
         point, component = np.nonzero(measured & wanted)
         if not len(point):
             raise MeasurementError(must_be(
                 "components", "map", f"some of {', '.join(study.observation.components)}, which "
                 "the study observes", "none of them"))
-        operator = sparse.csr_array(
+        analysis = sparse.csr_array(
             (np.ones(len(point)), (np.arange(len(point)), 3 * point + component)),
             shape=(len(point), 3 * len(points)))
-        return Observation(points, operator, tuple(f"B{COMPONENTS[c]}" for c in component),
-                           points[point])
-    if not measured[:, :2].all():
-        raise MeasurementError(must_be("components", "map",
-                                       "Bx and By at every point, for the Fourier coefficients "
-                                       "of B_r", "points without them"))
-    return fourier_of(points, study.observation)
+        labels, positions = tuple(f"B{COMPONENTS[c]}" for c in component), points[point]
+    used = probe(study.instrument, points)
+    return Observation(used.points, sparse.csr_array(analysis @ used.operator), analysis, labels,
+                       positions)
 
 
-def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.int64]]:
-    """Group points into full circles of the study's radius; indices by angle, one row a circle.
+def circles(
+    points: Floats, settings: FourierCoefficients
+) -> list[tuple[float, NDArray[np.int64]]]:
+    """Group points into full circles of the study's radii: for each its radius in m and the
+    indices of its points by angle.
 
     Raises
     ------
     MeasurementError
         If the points are not circles of equally spaced points about the z axis.
     """
-    radius = settings.positions.radius_m
-    if not np.allclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=1e-6):
+    radii = np.array(settings.positions.radius_m)
+    on_circle = np.isclose(np.hypot(points[:, 0], points[:, 1])[:, None], radii, rtol=1e-6)
+    if not on_circle.any(axis=1).all():
         raise MeasurementError(must_be(
-            "points", "map", f"on circles of radius {radius:g} m, as the study's Fourier "
-            "coefficients need", "points at other radii", "Observe flux_density instead."))
+            "points", "map", f"on circles of radius {', '.join(f'{one:g}' for one in radii)} m, "
+            "as the study's Fourier coefficients need", "points at other radii",
+            "Observe flux_density instead."))
     found = []
-    for z in np.unique(np.round(points[:, 2], 9)):
-        index = np.flatnonzero(np.abs(points[:, 2] - z) < 1e-9)
+    own = radii[np.argmax(on_circle, axis=1)]
+    for radius, z in np.unique(np.column_stack([own, np.round(points[:, 2], 9)]), axis=0):
+        index = np.flatnonzero((own == radius) & (np.abs(points[:, 2] - z) < 1e-9))
         angle = np.arctan2(points[index, 1], points[index, 0]) % (2 * np.pi)
         order = np.argsort(angle)
         steps = np.diff(angle[order], append=angle[order][0] + 2 * np.pi)
         if len(index) <= 2 * settings.harmonics or not np.allclose(
                 steps, 2 * np.pi / len(index), atol=1e-6):
             raise MeasurementError(must_be(
-                f"circle at z = {z:g} m", "map",
+                f"circle of radius {radius:g} m at z = {z:g} m", "map",
                 f"more than {2 * settings.harmonics} equally spaced points", f"{len(index)} points"
             ))
-        found.append(index[order])
+        found.append((float(radius), index[order]))
     return found
 
 
-def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
-    """Fourier coefficients of B_r on the circles that points (n, 3) in m form."""
+def fourier_analysis(
+    points: Floats, settings: FourierCoefficients
+) -> tuple[sparse.csr_array, tuple[str, ...], Floats]:
+    """Fourier coefficients of B_r on the circles that points (n, 3) in m form: matrix (readings,
+    3 n), labels and positions (readings, 3) in m.
+    """
     order = np.arange(1, settings.harmonics + 1)
     rows, columns, values = [], [], []
     labels: list[str] = []
     positions = []
-    for index in circles(points, settings):
+    for radius, index in circles(points, settings):
         angle = np.arctan2(points[index, 1], points[index, 0])
         wave = np.vstack([np.cos(np.outer(order, angle)), np.sin(np.outer(order, angle))])
         wave *= 2 / len(index)
@@ -146,50 +185,76 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
             columns.append(np.tile(3 * index + axis, len(wave)))
             rows.append(len(labels) + np.repeat(np.arange(len(wave)), len(index)))
         labels += [f"A{k}" for k in order] + [f"B{k}" for k in order]
-        positions += [(0.0, 0.0, points[index[0], 2])] * (2 * len(order))
-    operator = sparse.csr_array(
+        positions += [(radius, 0.0, points[index[0], 2])] * (2 * len(order))
+    matrix = sparse.csr_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(labels), 3 * len(points)))
-    return Observation(points, operator, tuple(labels), np.array(positions))
+    return matrix, tuple(labels), np.array(positions)
 
 
-def noise_regions(noise: NoiseSettings, z: Floats) -> NDArray[np.int64]:
-    """Index of the noise region of each z in m: the first whose window holds it.
+def noise_regions(
+    noise: NoiseSettings, z: Floats, components: Sequence[str]
+) -> NDArray[np.int64]:
+    """Index of the noise region of each reading, at z in m and of a component: the first that
+    fits.
 
     Raises
     ------
     StudyError
-        If some z is in none.
+        If some reading is in none.
     """
     region = np.full(len(z), -1)
     for number, window in reversed(list(enumerate(noise.regions))):
         low = -np.inf if window.z_min_m is None else window.z_min_m
         high = np.inf if window.z_max_m is None else window.z_max_m
-        region[(z >= low) & (z <= high)] = number
+        region[(z >= low) & (z <= high) & np.isin(components, ["", *window.components])] = number
     if (region < 0).any():
+        first = int(np.argmin(region))
+        which = f", component {components[first]}," if components[first] else ""
         raise StudyError(
             f"Input `noise.regions` of study must cover every reading; instead z = "
-            f"{z[np.argmin(region)]:g} m is in none. Add a last region without limits.")
+            f"{z[first]:g} m{which} is in none. Add a last region without limits.")
     return region
 
 
 def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> Noise:
-    """Noise of the readings: of the map's points where it says, else by region.
+    """Noise of the readings: of the map's points where it says, else by region; and in both cases
+    what uncertain positions add.
 
-    For Fourier coefficients a map's point noise is propagated, with the correlations that it
+    For Fourier coefficients the noise of points is propagated, with the correlations that it
     leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
     coefficients themselves.
     """
+    settings = study.noise
     if "sigma_T" in data:
         points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
-        operator = observation.operator
-        return Noise(_without_rounding(operator @ sparse.diags_array(points) @ operator.T))
-    if study.noise is None:
+        analysis = observation.analysis
+        covariance = analysis @ sparse.diags_array(points) @ analysis.T
+    elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
             "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
-    sigma = np.array([region.sigma_T for region in study.noise.regions])
-    return independent(sigma[noise_regions(study.noise, observation.positions[:, 2])])
+    else:
+        sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
+            settings, observation.positions[:, 2], observation.components)]
+        covariance = sparse.diags_array(sigma**2)
+    if settings is not None and settings.position_sd_m is not None:
+        moved = _displacement(study, observation, np.array(settings.position_sd_m))
+        covariance = covariance + moved @ moved.T
+    return Noise(_without_rounding(sparse.csr_array(covariance)))
+
+
+def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+    """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
+    (3,) in m along each axis.
+
+    The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
+    the bore some per cent of the field, is left out of this scale of the noise.
+    """
+    gradient = gradient_of(blocks_of(study), observation.points) * sd
+    number = np.arange(len(gradient) + 1)
+    return sparse.csr_array(
+        observation.operator @ sparse.bsr_array((gradient, number[:-1], number)))
 
 
 def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:

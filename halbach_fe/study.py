@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from halbach_fe import materials
 from halbach_fe.errors import StudyError, must_be
@@ -45,8 +45,15 @@ Fraction = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False)]
 Fractions = tuple[Fraction, Fraction, Fraction]
 FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
+PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+def _one_or_list(kind: Any) -> BeforeValidator:
+    """Let a single value stand for a list of one."""
+    return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
+                           json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
 
 
 class _Model(BaseModel):
@@ -349,10 +356,12 @@ class LinePositions(_Model):
 
 
 class CirclePositions(_Model):
-    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z."""
+    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z, of one
+    radius or of each of several.
+    """
 
     kind: Literal["circles"]
-    radius_m: Length
+    radius_m: Annotated[tuple[Length, ...], Field(min_length=1), _one_or_list(Length)]
     angles: Annotated[int, Field(ge=1, le=10_000)]
     z_min_m: Coordinate = 0.0
     z_max_m: Coordinate = 0.0
@@ -366,6 +375,8 @@ class CirclePositions(_Model):
                 f"z_max_m = {self.z_max_m} make no sense; one circle needs equal limits, "
                 "several need z_min_m < z_max_m"
             )
+        if len(set(self.radius_m)) < len(self.radius_m):
+            raise ValueError(f"radius_m must name each radius once, but is {self.radius_m}")
         return self
 
 
@@ -410,14 +421,16 @@ Observation = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="
 
 
 class NoiseRegion(_Model):
-    """A z window with one standard deviation per reading. The first region that fits is used.
+    """A z window with one standard deviation per reading, of all components or of some.
 
-    A limit that is left out is none.
+    The first region that fits a reading is used. A limit that is left out is none. Regions of one
+    name are one region in reports.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
     z_min_m: Coordinate | None = None
     z_max_m: Coordinate | None = None
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
     sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
 
     @model_validator(mode="after")
@@ -428,9 +441,25 @@ class NoiseRegion(_Model):
 
 
 class Noise(_Model):
-    """Measurement noise by region; a map that carries its own sigma overrides it."""
+    """Measurement noise by region, which a map that carries its own sigma overrides, and what the
+    positions add to either.
 
-    regions: Annotated[tuple[NoiseRegion, ...], Field(min_length=1)]
+    ``position_sd_m`` is how far each point may be from where the map has it, along x, y and z
+    (one value: the same along each). It moves a reading by the local gradient of the nominal
+    field, all components of a point together: much in the fringe, little in the homogeneous field.
+    """
+
+    regions: tuple[NoiseRegion, ...] = ()
+    position_sd_m: Annotated[tuple[PositionSd, ...], _one_or_list(PositionSd)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Noise:
+        if not self.regions and self.position_sd_m is None:
+            raise ValueError("give regions, position_sd_m, or both")
+        if self.position_sd_m is not None and len(self.position_sd_m) not in (1, 3):
+            raise ValueError(f"position_sd_m must be one value or three, for x, y and z, not "
+                             f"{len(self.position_sd_m)}")
+        return self
 
 
 class Prior(_Model):
@@ -534,6 +563,11 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        fourier = self.observation.quantity == "fourier_coefficients"
+        regions = self.noise.regions if self.noise else ()
+        if fourier and any(set(one.components) != set(COMPONENTS) for one in regions):
+            raise ValueError("noise.regions may name components of flux_density only; Fourier "
+                             "coefficients have none")
         slots = sorted(slot for one in self.prior.types.values() for slot in one)
         if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
             raise ValueError(f"prior.types must name every slot from 1 to "
@@ -680,6 +714,7 @@ def _more(errors: list[Any]) -> str:
 def _unit_hint(key: str, value: float) -> str:
     """Guess a unit that is wrong by a factor of 1000."""
     wrong = {"_m": "millimetres", "_T": "millitesla"}
+    key = key.partition("[")[0] if key.endswith("]") else key
     for suffix, unit in wrong.items():
         if key.endswith(suffix) and abs(value) > 1:
             return f"Was it meant in {unit}? Then write {value / 1000:g}."

@@ -28,6 +28,7 @@ from halbach_fe.inference import linear
 from halbach_fe.inference.linear import predict, whitened
 from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.instrument import without_remainder
 from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
@@ -127,10 +128,10 @@ class Update:
     def scores(self) -> tuple[RegionScore, ...]:
         """Scores by region, training and held-out readings apart."""
         noise = self.study.noise
-        names = [region.name for region in noise.regions] if noise else [ALL_READINGS]
+        names = [region.name for region in noise.regions] if noise else []
         return tuple(
             self._score(region, part, chosen)
-            for region in dict.fromkeys(names)
+            for region in dict.fromkeys(names or [ALL_READINGS])
             for part, mask in ((TRAINING, ~self.held_out), (HELD_OUT, self.held_out))
             if (chosen := mask & (np.array(self.regions) == region)).any())
 
@@ -221,13 +222,12 @@ def infer(
         raise MeasurementError(must_be(
             "readings", "map", "enough for the study to leave some for the update",
             f"{len(keep)}, all held out", "Change inference.held_out."))
-    if study.noise is None:
-        regions = (ALL_READINGS,) * len(observation)
-    else:
+    regions = (ALL_READINGS,) * len(observation)
+    if study.noise is not None and study.noise.regions:
         names = [region.name for region in study.noise.regions]
-        regions = tuple(names[i] for i in noise_regions(study.noise,
-                                                        observation.positions[:, 2]))
-    readings = observation.apply(np.nan_to_num(data["B_T"].values))
+        regions = tuple(names[i] for i in noise_regions(
+            study.noise, observation.positions[:, 2], observation.components))
+    readings = observation.read(np.nan_to_num(without_remainder(study.instrument, data)))
     try:
         model = response(study, observation, workshop)
     except PointsOutsideError as error:

@@ -14,7 +14,7 @@ import numpy as np
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import DUAL, REFINEMENT, dual, farther, refined
 from halbach_fe.exact_field import field_of
-from halbach_fe.observation import fourier_of, noise_regions, points_from
+from halbach_fe.observation import fourier_analysis, noise_regions, points_from
 from halbach_fe.routes import MESHES, choose_route, is_vacuum, solve_nominal
 from halbach_fe.solve import Workshop
 from halbach_fe.study import FourierCoefficients, Study
@@ -130,19 +130,21 @@ class _Comparison:
         positions = study.observation.positions
         if positions.kind == "circles" and positions.angles > 2:
             wanted = getattr(study.observation, "harmonics", HARMONICS)
-            self._circles = fourier_of(points, FourierCoefficients(
+            self._circles, *_ = fourier_analysis(points, FourierCoefficients(
                 quantity="fourier_coefficients", positions=positions,
                 harmonics=min(wanted, (positions.angles - 1) // 2)))
         self._regions = {"all": np.ones(len(points), bool)}
-        if study.noise is not None:
-            index = noise_regions(study.noise, points[:, 2])
-            self._regions = {region.name: index == number
-                             for number, region in enumerate(study.noise.regions)}
+        if study.noise is not None and study.noise.regions:
+            names = getattr(study.observation, "components", ("",))
+            index = noise_regions(study.noise, np.repeat(points[:, 2], len(names)),
+                                  names * len(points)).reshape(len(points), -1)
+            regions = np.array([region.name for region in study.noise.regions])[index]
+            self._regions = {name: (regions == name).any(axis=1) for name in np.unique(regions)}
 
     def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
         change = np.linalg.norm(one - two, axis=1) / self.scale
         fourier = (None if self._circles is None
-                   else float(np.abs(self._circles.apply(one - two)).max() / self.scale))
+                   else float(np.abs(self._circles @ (one - two).ravel()).max() / self.scale))
         return Difference(
             what=what, pointwise=float(change.max()), fourier=fourier,
             by_region={name: float(change[mask].max()) for name, mask in self._regions.items()

@@ -19,7 +19,8 @@ class BlockDisplaced(Effect):
     title = "displacement of a block"
     kind = "field"
     parameters = (
-        Parameter("radial", "m", 0.0002), Parameter("azimuthal", "m", 0.0002), Parameter("axial", "m", 0.0002),)
+        Parameter("radial", "m", 2e-4), Parameter("azimuthal", "m", 2e-4),
+        Parameter("axial", "m", 2e-4))
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""

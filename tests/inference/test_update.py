@@ -159,6 +159,59 @@ def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, works
     assert after.max() < 1e-5
 
 
+TWO_CIRCLES = {"quantity": "fourier_coefficients", "harmonics": 8, "positions": {
+    "kind": "circles", "radius_m": [0.05, 0.075], "angles": 60}}
+
+
+def test_two_radii_with_unequal_noise(dipole, generator, workshop):
+    """Coefficients of two circles, B_y read ten times worse than B_x, whose noise correlates them:
+    error bars and chi2 hold.
+    """
+    _, data, truth = iron_campaign(dipole, generator, noise=0.0)
+    sigma = np.tile([1e-5, 1e-4, np.nan], (120, 1))
+    data["B_T"].values[:] += sigma * generator.standard_normal((120, 3))
+    data["sigma_T"] = (("point", "component"), sigma)
+    study = dipole(iron_ring=IRON, mesh__block_size_m=0.01, observation=TWO_CIRCLES)
+    update = infer(study, data, workshop)
+    assert len(update.readings) == 32
+    assert not update.noise.independent
+    score = (update.posterior.mean - truth) / update.posterior.sd
+    # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    assert update.prior_conflict == pytest.approx(1.0, abs=1.0)  # 32 readings: sd 0.25
+    write_update(update, workshop.folder)
+    table = np.genfromtxt(workshop.folder / "prediction.csv", delimiter=",", names=True)
+    assert sorted(set(table["x_m"])) == [0.05, 0.075]
+
+
+def test_uncertain_positions(short_dipole, generator, workshop):
+    """A 3D map by magpylib whose every point is 0.2 mm off: as noise it is understood, in points
+    and in coefficients of two circles; a study that takes the positions for exact disagrees.
+    """
+    points = np.vstack([circle(radius, 20, z) for radius in (0.05, 0.075)
+                        for z in np.linspace(-0.12, 0.12, 7)])
+    moved = points + 2e-4 * generator.standard_normal(points.shape)
+    field = np.zeros_like(points)
+    study = short_dipole(array__recoil_permeability=1.0)
+    for block in blocks_of(study):
+        middle = position_angle_deg(study.array, block.slot)
+        polarization = np.array(block.easy_axis) + 0.01 * generator.standard_normal(3)
+        field += magpylib.magnet.CylinderSegment(
+            dimension=(0.104, 0.1865, 0.08, middle - 11.25, middle + 11.25),
+            position=(0, 0, (block.z_min + block.z_max) / 2),
+            polarization=block.remanence * polarization).getB(moved)
+    field += 1e-5 * generator.standard_normal(field.shape)
+    data = field_map(points, field, np.full_like(field, 1e-5))
+    for observation in (study.observation.model_dump(), TWO_CIRCLES):
+        known, exact = (infer(short_dipole(array__recoil_permeability=1.0, observation=observation,
+                                           noise=noise), data, workshop)
+                        for noise in ({"position_sd_m": 2e-4}, None))
+        assert known.prior_conflict < known.conflict_limit
+        # 840 readings: sd 0.05; 224: 0.09
+        assert known.prior_conflict == pytest.approx(1.0, abs=0.4)
+        assert exact.prior_conflict > 10 * exact.conflict_limit
+
+
 def test_nothing_held_out_is_said(dipole, generator, workshop):
     _, data, _ = iron_campaign(dipole, generator)
     with pytest.raises(MeasurementError, match="enough z positions"):
