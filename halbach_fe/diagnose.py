@@ -34,6 +34,8 @@ SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
 Say = Callable[[str], None]
+Signatures = dict[tuple[str, Place], Floats]
+"""Whitened training readings (rows, k) per unit of each parameter, by effect and place."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,16 @@ class Named:
 
 @dataclass(frozen=True)
 class Search:
-    """All effects compared at one point of linearization."""
+    """All effects compared at one point of linearization.
+
+    ``training`` is the whitened residual (rows,) of the training readings from the prior mean.
+    """
 
     hypotheses: tuple[Hypothesis, ...]
     candidates: tuple[Candidate, ...]
     evidence: Evidence
     marginal: Marginal
-    residual: Floats
+    training: Floats
 
 
 @dataclass(frozen=True)
@@ -121,13 +126,14 @@ def diagnose(
     """
     effects = catalogue() if effects is None else effects
     named: tuple[Named, ...] = ()
+    signatures: Signatures = {}
     first: tuple[Update, Search] | None = None
     for number in range(MOST_ROUNDS):
         say(f"round {number + 1}: the model with "
             f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
         now = applied(study, named)
         update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks)
-        search = look(study, update, data, workshop, effects, named)
+        search = look(study, update, data, workshop, effects, named, signatures)
         first = first or (update, search)
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
@@ -137,10 +143,10 @@ def diagnose(
     return Diagnosis(
         before=first[0], after=update, named=named,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
-        groups_before=_groups(first[0], first[1].marginal, _residual(first[0])),
-        groups_after=_groups(update, _marginal(update), _residual(update)),
-        left_out_before=left_out(first[1].marginal, first[1].residual),
-        left_out_after=left_out(_marginal(update), _residual(update)), rounds=number + 1)
+        groups_before=_groups(first[0], first[1].marginal, first[1].training),
+        groups_after=_groups(update, search.marginal, search.training),
+        left_out_before=left_out(first[1].marginal, first[1].training),
+        left_out_after=left_out(search.marginal, search.training), rounds=number + 1)
 
 
 def applied(study: Study, named: Sequence[Named]) -> Study:
@@ -152,16 +158,26 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 def look(
     study: Study, update: Update, data: xr.Dataset, workshop: Workshop,
-    effects: Sequence[Effect], named: Sequence[Named],
+    effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
 
     The residual is that of the study without them: what they do is added back, by their signatures
-    at this point.
+    at this point. Other effects keep the ``signatures`` that they had first.
     """
-    scene = scene_of(update.study, data, workshop)
-    bare = scene_of(study, data, workshop) if named else scene
-    marginal, residual = _marginal(update), _residual(update)
+    rows = np.flatnonzero(~update.held_out)
+    noise = update.errors.part(rows)
+
+    def whitened(readings: Floats) -> Floats:
+        """All readings (..., readings) to training ones (rows, ...)."""
+        return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
+
+    marginal = Marginal.of(noise.whiten(update.response.matrix[rows] @ update.prior.root))
+    training = whitened(update.readings - update.response.offset
+                        - update.response.matrix @ update.prior.mean)
+    residual = training
+    scene = _scene_of(update.study, data, workshop)
+    bare = _scene_of(study, data, workshop)
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     hypotheses: list[Hypothesis] = []
     candidates: list[Candidate] = []
@@ -170,41 +186,29 @@ def look(
     for effect in effects:
         scale = np.array([parameter.sd for parameter in effect.parameters])
         for place in effect.places(study):
-            present = there.get((effect.name, place))
-            whole = present is not None and effect.discrete
-            signature = effect.signature(bare if whole else scene, place)
-            readings = update.observation.read(signature)
+            key = effect.name, place
+            present = there.get(key)
+            if present is not None and not effect.discrete:
+                signatures.pop(key)
+            if key not in signatures:
+                seen = effect.signature(bare if present is None else scene, place)
+                signatures[key] = whitened(update.observation.read(seen))
             if present is not None:
                 amount = np.ones(1) if effect.discrete else present.values
-                residual = residual + whitened(update, amount @ readings)
-            columns.append(whitened(update, (scale[:, None] * readings).T))
+                residual = residual + signatures[key] @ amount
+            columns.append(signatures[key] * scale)
             hypotheses.append(Hypothesis(effect, place))
             candidates.append(Candidate(effect.name, place.name, tuple(
                 range(width, width + len(scale))), effect.certain))
             width += len(scale)
     evidence = marginal.evidence(np.hstack(columns), residual)
-    return Search(tuple(hypotheses), tuple(candidates), evidence, marginal, residual)
+    return Search(tuple(hypotheses), tuple(candidates), evidence, marginal, training)
 
 
-def scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
-    """The scene of a map."""
+def _scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
     points = points_of(data)
     return Scene(study, points, map_time(data),
                  lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
-
-
-def whitened(update: Update, readings: Floats) -> Floats:
-    """Training readings (n,) or (n, k) of all (readings,) or (readings, k), whitened."""
-    return update.errors.part(~update.held_out).whiten(readings[~update.held_out])
-
-
-def _marginal(update: Update) -> Marginal:
-    return Marginal.of(whitened(update, update.response.matrix @ update.prior.root))
-
-
-def _residual(update: Update) -> Floats:
-    return whitened(update, update.readings - update.response.offset
-                    - update.response.matrix @ update.prior.mean)
 
 
 def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
