@@ -10,15 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats
+from halbach_fe.diagnosis.discrepancy import harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
-from halbach_fe.diagnosis.selection import Candidate, Found, probabilities, select
+from halbach_fe.diagnosis.selection import (
+    ALIKE,
+    EFFECT_ODDS,
+    FOUND,
+    Candidate,
+    Found,
+    gains,
+    log_evidence,
+    probabilities,
+    select,
+    with_candidates,
+)
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Place
 from halbach_fe.field_map import points_of
@@ -69,14 +82,47 @@ class Named:
 class Search:
     """All effects compared at one point of linearization.
 
-    ``training`` is the whitened residual (rows,) of the training readings from the prior mean.
+    ``columns`` are the whitened signatures (rows, k), ``residual`` (rows,) what they explain;
+    ``training`` is the whitened residual of the training readings from the prior mean, with named
+    effects in the model.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     candidates: tuple[Candidate, ...]
     evidence: Evidence
+    columns: Floats
+    residual: Floats
     marginal: Marginal
     training: Floats
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Something that no effect of the catalogue explains.
+
+    Attributes
+    ----------
+    kind : str
+        ``field``: it solves Maxwell's equations in the bore, so that a source is missing;
+        ``instrument``: it cannot; ``either``: the readings do not tell.
+    log_bayes_factor : float
+        Over nothing more than the named effects.
+    alone : bool
+        Whether it is the better explanation without the named effects, which are then none.
+    largest_T : float
+        Of it at any training reading.
+    at_m : tuple of float
+        Where that is.
+    source_m : tuple of float or None
+        Where a point dipole would have to be that is the best source, if a field is missing.
+    """
+
+    kind: Literal["field", "instrument", "either"]
+    log_bayes_factor: float
+    alone: bool
+    largest_T: float
+    at_m: tuple[float, ...]
+    source_m: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
@@ -88,6 +134,8 @@ class Diagnosis:
     before, after : Update
         The inference with the study as it was, and with the effects that were named.
     named : tuple of Named
+    unknown : Unknown or None
+        What they leave unexplained, if anything.
     probabilities : dict
         Of each effect, and of none, if at most one is missing.
     groups_before, groups_after : list of Group
@@ -100,6 +148,7 @@ class Diagnosis:
     before: Update
     after: Update
     named: tuple[Named, ...]
+    unknown: Unknown | None
     probabilities: dict[str, float]
     groups_before: list[Group]
     groups_after: list[Group]
@@ -141,7 +190,7 @@ def diagnose(
         named = found
     assert first is not None
     return Diagnosis(
-        before=first[0], after=update, named=named,
+        before=first[0], after=update, named=named, unknown=unknown(search, update, named),
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
@@ -201,8 +250,47 @@ def look(
             candidates.append(Candidate(effect.name, place.name, tuple(
                 range(width, width + len(scale))), effect.certain))
             width += len(scale)
-    evidence = marginal.evidence(np.hstack(columns), residual)
-    return Search(tuple(hypotheses), tuple(candidates), evidence, marginal, training)
+    stacked = np.hstack(columns)
+    return Search(tuple(hypotheses), tuple(candidates), marginal.evidence(stacked, residual),
+                  stacked, residual, marginal, training)
+
+
+def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown | None:
+    """Judge what named effects leave: a smooth field, or a smooth error of the sensors."""
+    rows = np.flatnonzero(~update.held_out)
+    noise, observation = update.errors.part(rows), update.observation
+    points = observation.map_points
+    kinds: dict[Literal["field", "instrument", "either"], Floats] = {
+        "field": harmonic_fields(points), "instrument": sensor_errors(points)}
+    mine = [one.found.candidate for one in named]
+    held = [column for one in mine for column in one.columns]
+    own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
+           for one in mine]
+    found = []
+    for kind, fields in kinds.items():
+        scale = float(np.median(update.errors.sd))
+        smooth = noise.whiten(np.ascontiguousarray(observation.read(scale * fields)[:, rows].T))
+        both = search.marginal.evidence(
+            np.hstack([search.columns[:, held], smooth]), search.residual)
+        added = range(len(held), len(held) + len(fields))
+        rest = judge(with_candidates(both, own).only(added))
+        alone = judge(both.only(added)).log_bayes_factor > log_evidence(both, own) + FOUND
+        found.append((rest.log_bayes_factor, kind, alone,
+                      scale * np.tensordot(rest.mean, fields, 1)))
+    found.sort(key=lambda one: -one[0])
+    (factor, kind, alone, field), (second, *_) = found
+    if factor + np.log(EFFECT_ODDS) < FOUND:
+        return None
+    size = np.linalg.norm(field, axis=1)
+    source = None
+    if kind == "field":
+        odds = gains(with_candidates(search.evidence, mine), search.candidates)
+        dipoles = [number for number, one in enumerate(search.hypotheses)
+                   if one.effect.name == "ferromagnetic_object"]
+        if dipoles:
+            source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
+    return Unknown("either" if factor - second < ALIKE else kind, factor, alone,
+                   float(size.max()), tuple(points[int(np.argmax(size))].tolist()), source)
 
 
 def _scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
