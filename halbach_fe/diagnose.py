@@ -17,7 +17,7 @@ import xarray as xr
 
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats
-from halbach_fe.diagnosis.discrepancy import harmonic_fields, judge, sensor_errors
+from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
 from halbach_fe.diagnosis.selection import (
@@ -106,9 +106,9 @@ class Unknown:
         ``field``: it solves Maxwell's equations in the bore, so that a source is missing;
         ``instrument``: it cannot; ``either``: the readings do not tell.
     log_bayes_factor : float
-        Over nothing more than the named effects.
+        Over the named effects alone.
     alone : bool
-        Whether it is the better explanation without the named effects, which are then none.
+        Whether it is the better explanation by itself: no effect is named then.
     largest_T : float
         Of it at any training reading.
     at_m : tuple of float
@@ -189,8 +189,11 @@ def diagnose(
             break
         named = found
     assert first is not None
+    rest = unknown(search, update, named)
+    if rest is not None and rest.alone:
+        named, (update, search) = (), first
     return Diagnosis(
-        before=first[0], after=update, named=named, unknown=unknown(search, update, named),
+        before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
@@ -259,38 +262,42 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
     """Judge what named effects leave: a smooth field, or a smooth error of the sensors."""
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.part(rows), update.observation
-    points = observation.map_points
-    kinds: dict[Literal["field", "instrument", "either"], Floats] = {
-        "field": harmonic_fields(points), "instrument": sensor_errors(points)}
+    points, scale = observation.map_points, float(np.median(update.errors.sd))
     mine = [one.found.candidate for one in named]
     held = [column for one in mine for column in one.columns]
     own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
            for one in mine]
-    found = []
-    for kind, fields in kinds.items():
-        scale = float(np.median(update.errors.sd))
-        smooth = noise.whiten(np.ascontiguousarray(observation.read(scale * fields)[:, rows].T))
+    kinds: dict[Literal["field", "instrument", "either"], Terms] = {
+        "field": harmonic_fields(points), "instrument": sensor_errors(points)}
+    beside, instead = [], []
+    for kind, terms in kinds.items():
+        readings = observation.read(scale * terms.fields)
+        smooth = noise.whiten(np.ascontiguousarray(readings[:, rows].T))
         both = search.marginal.evidence(
             np.hstack([search.columns[:, held], smooth]), search.residual)
-        added = range(len(held), len(held) + len(fields))
-        rest = judge(with_candidates(both, own).only(added))
-        alone = judge(both.only(added)).log_bayes_factor > log_evidence(both, own) + FOUND
-        found.append((rest.log_bayes_factor, kind, alone,
-                      scale * np.tensordot(rest.mean, fields, 1)))
-    found.sort(key=lambda one: -one[0])
-    (factor, kind, alone, field), (second, *_) = found
-    if factor + np.log(EFFECT_ODDS) < FOUND:
+        added = range(len(held), both.information.shape[0])
+        rest = judge(with_candidates(both, own).only(added), terms.fineness)
+        alone = judge(both.only(added), terms.fineness)
+        beside.append((rest.log_bayes_factor, kind, rest))
+        instead.append((alone.log_bayes_factor, kind, alone))
+    beside.sort(key=lambda one: -one[0])
+    instead.sort(key=lambda one: -one[0])
+    if beside[0][0] + np.log(EFFECT_ODDS) < FOUND:
         return None
-    size = np.linalg.norm(field, axis=1)
+    alone_better = bool(mine) and instead[0][0] > log_evidence(both, own) + FOUND
+    (factor, kind, best), (second, *_) = instead if alone_better else beside
+    size = scale * np.linalg.norm(np.tensordot(best.mean, kinds[kind].fields, 1), axis=1)
     source = None
     if kind == "field":
-        odds = gains(with_candidates(search.evidence, mine), search.candidates)
+        others = [] if alone_better else mine
+        odds = gains(with_candidates(search.evidence, others), search.candidates)
         dipoles = [number for number, one in enumerate(search.hypotheses)
                    if one.effect.name == "ferromagnetic_object"]
         if dipoles:
             source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
-    return Unknown("either" if factor - second < ALIKE else kind, factor, alone,
-                   float(size.max()), tuple(points[int(np.argmax(size))].tolist()), source)
+    return Unknown("either" if factor - second < ALIKE else kind, factor,
+                   alone_better or not mine, float(size.max()),
+                   tuple(points[int(np.argmax(size))].tolist()), source)
 
 
 def _scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
