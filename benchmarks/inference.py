@@ -16,6 +16,7 @@ from halbach_fe.field_map import read_map
 from halbach_fe.getdp import find_getdp
 from halbach_fe.inference import linear
 from halbach_fe.inference.diagnostics import diagnose
+from halbach_fe.inference.noise import independent
 from halbach_fe.inference.prior import Gaussian, block_prior
 from halbach_fe.inference.sampling import Move, Posterior, prior_reference, sample
 from halbach_fe.nonlinear import nonlinear_model
@@ -48,7 +49,7 @@ def posterior_time(note: Note) -> None:
         whitened = matrix / sigma[:, None]
         whitened.T @ whitened
         middle = time.monotonic()
-        linear.update(matrix, readings, sigma, prior)
+        linear.update(matrix, readings, independent(sigma), prior)
         times.append((middle - started, time.monotonic() - middle))
     product, all_ = np.min(times, axis=0)
     note("inference.posterior_time_over_gram", all_ / product, "ratio",
@@ -95,8 +96,8 @@ def nonlinear(note: Note) -> None:
         note("inference.nonlinear_max_rhat", float(found.diagnostics.r_hat.max()), "", "")
         model = nonlinear_model(study, update.observation, replace(
             workshop, folder=workshop.folder / "pcn"), np.random.default_rng(1))
-        sigma = np.hypot(update.noise, model.error)
-        target = Posterior(lambda p: model(p, 1e-7), update.readings, sigma, prior)
+        target = Posterior(lambda p: model(p, 1e-7), update.readings,
+                           update.noise.plus(model.error), prior)
         common.say(f"the paper's sampler, {PCN_STEPS} steps")
         generator = np.random.default_rng(2)
         chain = sample(target, [Move(prior_reference(prior), PCN_STEP)], PCN_STEPS, generator,

@@ -31,6 +31,11 @@ from halbach_fe.blocks import Edge, Floats, Ints, MagnetBlock, Outline
 from halbach_fe.symmetry import Frame, frame_of, turn_matrix, unique_points
 
 _ORDER = 12
+_STEP = 1e-4
+"""Of the array's radius, for differences: the relative error is the square of the step over the
+distance to a block. Of four Gauss points, measured at 3 % of the radius from the blocks, it is 1e-4
+too."""
+
 _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
 _AT_ONCE = 4_000_000  # blocks times points whose places are compared at once
 
@@ -64,17 +69,21 @@ def unit_field(block: MagnetBlock, points: Floats, order: int = _ORDER) -> Float
     return result
 
 
-def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
+def unit_fields(
+    blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER
+) -> Iterator[Floats]:
     """Yield `unit_field` of every block, in order.
 
     Congruent blocks share the integrals: readings on circles see many blocks from the same place.
     """
     at_once = max(1, _AT_ONCE // max(1, len(points)))
     for first in range(0, len(blocks), at_once):
-        yield from _fields_of_some(blocks[first:first + at_once], points)
+        yield from _fields_of_some(blocks[first:first + at_once], points, order)
 
 
-def _fields_of_some(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
+def _fields_of_some(
+    blocks: Sequence[MagnetBlock], points: Floats, order: int
+) -> Iterator[Floats]:
     frames = [frame_of(block) for block in blocks]
     groups: dict[tuple[object, ...], list[int]] = {}
     for number, frame in enumerate(frames):
@@ -84,7 +93,7 @@ def _fields_of_some(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     for shape, members in groups.items():
         seen = np.vstack([frames[number].local(points)[0] for number in members])
         union, inverse = unique_points(seen)
-        fields[shape] = unit_field(_in_frame(blocks[members[0]], frames[members[0]]), union)
+        fields[shape] = unit_field(_in_frame(blocks[members[0]], frames[members[0]]), union, order)
         places.update(zip(members, inverse.reshape(len(members), len(points)), strict=True))
     for number, frame in enumerate(frames):
         yield frame.unfold(fields[frame.shape][places[number]], frame.local(points)[1])
@@ -103,12 +112,34 @@ def _in_frame(block: MagnetBlock, frame: Frame) -> MagnetBlock:
                    z_max=block.z_max - frame.centre)
 
 
-def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
+def field_of(blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER) -> Floats:
     """Field in vacuum of blocks with their nominal remanence, (n, 3) in T."""
     total = np.zeros((len(points), 3))
-    for block, field in zip(blocks, unit_fields(blocks, points), strict=True):
+    for block, field in zip(blocks, unit_fields(blocks, points, order), strict=True):
         total += field @ (np.array(block.easy_axis) * block.remanence)
     return total
+
+
+def gradient_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
+    """Gradient of `field_of` at points (n, 3) in m off the blocks, (n, 3, 3) in T/m.
+
+    ``[i, c, k]`` is the derivative of component c along k, to 1e-4 at a hundredth of the radius
+    from a block: for the scale of a noise. By central differences, radially and azimuthally, for
+    which points on circles share integrals; along z by curl B = 0 and div B = 0.
+    """
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    zero = np.zeros(len(points))
+    radial = np.column_stack([np.cos(angle), np.sin(angle), zero])
+    azimuthal = np.column_stack([-np.sin(angle), np.cos(angle), zero])
+    step = _STEP * max(edge.radius for block in blocks for edge in block.outline)
+    places = [points + sign * step * along for along in (radial, azimuthal) for sign in (1, -1)]
+    fields = field_of(blocks, np.vstack(places), order=4).reshape(2, 2, len(points), 3)
+    by_radius, by_angle = (fields[:, 0] - fields[:, 1]) / (2 * step)
+    expansion = np.sum(by_radius * radial + by_angle * azimuthal, axis=1)
+    by_z = by_radius[:, 2:] * radial + by_angle[:, 2:] * azimuthal
+    by_z[:, 2] = -expansion
+    return (by_radius[:, :, None] * radial[:, None] + by_angle[:, :, None] * azimuthal[:, None]
+            + by_z[:, :, None] * np.eye(3)[2])
 
 
 def demagnetizing_tensors(blocks: Sequence[MagnetBlock]) -> list[Floats]:

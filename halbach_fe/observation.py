@@ -6,6 +6,7 @@ by point) into readings: a selection for flux densities, a Fourier analysis for 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,18 @@ import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
-from halbach_fe.study import COMPONENTS, FourierCoefficients, Noise, Positions, Study
+from halbach_fe.exact_field import gradient_of
+from halbach_fe.inference.noise import Noise
+from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
+from halbach_fe.study import Noise as NoiseSettings
+
+RADIUS_M = 1e-4
+"""How well a radius is met: maps have rounded coordinates, and circles lie farther apart."""
+
+ROUNDING = 1e-12
+"""Correlations below it are none: sums over a circle's points cancel to 1e-15."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +40,7 @@ class Observation:
     labels : tuple of str
         Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
     positions : ndarray, shape (readings, 3), in m
-        Where each reading belongs; a circle's centre for a Fourier coefficient.
+        Where each reading belongs; for a Fourier coefficient where its circle begins, at angle 0.
     """
 
     points: Floats
@@ -40,6 +50,16 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """x, y or z of each reading; nothing for a Fourier coefficient."""
+        return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
+
+    @property
+    def radii(self) -> Floats:
+        """Distance of each reading from the z axis, (readings,) in m: of its point or circle."""
+        return np.hypot(self.positions[:, 0], self.positions[:, 1])
 
     def apply(self, fields: Floats) -> Floats:
         """Readings of fields (..., n, 3) in T; shape (..., readings)."""
@@ -52,9 +72,17 @@ class Observation:
         """
         if self.operator.nnz == len(self):  # one component at one point each
             return np.linalg.norm(field, axis=1)[self.operator.indices // len(COMPONENTS)]
-        circles = len(np.unique(self.positions[:, 2]))
-        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K
+        harmonics = int(self.labels[-1][1:])
+        parts = self.apply(field).reshape(-1, 2, harmonics)  # A_1 ... A_K, B_1 ... B_K of each
         return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
+
+
+def together(one: Observation, other: Observation) -> Observation:
+    """The readings of two maps, one after the other."""
+    return Observation(
+        np.vstack([one.points, other.points]),
+        sparse.csr_array(sparse.block_diag([one.operator, other.operator])),
+        one.labels + other.labels, np.vstack([one.positions, other.positions]))
 
 
 def points_from(positions: Positions) -> Floats:
@@ -65,8 +93,10 @@ def points_from(positions: Positions) -> Floats:
         return np.array(positions.points_m, float)
     angle = 2 * np.pi * np.arange(positions.angles) / positions.angles
     z = np.linspace(positions.z_min_m, positions.z_max_m, positions.count)
-    circle = positions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.column_stack([np.tile(circle, (len(z), 1)), np.repeat(z, len(circle))])
+    radii = np.array(positions.radius_m)
+    circles = radii[:, None, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.tile(circles, (1, len(z), 1)).reshape(-1, 2),
+                            np.tile(np.repeat(z, len(angle)), len(radii))])
 
 
 def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observation:
@@ -97,32 +127,38 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
     return fourier_of(points, study.observation)
 
 
-def circles(points: Floats, settings: FourierCoefficients) -> list[NDArray[np.int64]]:
-    """Group points into full circles of the study's radius; indices by angle, one row a circle.
+def circles(
+    points: Floats, settings: FourierCoefficients
+) -> list[tuple[float, NDArray[np.int64]]]:
+    """Group points into full circles of the study's radii: for each its radius in m and the
+    indices of its points by angle.
 
     Raises
     ------
     MeasurementError
         If the points are not circles of equally spaced points about the z axis.
     """
-    radius = settings.positions.radius_m
-    if not np.allclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=1e-6):
+    radii = np.array(settings.positions.radius_m)
+    on_circle = np.isclose(np.hypot(points[:, 0], points[:, 1])[:, None], radii, rtol=1e-6)
+    if not on_circle.any(axis=1).all():
         raise MeasurementError(must_be(
-            "points", "map", f"on circles of radius {radius:g} m, as the study's Fourier "
-            "coefficients need", "points at other radii", "Observe flux_density instead."))
+            "points", "map", f"on circles of radius {', '.join(f'{one:g}' for one in radii)} m, "
+            "as the study's Fourier coefficients need", "points at other radii",
+            "Observe flux_density instead."))
     found = []
-    for z in np.unique(np.round(points[:, 2], 9)):
-        index = np.flatnonzero(np.abs(points[:, 2] - z) < 1e-9)
+    own = radii[np.argmax(on_circle, axis=1)]
+    for radius, z in np.unique(np.column_stack([own, np.round(points[:, 2], 9)]), axis=0):
+        index = np.flatnonzero((own == radius) & (np.abs(points[:, 2] - z) < 1e-9))
         angle = np.arctan2(points[index, 1], points[index, 0]) % (2 * np.pi)
         order = np.argsort(angle)
         steps = np.diff(angle[order], append=angle[order][0] + 2 * np.pi)
         if len(index) <= 2 * settings.harmonics or not np.allclose(
                 steps, 2 * np.pi / len(index), atol=1e-6):
             raise MeasurementError(must_be(
-                f"circle at z = {z:g} m", "map",
+                f"circle of radius {radius:g} m at z = {z:g} m", "map",
                 f"more than {2 * settings.harmonics} equally spaced points", f"{len(index)} points"
             ))
-        found.append(index[order])
+        found.append((float(radius), index[order]))
     return found
 
 
@@ -132,7 +168,7 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
     rows, columns, values = [], [], []
     labels: list[str] = []
     positions = []
-    for index in circles(points, settings):
+    for radius, index in circles(points, settings):
         angle = np.arctan2(points[index, 1], points[index, 0])
         wave = np.vstack([np.cos(np.outer(order, angle)), np.sin(np.outer(order, angle))])
         wave *= 2 / len(index)
@@ -141,54 +177,125 @@ def fourier_of(points: Floats, settings: FourierCoefficients) -> Observation:
             columns.append(np.tile(3 * index + axis, len(wave)))
             rows.append(len(labels) + np.repeat(np.arange(len(wave)), len(index)))
         labels += [f"A{k}" for k in order] + [f"B{k}" for k in order]
-        positions += [(0.0, 0.0, points[index[0], 2])] * (2 * len(order))
+        positions += [(radius, 0.0, points[index[0], 2])] * (2 * len(order))
     operator = sparse.csr_array(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(len(labels), 3 * len(points)))
     return Observation(points, operator, tuple(labels), np.array(positions))
 
 
-def noise_regions(noise: Noise, z: Floats) -> NDArray[np.int64]:
-    """Index of the noise region of each z in m: the first whose window holds it.
+def noise_regions(
+    noise: NoiseSettings, z: Floats, components: Sequence[str]
+) -> NDArray[np.int64]:
+    """Index of the noise region of each reading, at z in m and of a component: the first that
+    fits.
 
     Raises
     ------
     StudyError
-        If some z is in none.
+        If some reading is in none.
     """
     region = np.full(len(z), -1)
     for number, window in reversed(list(enumerate(noise.regions))):
         low = -np.inf if window.z_min_m is None else window.z_min_m
         high = np.inf if window.z_max_m is None else window.z_max_m
-        region[(z >= low) & (z <= high)] = number
+        region[(z >= low) & (z <= high) & np.isin(components, ["", *window.components])] = number
     if (region < 0).any():
+        first = int(np.argmin(region))
+        which = f", component {components[first]}," if components[first] else ""
         raise StudyError(
             f"Input `noise.regions` of study must cover every reading; instead z = "
-            f"{z[np.argmin(region)]:g} m is in none. Add a last region without limits.")
+            f"{z[first]:g} m{which} is in none. Add a last region without limits.")
     return region
 
 
-def standard_deviations(study: Study, observation: Observation, data: xr.Dataset) -> Floats:
-    """Noise of each reading (readings,) in T: from the map where it says, else by region.
+def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> Noise:
+    """Noise of the readings: of the map's points where it says, else by region; and in both cases
+    what uncertain positions add.
 
-    For Fourier coefficients a map's own point noise is propagated; the regions' sigma is that of
-    the coefficients themselves.
+    For Fourier coefficients the noise of points is propagated, with the correlations that it
+    leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
+    coefficients themselves.
     """
+    settings = study.noise
     if "sigma_T" in data:
-        variance = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
-        return np.sqrt(np.asarray((observation.operator**2) @ variance))
-    if study.noise is None:
+        points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
+        operator = observation.operator
+        covariance = operator @ sparse.diags_array(points) @ operator.T
+    elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
             "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
-    sigma = np.array([region.sigma_T for region in study.noise.regions])
-    return sigma[noise_regions(study.noise, observation.positions[:, 2])]
+    else:
+        sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
+            settings, observation.positions[:, 2], observation.components)]
+        covariance = sparse.diags_array(sigma**2)
+    if settings is not None and settings.position_sd_m is not None:
+        moved = _displacement(study, observation, np.array(settings.position_sd_m))
+        covariance = covariance + moved @ moved.T
+    return Noise(_without_rounding(sparse.csr_array(covariance)))
 
 
-def held_out(study: Study, z: Floats) -> NDArray[np.bool_]:
-    """Tell which readings at heights z (n,) in m the study keeps from the update."""
+def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+    """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
+    (3,) in m along each axis.
+
+    The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
+    the bore some per cent of the field, is left out of this scale of the noise.
+    """
+    gradient = gradient_of(blocks_of(study), observation.points) * sd
+    number = np.arange(len(gradient) + 1)
+    return sparse.csr_array(
+        observation.operator @ sparse.bsr_array((gradient, number[:-1], number)))
+
+
+def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
+    """The covariance without correlations below `ROUNDING`: equal noise all around a circle leaves
+    its coefficients independent.
+    """
+    entries = covariance.tocoo()
+    rows, columns = entries.coords
+    variance = covariance.diagonal()
+    kept = np.abs(entries.data) > ROUNDING * np.sqrt(variance[rows] * variance[columns])
+    return sparse.csr_array((entries.data[kept], (rows[kept], columns[kept])),
+                            shape=covariance.shape)
+
+
+def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:
+    """Tell which readings the study keeps from the update, (readings,).
+
+    Raises
+    ------
+    MeasurementError
+        If a key of the study holds out none, or all together hold out all.
+    """
     settings = study.inference.held_out
+    chosen = np.zeros(len(observation), bool)
     if settings is None:
-        return np.zeros(len(z), bool)
-    _, rank = np.unique(np.round(z, 9), return_inverse=True)
-    return np.asarray((rank // settings.window) % settings.every == settings.every - 1)
+        return chosen
+    z = observation.positions[:, 2]
+    if settings.every is not None:
+        _, rank = np.unique(np.round(z, 9), return_inverse=True)
+        chosen = (rank // settings.window) % settings.every == settings.every - 1
+        if not chosen.any():
+            raise MeasurementError(must_be(
+                "readings", "map", "at enough z positions for the study to hold some out",
+                f"{rank.max() + 1} positions",
+                "Remove inference.held_out, or make its window smaller."))
+    named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, RADIUS_M)
+             for radius in settings.radii_m}
+    named |= {f"components = {one}": np.array(observation.components) == one
+              for one in settings.components}
+    named |= {f"z_ranges_m = {low:g}, {high:g}": (z >= low) & (z <= high)
+              for low, high in settings.z_ranges_m}
+    for name, mask in named.items():
+        if not mask.any():
+            raise MeasurementError(must_be(
+                "readings", "map", f"such that `inference.held_out.{name}` holds some of them out",
+                "none", "Correct or remove it."))
+        chosen = chosen | mask
+    if chosen.all():
+        raise MeasurementError(must_be(
+            "readings", "map", "enough for the study to leave some for the update",
+            f"{len(chosen)}, all held out", "Change inference.held_out."))
+    return chosen

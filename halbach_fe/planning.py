@@ -13,8 +13,9 @@ from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import StudyError
 from halbach_fe.inference.design import greedy, information
 from halbach_fe.inference.linear import posterior
+from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian, block_prior
-from halbach_fe.observation import observe, points_from, standard_deviations
+from halbach_fe.observation import observe, points_from, reading_noise
 from halbach_fe.response import response
 from halbach_fe.routes import check_points
 from halbach_fe.solve import Workshop
@@ -104,13 +105,13 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
         raise StudyError(str(error).replace("observation.positions", "plan.candidates")) from None
     points = np.vstack([baseline, candidates])
     observation = observe(study, points, np.ones_like(points, bool))
-    noise = standard_deviations(study, observation, xr.Dataset())
+    noise = reading_noise(study, observation, xr.Dataset())
     model = response(study, observation, workshop)
+    errors = noise.plus(model.error)
     prior = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
-    sigma = np.hypot(noise, model.error)
-    size = len(observation) // len(points)  # readings at a point
-    whitened = ((model.matrix @ prior.root) / sigma[:, None]).reshape(len(points), size, -1)
+    size = len(observation) // len(points)  # readings at a point, which alone may be correlated
+    whitened = errors.whiten(model.matrix @ prior.root).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)
     same = min(wanted, len(baseline))
     counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))
@@ -120,7 +121,7 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
 
     def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
-        return _posterior(model.matrix[index], sigma[index], prior).sd
+        return _posterior(model.matrix[index], errors.part(index), prior).sd
 
     return MeasurementPlan(
         model.parameters, candidates, candidates[chosen], baseline, gain, counts, np.array(own),
@@ -133,6 +134,6 @@ def spread(total: int, count: int) -> Ints:
     return np.floor(np.arange(count) * total / count).astype(int)
 
 
-def _posterior(matrix: Floats, sigma: Floats, prior: Gaussian) -> Gaussian:
+def _posterior(matrix: Floats, noise: Noise, prior: Gaussian) -> Gaussian:
     """What remains to be known; it does not depend on the readings."""
-    return posterior(matrix, matrix @ prior.mean, sigma, prior)
+    return posterior(matrix, matrix @ prior.mean, noise, prior)

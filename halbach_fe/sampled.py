@@ -120,10 +120,9 @@ def sample_posterior(
     model = nonlinear_model(update.study, update.observation, workshop,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
-    sigma = np.hypot(update.noise, model.error)
-    tolerance = max(SMALLEST_TOLERANCE_T,
-                    LIKELIHOOD_ERROR * float(sigma[train].min()) / int(train.sum()))
-    target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], sigma[train],
+    errors = update.noise.plus(model.error).part(train)
+    tolerance = max(SMALLEST_TOLERANCE_T, LIKELIHOOD_ERROR * errors.finest / len(errors))
+    target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], errors,
                        update.prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
     generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
@@ -148,12 +147,13 @@ def sample_posterior(
     flat = kept.reshape(-1, kept.shape[2])
     chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
     predicted = model(chosen, tolerance)
+    spread = (predicted - predicted.mean(axis=0)) / np.sqrt(len(predicted))
     some = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
     agreement = verify(model, update.study, update.observation, workshop, some)
     return Sampled(
         kept, model.parameters, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
-        Prediction(predicted.mean(axis=0), predicted.std(axis=0)))
+        Prediction(predicted.mean(axis=0), predicted.std(axis=0), lambda rows: spread[:, rows].T))
 
 
 @dataclass
@@ -178,10 +178,11 @@ def _key(update: Update, model: NonlinearModel, chains: int, seed: int) -> str:
     """Digest of all that the chains depend on, but their length."""
     digest = hashlib.sha256(f"{chains} {seed}".encode() + code_digest())
     iron = model.condensed
-    for part in (update.readings, update.noise, update.held_out, update.prior.mean,
-                 update.prior.root, model.error, iron.linear, iron.readings, iron.potential,
-                 iron.weights, iron.stiffness.data, iron.gradient.data, iron.law.squares,
-                 iron.law.values):
+    noise = update.noise.covariance
+    for part in (update.readings, noise.data, noise.indices, noise.indptr, update.held_out,
+                 update.prior.mean, update.prior.root, model.error, iron.linear, iron.readings,
+                 iron.potential, iron.weights, iron.stiffness.data, iron.gradient.data,
+                 iron.law.squares, iron.law.values):
         digest.update(np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
 

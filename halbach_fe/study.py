@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from halbach_fe import materials
 from halbach_fe.errors import StudyError, must_be
@@ -37,8 +37,15 @@ Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
 RecoilPermeability = Annotated[float, Field(ge=1.0, le=2.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
+PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+def _one_or_list(kind: Any) -> BeforeValidator:
+    """Let a single value stand for a list of one."""
+    return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
+                           json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
 
 
 class _Model(BaseModel):
@@ -257,10 +264,12 @@ class LinePositions(_Model):
 
 
 class CirclePositions(_Model):
-    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z."""
+    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z, of one
+    radius or of each of several.
+    """
 
     kind: Literal["circles"]
-    radius_m: Length
+    radius_m: Annotated[tuple[Length, ...], Field(min_length=1), _one_or_list(Length)]
     angles: Annotated[int, Field(ge=1, le=10_000)]
     z_min_m: Coordinate = 0.0
     z_max_m: Coordinate = 0.0
@@ -274,6 +283,8 @@ class CirclePositions(_Model):
                 f"z_max_m = {self.z_max_m} make no sense; one circle needs equal limits, "
                 "several need z_min_m < z_max_m"
             )
+        if len(set(self.radius_m)) < len(self.radius_m):
+            raise ValueError(f"radius_m must name each radius once, but is {self.radius_m}")
         return self
 
 
@@ -318,14 +329,16 @@ Observation = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="
 
 
 class NoiseRegion(_Model):
-    """A z window with one standard deviation per reading. The first region that fits is used.
+    """A z window with one standard deviation per reading, of all components or of some.
 
-    A limit that is left out is none.
+    The first region that fits a reading is used. A limit that is left out is none. Regions of one
+    name are one region in reports.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
     z_min_m: Coordinate | None = None
     z_max_m: Coordinate | None = None
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
     sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
 
     @model_validator(mode="after")
@@ -336,9 +349,25 @@ class NoiseRegion(_Model):
 
 
 class Noise(_Model):
-    """Measurement noise by region; a map that carries its own sigma overrides it."""
+    """Measurement noise by region, which a map that carries its own sigma overrides, and what the
+    positions add to either.
 
-    regions: Annotated[tuple[NoiseRegion, ...], Field(min_length=1)]
+    ``position_sd_m`` is how far each point may be from where the map has it, along x, y and z
+    (one value: the same along each). It moves a reading by the local gradient of the nominal
+    field, all components of a point together: much in the fringe, little in the homogeneous field.
+    """
+
+    regions: tuple[NoiseRegion, ...] = ()
+    position_sd_m: Annotated[tuple[PositionSd, ...], _one_or_list(PositionSd)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Noise:
+        if not self.regions and self.position_sd_m is None:
+            raise ValueError("give regions, position_sd_m, or both")
+        if self.position_sd_m is not None and len(self.position_sd_m) not in (1, 3):
+            raise ValueError(f"position_sd_m must be one value or three, for x, y and z, not "
+                             f"{len(self.position_sd_m)}")
+        return self
 
 
 class Prior(_Model):
@@ -374,14 +403,34 @@ class Prior(_Model):
 
 
 class HeldOut(_Model):
-    """Which readings are kept from the update and only predicted.
+    """Which readings are kept from the update and only predicted: all that any key names.
 
     Readings are grouped in runs of ``window`` consecutive z positions; the last of every
-    ``every`` runs is held out.
+    ``every`` runs is held out (without any key: of every 2). ``radii_m`` are distances from the
+    axis, ``z_ranges_m`` pairs of limits.
     """
 
-    every: Annotated[int, Field(ge=2, le=1000)] = 2
+    every: Annotated[int, Field(ge=2, le=1000)] | None = None
     window: Annotated[int, Field(ge=1, le=100_000)] = 1
+    radii_m: tuple[Gap, ...] = ()
+    components: tuple[Component, ...] = ()
+    z_ranges_m: tuple[tuple[Coordinate, Coordinate], ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _windows(cls, given: Any) -> Any:
+        alone = isinstance(given, dict) and not given.keys() - {"window"}
+        return given | {"every": 2} if alone else given
+
+    @model_validator(mode="after")
+    def _consistent(self) -> HeldOut:
+        if self.every is None and self.window > 1:
+            raise ValueError("window needs every: the last of how many windows is held out?")
+        for low, high in self.z_ranges_m:
+            if low > high:
+                raise ValueError(f"z_ranges_m must be pairs of a lower and an upper limit, not "
+                                 f"[{low}, {high}]")
+        return self
 
 
 class Inference(_Model):
@@ -440,6 +489,14 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
+        by_component = {
+            "noise.regions": any(set(one.components) != set(COMPONENTS) for one in regions),
+            "inference.held_out": bool(held_out and held_out.components)}
+        for key, named in by_component.items():
+            if named and self.observation.quantity == "fourier_coefficients":
+                raise ValueError(f"{key} may name components of flux_density only; Fourier "
+                                 "coefficients have none")
         slots = sorted(slot for one in self.prior.types.values() for slot in one)
         if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
             raise ValueError(f"prior.types must name every slot from 1 to "
@@ -586,6 +643,7 @@ def _more(errors: list[Any]) -> str:
 def _unit_hint(key: str, value: float) -> str:
     """Guess a unit that is wrong by a factor of 1000."""
     wrong = {"_m": "millimetres", "_T": "millitesla"}
+    key = key.partition("[")[0] if key.endswith("]") else key
     for suffix, unit in wrong.items():
         if key.endswith(suffix) and abs(value) > 1:
             return f"Was it meant in {unit}? Then write {value / 1000:g}."

@@ -134,10 +134,12 @@ class _Comparison:
                 quantity="fourier_coefficients", positions=positions,
                 harmonics=min(wanted, (positions.angles - 1) // 2)))
         self._regions = {"all": np.ones(len(points), bool)}
-        if study.noise is not None:
-            index = noise_regions(study.noise, points[:, 2])
-            self._regions = {region.name: index == number
-                             for number, region in enumerate(study.noise.regions)}
+        if study.noise is not None and study.noise.regions:
+            names = getattr(study.observation, "components", ("",))
+            index = noise_regions(study.noise, np.repeat(points[:, 2], len(names)),
+                                  names * len(points)).reshape(len(points), -1)
+            regions = np.array([region.name for region in study.noise.regions])[index]
+            self._regions = {name: (regions == name).any(axis=1) for name in np.unique(regions)}
 
     def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
         change = np.linalg.norm(one - two, axis=1) / self.scale

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from halbach_fe.blocks import Floats, Ints
+from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian
 
 Sampler = Callable[[Floats, np.random.Generator], Floats]
@@ -23,7 +24,7 @@ BINS = 10
 
 
 def ranks(
-    prior: Gaussian, model: Callable[[Floats], Floats], sigma: Floats, sampler: Sampler,
+    prior: Gaussian, model: Callable[[Floats], Floats], noise: Noise, sampler: Sampler,
     repeats: int, generator: np.random.Generator,
     say: Callable[[int], None] = lambda number: None,
 ) -> tuple[Ints, int]:
@@ -32,7 +33,7 @@ def ranks(
     draws = np.empty((0, 0))
     for number in range(repeats):
         truth = prior.sample(1, generator)[0]
-        readings = model(truth) + sigma * generator.standard_normal(len(sigma))
+        readings = model(truth) + noise.sample(generator)
         draws = sampler(readings, generator)
         found.append((draws < truth).sum(axis=0))
         say(number + 1)

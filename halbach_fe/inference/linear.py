@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg as linalg
 
 from halbach_fe.blocks import Floats
+from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian
 
 READINGS_AT_ONCE = 8192
@@ -50,42 +51,44 @@ class LinearPosterior:
     conflict: float
 
 
-def update(matrix: Floats, readings: Floats, sigma: Floats, prior: Gaussian) -> LinearPosterior:
+def update(matrix: Floats, readings: Floats, noise: Noise, prior: Gaussian) -> LinearPosterior:
     """Update a prior with readings q = H p + noise.
 
     Parameters
     ----------
     matrix : ndarray, shape (n, m)
         H.
-    readings, sigma : ndarray, shape (n,)
-        q and the standard deviation of its independent noise.
+    readings : ndarray, shape (n,)
+        q.
+    noise : Noise
+        Of the n readings.
     prior : Gaussian
         Of the m parameters.
     """
-    residual = (readings - matrix @ prior.mean) / sigma
-    product, right = _normal(matrix, residual, sigma)
+    residual = noise.whiten(readings - matrix @ prior.mean)
+    product, right = _normal(matrix, residual, noise)
     precision = np.eye(prior.root.shape[1]) + prior.root.T @ product @ prior.root
     if np.abs(precision).sum(axis=0).max() < WORST_CONDITION:
         factor = linalg.cholesky(precision)  # upper
         half = linalg.solve_triangular(factor, prior.root.T @ right, trans="T")
     else:
-        whitened = (matrix @ prior.root) / sigma[:, None]
+        whitened = noise.whiten(matrix @ prior.root)
         q, factor = linalg.qr(np.vstack([whitened, np.eye(len(precision))]), mode="economic")
         half = q[:len(readings)].T @ residual
     # cov(z) = (R'R)^-1, so R^-1 is a root of it
     root = linalg.solve_triangular(factor, prior.root.T, trans="T").T
     inverse = linalg.solve_triangular(factor, np.eye(len(factor)))
     chi2 = float(residual @ residual - half @ half)
-    log_size = float(np.log(np.abs(np.diag(factor))).sum() + np.log(sigma).sum()
+    log_size = float(np.log(np.abs(np.diag(factor))).sum() + noise.log_size
                      + len(readings) / 2 * np.log(2 * np.pi))
     return LinearPosterior(
         Gaussian(prior.mean + root @ half, root), -chi2 / 2 - log_size,
         len(factor) - float((inverse**2).sum()), chi2 / len(readings))
 
 
-def posterior(matrix: Floats, readings: Floats, sigma: Floats, prior: Gaussian) -> Gaussian:
+def posterior(matrix: Floats, readings: Floats, noise: Noise, prior: Gaussian) -> Gaussian:
     """The distribution that `update` finds."""
-    return update(matrix, readings, sigma, prior).distribution
+    return update(matrix, readings, noise, prior).distribution
 
 
 def contraction(prior: Gaussian, after: Gaussian, size: int) -> Floats:
@@ -96,13 +99,13 @@ def contraction(prior: Gaussian, after: Gaussian, size: int) -> Floats:
     return np.asarray(1 - now / before)
 
 
-def _normal(matrix: Floats, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+def _normal(matrix: Floats, residual: Floats, noise: Noise) -> tuple[Floats, Floats]:
     """H' Sigma^-1 H (m, m) and H' Sigma^-1/2 r (m,), r being whitened."""
     product = np.zeros((matrix.shape[1], matrix.shape[1]))
     right = np.zeros(matrix.shape[1])
     for first in range(0, len(matrix), READINGS_AT_ONCE):
         part = slice(first, first + READINGS_AT_ONCE)
-        whitened = matrix[part] / sigma[part, None]
+        whitened = noise.whiten(matrix, part)
         product += whitened.T @ whitened
         right += whitened.T @ residual[part]
     return product, right
@@ -117,10 +120,26 @@ def predict(matrix: Floats, parameters: Gaussian) -> tuple[Floats, Floats]:
     return mean, np.sqrt(variance)
 
 
-def chi2_per_reading(readings: Floats, sigma: Floats, mean: Floats, sd: Floats) -> float:
-    """Mean squared error of a prediction (mean and sd) over its variance and the noise's, about 1
-    if all is well.
+def whitened(residual: Floats, noise: Noise, root: Floats) -> Floats:
+    """Residuals of a prediction, whitened by its covariance and the noise's, (n,): independent and
+    standard normal if all is well.
 
-    For readings that the model has not seen; those that it was fitted to lie nearer.
+    Of all roots of the inverse of ``Sigma + R R'`` it is, after W, the symmetric one,
+    ``(I + A A')^-1/2`` with A = W R: the nearest to the residual that each reading has by itself.
+    By the eigenvectors of A'A it takes the time of one update, however many the readings.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        Measured less predicted. Of readings that the model has not seen; those that it was fitted
+        to lie nearer.
+    noise : Noise
+    root : ndarray, shape (n, k)
+        Root of the covariance of the prediction.
     """
-    return float(np.mean((readings - mean) ** 2 / (sd**2 + sigma**2)))
+    own, spread = noise.whiten(residual), noise.whiten(root)
+    squares, vectors = linalg.eigh(spread.T @ spread)
+    size = np.sqrt(1 + np.maximum(squares, 0))
+    # 1/size - 1, over squares
+    return np.asarray(own - spread @ (vectors @ (
+        (vectors.T @ (spread.T @ own)) / (size * (1 + size)))))

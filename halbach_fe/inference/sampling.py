@@ -22,6 +22,7 @@ import scipy.linalg as linalg
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import SamplingError
+from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian
 
 Model = Callable[[Floats], Floats]
@@ -40,20 +41,21 @@ class Posterior:
     ----------
     model : callable
         Parameters (m,) to readings (n,) in T.
-    readings, sigma : ndarray, shape (n,)
+    readings : ndarray, shape (n,)
+    noise : Noise
     prior : Gaussian
     """
 
     model: Model
     readings: Floats
-    sigma: Floats
+    noise: Noise
     prior: Gaussian
     solves: int = field(default=0, init=False)
 
     def log_likelihood(self, parameters: Floats) -> float:
         """Without the constant."""
         self.solves += 1
-        residual = (self.model(parameters) - self.readings) / self.sigma
+        residual = self.noise.whiten(self.model(parameters) - self.readings)
         return -float(residual @ residual) / 2
 
 
@@ -115,8 +117,8 @@ def laplace(
     value = objective(z)
     for _ in range(MAX_GAUSS_NEWTON):
         parameters = prior.mean + prior.root @ z
-        whitened = jacobian(parameters) @ prior.root / posterior.sigma[:, None]
-        residual = (posterior.readings - posterior.model(parameters)) / posterior.sigma
+        whitened = posterior.noise.whiten(jacobian(parameters) @ prior.root)
+        residual = posterior.noise.whiten(posterior.readings - posterior.model(parameters))
         factor = linalg.cholesky(np.eye(len(z)) + whitened.T @ whitened)  # upper
         step = linalg.cho_solve((factor, False), whitened.T @ residual - z)
         if np.linalg.norm(factor @ step) < MODE_TOLERANCE:

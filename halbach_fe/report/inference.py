@@ -20,7 +20,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.update import COVERAGE_Z, HELD_OUT, Update
+from halbach_fe.update import COVERAGE_Z, Update
 
 NOTHING = "–"
 
@@ -107,8 +107,7 @@ def _percent(value: float | None) -> str:
 
 
 def _z_of(update: Update, region: str, part: str) -> Floats:
-    mask = (np.array(update.regions) == region) & (update.held_out == (part == HELD_OUT))
-    return update.observation.positions[mask, 2]
+    return update.observation.positions[update.chosen(region, part), 2]
 
 
 def _first_label(update: Update) -> tuple[str, Floats, np.ndarray[tuple[int], np.dtype[np.intp]]]:

@@ -22,6 +22,7 @@ from halbach_fe.cli import common
 from halbach_fe.errors import CheckFailedError
 from halbach_fe.inference import linear
 from halbach_fe.inference.calibration import ranks, uniformity
+from halbach_fe.inference.noise import independent
 from halbach_fe.inference.prior import block_prior
 from halbach_fe.inference.sampling import Move, Posterior, laplace, prior_reference, sample
 from halbach_fe.nonlinear import nonlinear_model
@@ -53,14 +54,14 @@ def run(arguments: argparse.Namespace) -> int:
         model = nonlinear_model(study, observation, replace(
             workshop, folder=workshop.folder / "model"), generator)
     prior = block_prior(model.nominal, 2, 0.01, 1.0)
-    sigma = np.full(len(observation), SIGMA_T)
+    noise = independent(np.full(len(observation), SIGMA_T))
     tangent = model.jacobian(model.nominal)
 
     def closed_form(readings: Floats, generator: np.random.Generator) -> Floats:
-        return linear.posterior(tangent, readings, sigma, prior).sample(DRAWS, generator)
+        return linear.posterior(tangent, readings, noise, prior).sample(DRAWS, generator)
 
     def target(readings: Floats) -> Posterior:
-        return Posterior(lambda p: model(p, TOLERANCE_T), readings, sigma, prior)
+        return Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
 
     def chains(readings: Floats, generator: np.random.Generator) -> Floats:
         posterior = target(readings)
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     results, found = {}, {}
     for name, (forward, sampler, repeats, good) in cases.items():
         common.say(f"{name}: {repeats} truths")
-        found[name], draws = ranks(prior, forward, sigma, sampler, repeats, generator)
+        found[name], draws = ranks(prior, forward, noise, sampler, repeats, generator)
         values, together = uniformity(found[name], draws)
         results[name] = {"repeats": repeats, "p_value": together,
                          "smallest_p_of_a_parameter": float(values.min()),

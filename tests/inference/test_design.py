@@ -46,7 +46,7 @@ def test_greedy_is_near_the_best(generator):
 def test_plan_in_a_cross_section(dipole, workshop):
     """Equally spaced points are as good as any on one circle; nearer to the blocks is better."""
     def circles(*radii):
-        return [{"kind": "circles", "radius_m": radius, "angles": 48} for radius in radii]
+        return [{"kind": "circles", "radius_m": radii, "angles": 48}]
 
     study = dipole(noise=NOISE, observation__components=["x", "y"],
                    plan={"candidates": circles(0.075), "points": 12})

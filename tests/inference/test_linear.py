@@ -8,19 +8,14 @@ from scipy import stats
 
 from halbach_fe.errors import StudyError
 from halbach_fe.inference import linear
-from halbach_fe.inference.linear import (
-    chi2_per_reading,
-    contraction,
-    posterior,
-    predict,
-    update,
-)
+from halbach_fe.inference.linear import contraction, posterior, predict, update, whitened
+from halbach_fe.inference.noise import independent
 from halbach_fe.inference.prior import Gaussian, block_prior
 
 
-def textbook(matrix, readings, sigma, prior):
+def textbook(matrix, readings, noise, prior):
     """C_1 = (H' S^-1 H + C_0^-1)^-1 and its mean, as printed; sound only for tame numbers."""
-    weight = matrix.T / sigma**2
+    weight = matrix.T @ np.linalg.inv(noise.covariance.toarray())
     precision = np.linalg.inv(prior.covariance)
     covariance = np.linalg.inv(weight @ matrix + precision)
     return covariance @ (weight @ readings + precision @ prior.mean), covariance
@@ -30,12 +25,12 @@ def problem(generator, n=12, m=5):
     root = np.eye(m) + 0.2 * generator.standard_normal((m, m))
     prior = Gaussian(generator.standard_normal(m), root)
     matrix, sigma = generator.standard_normal((n, m)), generator.uniform(0.1, 0.5, n)
-    return matrix, generator.standard_normal(n), sigma, prior
+    return matrix, generator.standard_normal(n), independent(sigma), prior
 
 
 def test_one_reading_of_one_parameter():
     """Prior 1 +- 2, reading 5 +- 1 of it: mean (1/4 + 5)/(1/4 + 1), variance 1/(1/4 + 1)."""
-    found = posterior(np.array([[1.0]]), np.array([5.0]), np.array([1.0]),
+    found = posterior(np.array([[1.0]]), np.array([5.0]), independent(np.ones(1)),
                       Gaussian(np.array([1.0]), np.array([[2.0]])))
     assert found.mean == pytest.approx([5.25 / 1.25])
     assert found.sd == pytest.approx([1 / np.sqrt(1.25)])
@@ -60,7 +55,7 @@ def test_against_brute_force_sampling(generator):
     mean = weight @ draws
     spread = np.sqrt(weight @ (draws - mean) ** 2)
     effective = 1 / np.sum(weight**2)
-    found = posterior(matrix, readings, sigma, prior)
+    found = posterior(matrix, readings, independent(sigma), prior)
     assert effective > 10_000
     assert np.all(np.abs(mean - found.mean) < 5 * found.sd / np.sqrt(effective))
     assert spread == pytest.approx(found.sd, rel=5 / np.sqrt(effective))
@@ -73,9 +68,9 @@ def test_sound_where_the_textbook_formula_breaks(generator):
     prior = Gaussian(np.zeros(2), np.eye(2))
     matrix = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]])
     truth = np.array([0.3, -0.2])
-    found = posterior(matrix, matrix @ truth, np.full(2, 1e-12), prior)
+    found = posterior(matrix, matrix @ truth, independent(np.full(2, 1e-12)), prior)
     np.testing.assert_allclose(found.mean, truth, atol=1e-5)
-    wrong, _ = textbook(matrix, matrix @ truth, np.full(2, 1e-12), prior)
+    wrong, _ = textbook(matrix, matrix @ truth, independent(np.full(2, 1e-12)), prior)
     assert np.abs(wrong - truth).max() > 1e-5
 
 
@@ -84,14 +79,14 @@ def test_singular_prior_is_respected(generator):
     nominal = np.array([1.0, 0.0, 0.0, 2.0])
     prior = Gaussian(nominal, 0.1 * nominal[:, None])
     found = posterior(generator.standard_normal((3, 4)), generator.standard_normal(3),
-                      np.ones(3), prior)
+                      independent(np.ones(3)), prior)
     assert found.root.shape == (4, 1)
     assert np.linalg.matrix_rank(np.column_stack([found.mean, nominal]), tol=1e-9) == 1
 
 
 def test_uninformative_data_leave_the_prior(generator):
-    matrix, readings, sigma, prior = problem(generator)
-    found = posterior(matrix, readings, sigma * 1e9, prior)
+    matrix, readings, noise, prior = problem(generator)
+    found = posterior(matrix, readings, independent(noise.sd * 1e9), prior)
     np.testing.assert_allclose(found.mean, prior.mean, atol=1e-6)
     np.testing.assert_allclose(found.covariance, prior.covariance, atol=1e-6)
 
@@ -100,11 +95,10 @@ def test_calibration_over_many_truths(generator):
     """Truth drawn from the prior: z-scores are standard normal. Twice too small an error bar is
     seen by the same figure.
     """
-    matrix, _, sigma, prior = problem(generator)
+    matrix, _, noise, prior = problem(generator)
     scores = []
     for truth in prior.sample(2000, generator):
-        readings = matrix @ truth + sigma * generator.standard_normal(len(sigma))
-        found = posterior(matrix, readings, sigma, prior)
+        found = posterior(matrix, matrix @ truth + noise.sample(generator), noise, prior)
         scores.append((truth - found.mean) / found.sd)
     rms = np.sqrt(np.mean(np.square(scores)))
     # 10 000 correlated values: at least 2000 effective, 1.6 % in the rms; 0.07 is over 4 sigma
@@ -112,51 +106,67 @@ def test_calibration_over_many_truths(generator):
     assert 2 * rms != pytest.approx(1.0, abs=0.07)
 
 
-def test_prediction_and_chi2(generator):
-    matrix, _, sigma, prior = problem(generator, 400, 5)
+def test_prediction(generator):
+    matrix, _, _, prior = problem(generator, 400, 5)
     mean, sd = predict(matrix, prior)
     draws = prior.sample(20_000, generator) @ matrix.T
     np.testing.assert_allclose(sd, draws.std(axis=0), rtol=0.05)
     np.testing.assert_allclose(mean, matrix @ prior.mean)
-    certain = Gaussian(prior.mean, np.zeros((5, 1)))
-    readings = mean + sigma * generator.standard_normal(400)
-    # sd of chi2/n over 400 readings is 0.07
-    model = predict(matrix, certain)
-    assert chi2_per_reading(readings, sigma, *model) == pytest.approx(1.0, abs=0.3)
-    assert chi2_per_reading(readings + 3 * sigma, sigma, *model) > 3
+
+
+def test_whitened_residuals(generator):
+    """Against the dense covariance; and over many draws they are independent and standard normal,
+    which those divided by their sd's are not.
+    """
+    matrix, _, noise, prior = problem(generator, 12, 5)
+    covariance = matrix @ prior.covariance @ matrix.T + noise.covariance.toarray()
+    root, residual = matrix @ prior.root, generator.standard_normal(12)
+    values, vectors = np.linalg.eigh(covariance / np.outer(noise.sd, noise.sd))
+    expected = (vectors / np.sqrt(values)) @ vectors.T @ (residual / noise.sd)
+    np.testing.assert_allclose(whitened(residual, noise, root), expected, rtol=1e-9)
+    # the same figure as the update's, which is tested against the dense formula
+    readings = residual + matrix @ prior.mean
+    assert np.mean(whitened(residual, noise, root) ** 2) == pytest.approx(
+        update(matrix, readings, noise, prior).conflict)
+    draws = generator.multivariate_normal(np.zeros(12), covariance, 4000)
+    white = np.array([whitened(draw, noise, root) for draw in draws])
+    # 4000 draws: each correlation has an sd of 1.6 %; 4 sigma
+    assert np.abs(np.cov(white.T) - np.eye(12)).max() < 0.1
+    assert np.abs(np.corrcoef(draws.T) - np.eye(12)).max() > 0.5
 
 
 def test_prior_conflict_is_the_prior_predictive_distance(generator):
-    matrix, readings, sigma, prior = problem(generator)
-    covariance = matrix @ prior.covariance @ matrix.T + np.diag(sigma**2)
+    matrix, readings, noise, prior = problem(generator)
+    covariance = matrix @ prior.covariance @ matrix.T + noise.covariance.toarray()
     residual = readings - matrix @ prior.mean
     expected = residual @ np.linalg.solve(covariance, residual) / len(readings)
-    assert update(matrix, readings, sigma, prior).conflict == pytest.approx(expected)
+    assert update(matrix, readings, noise, prior).conflict == pytest.approx(expected)
 
 
 def test_prior_conflict_sees_noise_that_was_understated(generator):
     """Even with more parameters than readings, where every fit is perfect."""
     matrix, _, _, prior = problem(generator, 40, 200)
-    sigma = np.full(40, 5.0)
+    noise = independent(np.full(40, 5.0))
     truth = prior.sample(1, generator)[0]
-    noise = sigma * generator.standard_normal(40)
+    error = noise.sample(generator)
     # 40 readings: sd 0.22
-    assert update(matrix, matrix @ truth + noise, sigma, prior).conflict < 1.9
-    assert update(matrix, matrix @ truth + 10 * noise, sigma, prior).conflict > 1.9
+    assert update(matrix, matrix @ truth + error, noise, prior).conflict < 1.9
+    assert update(matrix, matrix @ truth + 10 * error, noise, prior).conflict > 1.9
 
 
 def test_evidence_and_parameters_learnt(generator):
     """Against the density of the readings, and the trace of the textbook's matrices."""
-    matrix, readings, sigma, prior = problem(generator)
-    found = update(matrix, readings, sigma, prior)
+    matrix, readings, noise, prior = problem(generator)
+    found = update(matrix, readings, noise, prior)
     predictive = stats.multivariate_normal(
-        matrix @ prior.mean, matrix @ prior.covariance @ matrix.T + np.diag(sigma**2))
+        matrix @ prior.mean, matrix @ prior.covariance @ matrix.T + noise.covariance.toarray())
     assert found.log_evidence == pytest.approx(predictive.logpdf(readings))
     learnt = np.trace(np.eye(5) - found.distribution.covariance @ np.linalg.inv(prior.covariance))
     assert found.learnt == pytest.approx(learnt)
     # many vague readings teach little, exact ones everything
-    assert update(matrix, readings, sigma * 1e3, prior).learnt < 1e-2
-    assert update(matrix, readings, sigma * 1e-3, prior).learnt == pytest.approx(5, abs=1e-4)
+    vague, exact = (independent(noise.sd * factor) for factor in (1e3, 1e-3))
+    assert update(matrix, readings, vague, prior).learnt < 1e-2
+    assert update(matrix, readings, exact, prior).learnt == pytest.approx(5, abs=1e-4)
 
 
 def test_chunks_of_readings_add_up(generator, monkeypatch):

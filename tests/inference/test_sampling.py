@@ -9,6 +9,7 @@ from halbach_fe.errors import SamplingError
 from halbach_fe.inference.calibration import ranks, uniformity
 from halbach_fe.inference.diagnostics import diagnose, require_convergence
 from halbach_fe.inference.linear import update
+from halbach_fe.inference.noise import independent
 from halbach_fe.inference.prior import Gaussian
 from halbach_fe.inference.sampling import Move, Posterior, laplace, prior_reference, sample
 
@@ -19,7 +20,7 @@ def linear_problem(generator, sigma=0.5):
     matrix = generator.standard_normal((6, SIZE))
     prior = Gaussian(np.array([3.0, -2.0, 1.0]), np.diag([1.0, 0.5, 2.0]))
     readings = matrix @ prior.sample(1, generator)[0] + sigma * generator.standard_normal(6)
-    posterior = Posterior(lambda p: matrix @ p, readings, np.full(6, sigma), prior)
+    posterior = Posterior(lambda p: matrix @ p, readings, independent(np.full(6, sigma)), prior)
     return posterior, matrix
 
 
@@ -34,7 +35,7 @@ def bent_problem(generator):
         return np.array([[1.0, p[1]], [0.0, 1.0]])
 
     readings = np.array([1.5, 0.6])
-    return Posterior(model, readings, np.array([0.3, 1.0]), prior), jacobian
+    return Posterior(model, readings, independent(np.array([0.3, 1.0])), prior), jacobian
 
 
 def run(posterior, reference, step, count, generator, start=None, **options):
@@ -55,7 +56,7 @@ def printed_pcn(prior, step, count, generator):
 def test_pcn_leaves_the_prior_invariant(generator):
     """With the likelihood switched off; centred on the prior's mean, which is not zero."""
     prior = Gaussian(np.array([3.0, -2.0]), np.array([[1.0, 0.0], [0.4, 0.5]]))
-    flat = Posterior(lambda p: np.zeros(1), np.zeros(1), np.ones(1), prior)
+    flat = Posterior(lambda p: np.zeros(1), np.zeros(1), independent(np.ones(1)), prior)
     chain = run(flat, prior_reference(prior), 0.8, 20_000, generator)
     assert chain.accepted == 1.0
     # autocorrelation 0.6 a step: 1/4 of the samples count; 5 sigma
@@ -74,7 +75,7 @@ def test_the_printed_proposal_does_not(generator):
 @pytest.mark.parametrize("kind", ["pcn", "laplace", "independence", "screened"])
 def test_linear_posterior_in_closed_form(generator, kind):
     posterior, matrix = linear_problem(generator)
-    exact = update(matrix, posterior.readings, posterior.sigma, posterior.prior).distribution
+    exact = update(matrix, posterior.readings, posterior.noise, posterior.prior).distribution
     # far from the mode a surrogate is so wrong that the second decision hardly ever agrees
     options = {"start": laplace(posterior, lambda p: matrix)[0].centre}
     if kind in ("pcn", "screened"):
@@ -85,7 +86,7 @@ def test_linear_posterior_in_closed_form(generator, kind):
         step = 0.7 if kind == "laplace" else 1.0
     if kind == "screened":  # a surrogate that is 5 % off
         options["surrogate"] = Posterior(lambda p: 1.05 * (matrix @ p), posterior.readings,
-                                         posterior.sigma, posterior.prior)
+                                         posterior.noise, posterior.prior)
     chains = np.array([run(posterior, reference, step, 8000, generator, **options).samples
                        for _ in range(4)])
     found = diagnose(chains)
@@ -101,8 +102,8 @@ def test_linear_posterior_in_closed_form(generator, kind):
 def test_screening_without_its_correction_would_be_seen(generator):
     """Negative control: the surrogate's own posterior is another."""
     posterior, matrix = linear_problem(generator, sigma=0.2)
-    wrong = update(1.05 * matrix, posterior.readings, posterior.sigma, posterior.prior)
-    right = update(matrix, posterior.readings, posterior.sigma, posterior.prior)
+    wrong = update(1.05 * matrix, posterior.readings, posterior.noise, posterior.prior)
+    right = update(matrix, posterior.readings, posterior.noise, posterior.prior)
     shift = np.abs(wrong.distribution.mean - right.distribution.mean) / right.distribution.sd
     assert shift.max() > 0.5
 
@@ -112,7 +113,7 @@ def test_screening_saves_solves(generator):
     reference = prior_reference(posterior.prior)
     run(posterior, reference, 0.5, 2000, generator)
     plain, posterior.solves = posterior.solves, 0
-    surrogate = Posterior(lambda p: matrix @ p + 1e-3, posterior.readings, posterior.sigma,
+    surrogate = Posterior(lambda p: matrix @ p + 1e-3, posterior.readings, posterior.noise,
                           posterior.prior)
     run(posterior, reference, 0.5, 2000, generator, surrogate=surrogate)
     assert plain == 2001
@@ -156,7 +157,7 @@ def test_a_short_chain_is_refused(generator):
 
 def test_mode_that_is_not_there_is_said():
     prior = Gaussian(np.zeros(1), np.eye(1))
-    nowhere = Posterior(lambda p: np.sign(p), np.array([0.5]), np.array([1e-3]), prior)
+    nowhere = Posterior(lambda p: np.sign(p), np.array([0.5]), independent(np.array([1e-3])), prior)
     with pytest.raises(SamplingError, match="mode was not found"):
         laplace(nowhere, lambda p: np.array([[1.0]]))
 
@@ -164,16 +165,16 @@ def test_mode_that_is_not_there_is_said():
 def test_rank_statistics_tell_a_posterior_that_is_too_sure(generator):
     """The linear posterior is calibrated; with half its spread, or twice, it is not."""
     problem, matrix = linear_problem(generator)
-    prior, sigma = problem.prior, problem.sigma
+    prior, noise = problem.prior, problem.noise
 
     def sampler(spread):
         def draw(readings, generator):
-            exact = update(matrix, readings, sigma, prior).distribution
+            exact = update(matrix, readings, noise, prior).distribution
             return exact.mean + spread * (exact.sample(99, generator) - exact.mean)
         return draw
 
     for spread, good in ((1.0, True), (0.5, False), (2.0, False)):
-        found, draws = ranks(prior, lambda p: matrix @ p, sigma, sampler(spread), 200, generator)
+        found, draws = ranks(prior, lambda p: matrix @ p, noise, sampler(spread), 200, generator)
         assert found.shape == (200, SIZE)
         values, together = uniformity(found, draws)
         assert (together > 1e-3) == good

@@ -12,6 +12,7 @@ import xarray as xr
 from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.exact_field import gradient_of
 from halbach_fe.field_map import field_map
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import observe
@@ -120,6 +121,55 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert "disagree" not in page
 
 
+def test_a_second_map_is_only_predicted(short_dipole, generator, workshop, tmp_path):
+    """The same readings held out, by window or as a map of their own with noise of its own, give
+    the same posterior and scores.
+    """
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    one = infer(study, data, workshop)
+    unseen = np.unique(np.flatnonzero(one.held_out) // 3)
+    apart = short_dipole(array__recoil_permeability=1.0, noise=NOISE)
+    other = data.isel(point=unseen)
+    other["sigma_T"] = (("point", "component"), np.full((len(unseen), 3), 1e-5))
+    two = infer(apart, data.drop_isel(point=unseen), workshop, unseen=other)
+    np.testing.assert_allclose(two.posterior.mean, one.posterior.mean, rtol=1e-9)
+    assert [score.part for score in two.scores] == ["training", "held-out map"]
+    assert two.scores[1].chi2_posterior == pytest.approx(one.scores[1].chi2_posterior)
+    assert two.scores[1].rms_standardized_posterior == pytest.approx(1.0, abs=0.15)
+    write_update(two, tmp_path)
+    table = np.genfromtxt(tmp_path / "prediction.csv", delimiter=",", names=True, dtype=None,
+                          encoding="utf-8")
+    assert set(table["part"][-len(unseen):]) == {"held-out map"}
+    total = np.sqrt(table["posterior_sd_T"]**2 + table["sigma_T"]**2 + table["solver_error_T"]**2)
+    np.testing.assert_allclose(table["standardized_residual"], (
+        table["measured_T"] - table["posterior_mean_T"]) / total, rtol=1e-9)
+    for name, value in (("x_m", 0.15), ("y_m", 0.0), ("z_m", 0.04)):
+        other[name].values[0] = value
+    with pytest.raises(MeasurementError, match="reading 1 of held-out map must be at a point in"):
+        infer(apart, data, workshop, unseen=other)
+
+
+def test_held_out_components_whose_points_were_seen(short_dipole, generator, workshop):
+    """B_z is predicted from B_x and B_y, and one end from the rest; positions that are 0.2 mm off
+    correlate the noise of held-out and training components of a point. Scores hold.
+    """
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    points = np.column_stack([data[name].values for name in ("x_m", "y_m", "z_m")])
+    gradient = gradient_of(blocks_of(study), points)
+    data["B_T"].values[:] += np.einsum(
+        "ick,ik->ic", gradient, 2e-4 * generator.standard_normal(points.shape))
+    update = infer(short_dipole(
+        array__recoil_permeability=1.0, noise=NOISE | {"position_sd_m": 2e-4},
+        inference={"held_out": {"components": ["z"], "z_ranges_m": [[0.1, 1.0]]}}), data, workshop)
+    assert update.held_out.sum() == 480 + 2 * 6 * 16
+    _, unseen = update.scores
+    # sd over 80 campaigns: 0.051 (of 672 independent readings 0.055), 0.042, 0.011; 4 to 5 sigma
+    assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.22)
+    assert unseen.rms_standardized_posterior == pytest.approx(1.0, abs=0.2)
+    assert unseen.coverage95_posterior == pytest.approx(0.95, abs=0.05)
+    assert update.prior_conflict < update.conflict_limit
+
+
 def test_report_says_when_the_model_does_not_fit(short_dipole, generator, workshop, tmp_path):
     study, data, _ = magpylib_campaign(short_dipole, generator)
     data["B_T"].values[:, 2] += 1e-3  # an offset of the z sensor: no magnet makes it
@@ -159,6 +209,59 @@ def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, works
     assert after.max() < 1e-5
 
 
+TWO_CIRCLES = {"quantity": "fourier_coefficients", "harmonics": 8, "positions": {
+    "kind": "circles", "radius_m": [0.05, 0.075], "angles": 60}}
+
+
+def test_two_radii_with_unequal_noise(dipole, generator, workshop):
+    """Coefficients of two circles, B_y read ten times worse than B_x, whose noise correlates them:
+    error bars and chi2 hold.
+    """
+    _, data, truth = iron_campaign(dipole, generator, noise=0.0)
+    sigma = np.tile([1e-5, 1e-4, np.nan], (120, 1))
+    data["B_T"].values[:] += sigma * generator.standard_normal((120, 3))
+    data["sigma_T"] = (("point", "component"), sigma)
+    study = dipole(iron_ring=IRON, mesh__block_size_m=0.01, observation=TWO_CIRCLES)
+    update = infer(study, data, workshop)
+    assert len(update.readings) == 32
+    assert not update.noise.independent
+    score = (update.posterior.mean - truth) / update.posterior.sd
+    # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    assert update.prior_conflict == pytest.approx(1.0, abs=1.0)  # 32 readings: sd 0.25
+    write_update(update, workshop.folder)
+    table = np.genfromtxt(workshop.folder / "prediction.csv", delimiter=",", names=True)
+    assert sorted(set(table["x_m"])) == [0.05, 0.075]
+
+
+def test_uncertain_positions(short_dipole, generator, workshop):
+    """A 3D map by magpylib whose every point is 0.2 mm off: as noise it is understood, in points
+    and in coefficients of two circles; a study that takes the positions for exact disagrees.
+    """
+    points = np.vstack([circle(radius, 20, z) for radius in (0.05, 0.075)
+                        for z in np.linspace(-0.12, 0.12, 7)])
+    moved = points + 2e-4 * generator.standard_normal(points.shape)
+    field = np.zeros_like(points)
+    study = short_dipole(array__recoil_permeability=1.0)
+    for block in blocks_of(study):
+        middle = position_angle_deg(study.array, block.slot)
+        polarization = np.array(block.easy_axis) + 0.01 * generator.standard_normal(3)
+        field += magpylib.magnet.CylinderSegment(
+            dimension=(0.104, 0.1865, 0.08, middle - 11.25, middle + 11.25),
+            position=(0, 0, (block.z_min + block.z_max) / 2),
+            polarization=block.remanence * polarization).getB(moved)
+    field += 1e-5 * generator.standard_normal(field.shape)
+    data = field_map(points, field, np.full_like(field, 1e-5))
+    for observation in (study.observation.model_dump(), TWO_CIRCLES):
+        known, exact = (infer(short_dipole(array__recoil_permeability=1.0, observation=observation,
+                                           noise=noise), data, workshop)
+                        for noise in ({"position_sd_m": 2e-4}, None))
+        assert known.prior_conflict < known.conflict_limit
+        # 840 readings: sd 0.05; 224: 0.09
+        assert known.prior_conflict == pytest.approx(1.0, abs=0.4)
+        assert exact.prior_conflict > 10 * exact.conflict_limit
+
+
 def test_nothing_held_out_is_said(dipole, generator, workshop):
     _, data, _ = iron_campaign(dipole, generator)
     with pytest.raises(MeasurementError, match="enough z positions"):
@@ -170,6 +273,8 @@ def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, workshop):
     far = field_map(np.array([[0.0, 0, 0], [75.0, 0, 0]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match="Check the units"):
         infer(short_dipole(noise=NOISE), far, workshop)
+    with pytest.raises(MeasurementError, match="Check the units"):
+        infer(short_dipole(noise=NOISE), far.isel(point=[0]), workshop, unseen=far)
 
 
 def test_readings_that_vanish_by_symmetry(short_dipole, workshop):

@@ -43,6 +43,19 @@ def test_coarse_meshes_are_told_from_fine_ones(short_dipole, workshop):
     assert fine.error_pointwise < 1e-3
 
 
+def test_several_circles_and_regions(dipole, workshop):
+    """Coefficients are those of each circle; regions of a name are one, by component or not."""
+    regions = [{"name": "bore", "components": ["x"], "sigma_T": 1e-5},
+               {"name": "bore", "sigma_T": 1e-4}]
+    study = dipole(iron_ring=IRON, noise={"regions": regions}, observation__components=["x", "y"],
+                   observation__positions={"kind": "circles", "radius_m": [0.05, 0.075],
+                                           "angles": 12})
+    found = verify(study, workshop).differences[0]
+    assert list(found.by_region) == ["bore"]
+    assert found.by_region["bore"] == found.pointwise
+    assert 0 < found.fourier < found.pointwise
+
+
 def test_other_geometries_get_the_dual_route(short_dipole, workshop):
     study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04)
     found = verify(study, workshop)

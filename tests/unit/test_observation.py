@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from halbach_fe.blocks import blocks_of
 from halbach_fe.errors import MeasurementError, StudyError
+from halbach_fe.exact_field import field_of
 from halbach_fe.field_map import field_map
-from halbach_fe.observation import held_out, observe, points_from, standard_deviations
-from tests.conftest import circle
+from halbach_fe.observation import held_out, observe, points_from, reading_noise, together
+from tests.conftest import changed, circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
            "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}}
@@ -31,6 +33,36 @@ def test_fourier_coefficients_of_a_pure_multipole(dipole, order, generator):
         multipole_field(points, order, 0.3, -0.2)), strict=True))
     expected = dict.fromkeys(observation.labels, 0.0) | {f"A{order}": 0.3, f"B{order}": -0.2}
     assert readings == pytest.approx(expected, abs=1e-14)
+
+
+def test_circles_of_several_radii(dipole, generator):
+    """Each reading tells its radius and z; the amplitude of each harmonic is its own circle's."""
+    study = dipole(observation=changed(FOURIER, positions__radius_m=[0.075, 0.05]))
+    points = points_from(study.observation.positions.model_copy(update={
+        "z_min_m": -0.1, "z_max_m": 0.1, "count": 2}))
+    assert points.shape == (96, 3)
+    field = multipole_field(points, 3, 0.3, -0.2) * np.hypot(*points[:, :2].T)[:, None]
+    field *= 1 + points[:, 2:]
+    order = generator.permutation(96)  # any order of points
+    observation = observe(study, points[order], np.ones((96, 3), bool))
+    assert len(observation) == 40
+    found = observation.apply(field[order])
+    assert len({(label, radius, z) for label, radius, z in zip(
+        observation.labels, observation.radii, observation.positions[:, 2], strict=True)}) == 40
+    for label, part in (("A3", 0.3), ("B3", -0.2), ("A1", 0.0)):
+        rows = np.array(observation.labels) == label
+        assert sorted(observation.radii[rows]) == pytest.approx([0.05, 0.05, 0.075, 0.075])
+        z = observation.positions[rows, 2]
+        assert found[rows] == pytest.approx(part * observation.radii[rows] * (1 + z), abs=1e-15)
+    third = np.array([label[1:] == "3" for label in observation.labels])
+    size = observation.magnitude(field[order])
+    assert size[third] == pytest.approx(np.hypot(0.3, 0.2) * (
+        observation.radii * (1 + observation.positions[:, 2]))[third])
+    assert size[~third] == pytest.approx(0, abs=1e-15)
+    with pytest.raises(MeasurementError, match=r"on circles of radius 0\.075, 0\.05 m"):
+        observe(study, circle(0.06), np.ones((24, 3), bool))
+    with pytest.raises(MeasurementError, match=r"circle of radius 0\.05 m at z = -0\.1 m"):
+        observe(study, np.delete(points, 60, axis=0), np.ones((95, 3), bool))
 
 
 def test_fourier_needs_full_circles_of_the_radius(dipole):
@@ -62,32 +94,181 @@ def test_noise_by_region_and_from_the_map(dipole):
     points = np.array([[0, 0, 0.0], [0, 0, 0.2]])
     observation = observe(study, points, np.ones((2, 3), bool))
     data = field_map(points, np.ones((2, 3)))
-    assert standard_deviations(study, observation, data).tolist() == [1e-5] * 3 + [1e-3] * 3
+    assert reading_noise(study, observation, data).sd == pytest.approx([1e-5] * 3 + [1e-3] * 3)
     data["sigma_T"] = (("point", "component"), np.full((2, 3), 7e-5))
-    assert standard_deviations(study, observation, data) == pytest.approx(7e-5)
+    assert reading_noise(study, observation, data).sd == pytest.approx(7e-5)
     with pytest.raises(StudyError, match="cover every reading"):
-        standard_deviations(dipole(noise={"regions": regions[:1]}), observation,
+        reading_noise(dipole(noise={"regions": regions[:1]}), observation,
                             data.drop_vars("sigma_T"))
     with pytest.raises(StudyError, match="how noisy"):
-        standard_deviations(dipole(), observation, data.drop_vars("sigma_T"))
+        reading_noise(dipole(), observation, data.drop_vars("sigma_T"))
 
 
-def test_point_noise_propagates_to_fourier_coefficients(dipole, generator):
-    """Against sampling: 4000 draws know a standard deviation to 1.1 %; 5 % is over 4 sigma."""
-    study, points = dipole(observation=FOURIER), circle(0.075)
-    observation = observe(study, points, np.ones((24, 3), bool))
-    data = field_map(points, np.ones((24, 3)), np.full((24, 3), 1e-4))
-    draws = observation.apply(1e-4 * generator.standard_normal((4000, 24, 3)))
-    assert standard_deviations(study, observation, data) == pytest.approx(draws.std(0), rel=0.05)
+def test_noise_by_component(dipole):
+    """The first region that fits a reading counts; what is in none is named."""
+    regions = [{"name": "body", "z_min_m": -0.1, "z_max_m": 0.1, "components": ["x", "z"],
+                "sigma_T": 1e-5},
+               {"name": "body", "z_min_m": -0.1, "z_max_m": 0.1, "sigma_T": 2e-5},
+               {"name": "rest", "components": ["z"], "sigma_T": 1e-3},
+               {"name": "rest", "components": ["x", "y"], "sigma_T": 2e-3}]
+    points = np.array([[0, 0, 0.0], [0, 0, 0.2]])
+    data = field_map(points, np.ones((2, 3)))
+
+    def noise(some):
+        study = dipole(noise={"regions": some})
+        return reading_noise(study, observe(study, points, np.ones((2, 3), bool)), data)
+
+    assert noise(regions).sd == pytest.approx([1e-5, 2e-5, 1e-5, 2e-3, 2e-3, 1e-3])
+    assert noise(regions[::-1]).sd == pytest.approx([2e-3, 2e-3, 1e-3] * 2)
+    with pytest.raises(StudyError, match=r"z = 0\.2 m, component x, is in none"):
+        noise(regions[:3])
 
 
-def test_held_out_pattern(dipole):
-    z = np.array([0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.4])
-    every_second = dipole(inference={"held_out": {"every": 2}})
-    assert held_out(every_second, z).tolist() == [False, False, True, False, True, True, False]
-    windows = dipole(inference={"held_out": {"every": 2, "window": 2}})
-    assert held_out(windows, z).tolist() == [False, False, False, True, True, True, False]
-    assert not held_out(dipole(), z).any()
+def displaced(study, observation, sd, generator, count=1500):
+    """Readings (count, readings) of the blocks with every point moved at random."""
+    points = observation.points
+    moved = points + sd * generator.standard_normal((count, *points.shape))
+    fields = field_of(blocks_of(study), moved.reshape(-1, 3), order=4).reshape(moved.shape)
+    return observation.apply(fields)
+
+
+@pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
+@pytest.mark.parametrize("from_map", [True, False])
+def test_noise_of_positions(short_dipole, generator, quantity, from_map):
+    """Against the exact field at displaced points near the magnet's end; 1500 draws know a
+    covariance over the two sd's to 3.7 %, 5 sigma. (The field's curvature adds far less.)
+    Components of one point taken as independent are told apart, and so is another axis.
+    """
+    sd = np.array([3e-4, 1e-5, 1e-4])
+    points = circle(0.075, 12, 0.07)
+    changes = {"noise": {"regions": [{"name": "all", "sigma_T": 1e-5}],
+                         "position_sd_m": sd.tolist()}}
+    if quantity == "fourier_coefficients":
+        changes["observation"] = FOURIER
+    study = short_dipole(**changes)
+    observation = observe(study, points, np.ones((12, 3), bool))
+    sigma = np.full((12, 3), 2e-5)
+    data = field_map(points, np.ones((12, 3)), sigma if from_map else None)
+    noise = reading_noise(study, observation, data)
+    draws = displaced(study, observation, sd, generator)
+    own = (observation.apply(2e-5 * generator.standard_normal((1500, 12, 3))) if from_map
+           else 1e-5 * generator.standard_normal(draws.shape))
+    scale = np.outer(noise.sd, noise.sd)
+    covariance = np.cov((draws + own).T) / scale
+    np.testing.assert_allclose(noise.covariance.toarray() / scale, covariance, atol=0.185)
+    assert not noise.independent
+    assert np.abs(np.eye(len(scale)) - covariance).max() > 0.5
+    turned = short_dipole(**changes | {"noise": changes["noise"] | {
+        "position_sd_m": np.roll(sd, 1).tolist()}})
+    other = reading_noise(turned, observation, data).covariance.toarray()
+    assert np.abs(other / scale - covariance).max() > 0.3
+
+
+def test_one_value_for_all_axes(short_dipole):
+    """And noise that is all of positions and the map."""
+    points = circle(0.075, 12, 0.08)
+    data = field_map(points, np.ones((12, 3)), np.full((12, 3), 1e-5))
+
+    def noise(value):
+        study = short_dipole(noise={"position_sd_m": value})
+        return reading_noise(study, observe(study, points, np.ones((12, 3), bool)), data)
+
+    one, three = noise(1e-4), noise([1e-4] * 3)
+    np.testing.assert_array_equal(one.covariance.toarray(), three.covariance.toarray())
+    assert one.sd.max() > 1e-4
+    study = short_dipole(noise={"position_sd_m": 1e-4})
+    with pytest.raises(StudyError, match="how noisy"):
+        reading_noise(study, observe(study, points, np.ones((12, 3), bool)),
+                      data.drop_vars("sigma_T"))
+
+
+@pytest.mark.parametrize("equal", [True, False])
+def test_point_noise_propagates_to_fourier_coefficients(dipole, generator, equal):
+    """Against sampling. 4000 draws know a covariance, over the two sd's, to at most
+    sqrt(2/4000) = 2.2 %; 5 sigma. Unequal noise around the circle correlates the coefficients:
+    without that the comparison fails, and equal noise leaves none.
+    """
+    study = dipole(observation=FOURIER)
+    points = np.vstack([circle(0.075, 24, z, z) for z in (0.0, 0.3)])
+    observation = observe(study, points, np.ones((48, 3), bool))
+    sigma = np.full((48, 3), 1e-4)
+    if not equal:
+        sigma[:, 0] = 3e-4  # Bx is worse than By
+        sigma[:24] *= 1 + 0.8 * np.cos(np.arange(24))[:, None] ** 2
+    noise = reading_noise(study, observation, field_map(points, np.ones((48, 3)), sigma))
+    draws = observation.apply(sigma * generator.standard_normal((4000, 48, 3)))
+    scale = np.outer(noise.sd, noise.sd)
+    found = noise.covariance.toarray()
+    np.testing.assert_allclose(np.cov(draws.T) / scale, found / scale, atol=0.11)
+    alone = np.abs(np.cov(draws.T) - np.diag(noise.sd**2)) / scale
+    assert (alone.max() < 0.11) == equal
+    assert noise.independent == equal
+    assert found[:10, 10:].max() == 0  # circles are independent
+
+
+def held_out_of(study, points, measured=None):
+    points = np.asarray(points, float)
+    measured = np.ones((len(points), 3), bool) if measured is None else measured
+    return held_out(study, observe(study, points, measured))
+
+
+def test_held_out_windows(dipole):
+    points = [[0, 0, z] for z in (0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.4)]
+    one = np.array([[True, False, False]] * 7)
+    for settings, expected in (({"every": 2}, "0010110"), ({}, "0010110"),
+                               ({"every": 2, "window": 2}, "0001110"),
+                               ({"window": 2}, "0001110")):
+        study = dipole(inference={"held_out": settings})
+        assert held_out_of(study, points, one).tolist() == [n == "1" for n in expected]
+    assert not held_out_of(dipole(), points).any()
+
+
+def test_held_out_radii_components_and_ranges(dipole):
+    """Each by itself, and together their union."""
+    points = np.vstack([circle(radius, 4, z) for radius in (0.05, 0.075) for z in (0, 0.1, 0.2)])
+    radius = np.repeat([0.05, 0.075], 36)
+    z = np.tile(np.repeat([0, 0.1, 0.2], 12), 2)
+    component = np.tile(["x", "y", "z"], 24)
+    for settings, expected in (
+            ({"radii_m": [0.07502]}, radius == 0.075),  # maps are rounded
+            ({"components": ["z", "x"]}, component != "y"),
+            ({"z_ranges_m": [[0.1, 0.1]]}, z == 0.1),
+            ({"z_ranges_m": [[-1, 0.05], [0.15, 1]]}, z != 0.1),
+            ({"every": 3}, z == 0.2),
+            ({"every": 3, "radii_m": [0.05], "components": ["y"], "z_ranges_m": [[-1, 0.01]]},
+             (z != 0.1) | (radius == 0.05) | (component == "y"))):
+        study = dipole(inference={"held_out": settings})
+        np.testing.assert_array_equal(held_out_of(study, points), expected)
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    ({"radii_m": [0.06]}, r"held_out\.radii_m = 0\.06` holds some of them out; .* none"),
+    ({"radii_m": [0.05, 0.06]}, r"radii_m = 0\.06`"),
+    ({"components": ["y"]}, r"held_out\.components = y`"),
+    ({"z_ranges_m": [[0.2, 0.3]]}, r"held_out\.z_ranges_m = 0\.2, 0\.3`"),
+    ({"every": 3}, "enough z positions"),
+    ({"radii_m": [0.05, 0.075]}, "16, all held out"),
+    ({"components": ["x"], "z_ranges_m": [[0, 0.1]]}, "all held out"),
+    ({"every": 2, "z_ranges_m": [[0, 0]]}, "all held out")])
+def test_held_out_that_leaves_nothing(dipole, settings, said):
+    """Neither for the update, nor for the prediction by any of the keys."""
+    points = np.vstack([circle(radius, 4, z) for radius in (0.05, 0.075) for z in (0, 0.1)])
+    measured = np.tile([True, False, False], (16, 1))
+    with pytest.raises(MeasurementError, match=said):
+        held_out_of(dipole(inference={"held_out": settings}), points, measured)
+
+
+def test_two_maps_together(dipole, generator):
+    """Readings, and amplitudes too, of a circle that is in both."""
+    study = dipole(observation=FOURIER)
+    points = circle(0.075)
+    one = observe(study, points, np.ones((24, 3), bool))
+    both = together(one, one)
+    fields = generator.standard_normal((2, 24, 3))
+    np.testing.assert_allclose(both.apply(np.vstack(fields)),
+                               np.concatenate([one.apply(field) for field in fields]))
+    np.testing.assert_allclose(both.magnitude(np.vstack(fields)),
+                               np.concatenate([one.magnitude(field) for field in fields]))
 
 
 def test_positions_expand(dipole):
