@@ -17,6 +17,7 @@ from halbach_fe.field_map import field_map
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import observe
 from halbach_fe.report.inference import write_report
+from halbach_fe.report.prediction import main_line
 from halbach_fe.study import MU_0
 from halbach_fe.update import infer, write_update
 from tests.conftest import circle
@@ -51,6 +52,8 @@ def test_permeable_dipole_with_iron_is_learnt(dipole, generator, workshop):
     score = (update.posterior.mean - truth) / update.posterior.sd
     # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
     assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    line = main_line(update)
+    assert (line.what, line.axis, len(line.index)) == ("Bx", "angle in degrees", 60)
     (region,) = update.scores
     assert update.prior_conflict == pytest.approx(1.0, abs=0.45)  # 240 readings: sd 0.09
     assert region.chi2_posterior is None  # seen by the update: no test of anything
@@ -106,6 +109,11 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert training.coverage95_posterior is None
     assert update.prior_conflict < update.conflict_limit
 
+    line = main_line(update)  # one reading at each z, though every circle begins elsewhere
+    assert (line.what, line.axis, len(line.index)) == ("Bx", "z in m", 30)
+    assert (np.diff(line.place) > 0).all()
+    places = update.observation.positions[line.index]
+    assert np.ptp(np.arctan2(places[:, 1], places[:, 0])) < 2 * np.pi / 16
     write_update(update, tmp_path)
     write_report(update, tmp_path)
     with xr.open_dataset(tmp_path / "posterior.h5", engine="h5netcdf") as stored:
@@ -116,7 +124,7 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert summary["scores"][1]["readings"] == 480
     assert len((tmp_path / "prediction.csv").read_text().splitlines()) == 1 + len(update.readings)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<img alt=") == 3
+    assert page.count("<img alt=") == 6
     assert "http" not in page.split("data:image")[0]
     assert "disagree" not in page
 
@@ -232,6 +240,13 @@ def test_two_radii_with_unequal_noise(dipole, generator, workshop):
     write_update(update, workshop.folder)
     table = np.genfromtxt(workshop.folder / "prediction.csv", delimiter=",", names=True)
     assert sorted(set(table["x_m"])) == [0.05, 0.075]
+    line = main_line(update)
+    assert (line.axis, line.place.tolist()) == ("harmonic", list(range(1, 9)))
+    assert len(set(update.observation.radii[line.index])) == 1
+    write_report(update, workshop.folder)
+    page = (workshop.folder / "report.html").read_text()
+    assert "of the training readings by the prior (nothing was held out)" in page
+    assert "T, correlated" in page
 
 
 def test_uncertain_positions(short_dipole, generator, workshop):
