@@ -20,9 +20,10 @@ def between(positions: Positions) -> Floats:
         z = np.unique(points[:, 2])
         between_z = (z[:-1] + z[1:]) / 2 if len(z) > 1 else z
         angle = 2 * np.pi * (np.arange(positions.angles) + 0.5) / positions.angles
-        circle = positions.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
-        return np.column_stack([np.tile(circle, (len(between_z), 1)),
-                                np.repeat(between_z, len(circle))])
+        directions = np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.vstack([np.column_stack([
+            np.tile(radius * directions, (len(between_z), 1)), np.repeat(between_z, len(angle))])
+            for radius in positions.radius_m])
     if positions.kind == "line" or len(points) < 2:
         return (points[:-1] + points[1:]) / 2
     distance = np.linalg.norm(points[:, None] - points, axis=2)

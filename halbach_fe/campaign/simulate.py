@@ -81,7 +81,9 @@ def simulate(
     table, calibration = coil_table(study, nominal, drawn.single, coil_sd, coil)
     magnet = drawn.mounted
     check_air(study, magnet, np.vstack([points, others]))
-    field = field_of(magnet, np.vstack([points, others]), elements, progress).round(DIGITS)
+    places = [real_places(study, one, generator)
+              for one, generator in ((points, noise), (others, other_noise))]
+    field = field_of(magnet, np.vstack(places), elements, progress).round(DIGITS)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
@@ -115,20 +117,37 @@ def model_of(magnet: Magnet) -> dict[str, str]:
 
 
 def point_noise(study: Study, points: Floats) -> Floats:
-    """Standard deviation (n,) in T of every component at points (n, 3) in m.
+    """Standard deviation (n, 3) in T of the components at points (n, 3) in m.
 
     Fourier coefficients of n points have 2/n of the points' variance, and the study's sigma is
     theirs.
     """
-    if study.noise is None:
-        raise StudyError(must_be("`noise`", f"study {study.name}",
+    if study.noise is None or not study.noise.regions:
+        raise StudyError(must_be("`noise.regions`", f"study {study.name}",
                                  "given for a simulated measurement", "nothing",
                                  "Add [[noise.regions]]."))
     sigma = np.array([region.sigma_T for region in study.noise.regions])
-    chosen = sigma[noise_regions(study.noise, points[:, 2])]
+    fourier = study.observation.quantity == "fourier_coefficients"
+    names = ["" if fourier or name not in observed(study) else name for name in COMPONENTS]
+    chosen = sigma[noise_regions(study.noise, np.repeat(points[:, 2], 3), names * len(points))]
     if study.observation.quantity == "fourier_coefficients":
         chosen = chosen * np.sqrt(study.observation.positions.angles / 2)
-    return chosen
+    return chosen.reshape(-1, 3)
+
+
+def observed(study: Study) -> tuple[str, ...]:
+    """Components that the study's map holds."""
+    if study.observation.quantity == "fourier_coefficients":
+        return "x", "y"
+    return study.observation.components
+
+
+def real_places(study: Study, points: Floats, generator: np.random.Generator) -> Floats:
+    """Where the probe was, (n, 3) in m, in place of points that are uncertain."""
+    if study.noise is None or study.noise.position_sd_m is None:
+        return points
+    sd = np.array(study.noise.position_sd_m)
+    return np.asarray(points + sd * generator.standard_normal(points.shape))
 
 
 def check_air(study: Study, magnet: Magnet, points: Floats) -> None:
@@ -146,13 +165,10 @@ def _measured(
     seal: dict[str, str],
 ) -> xr.Dataset:
     """A map with noise, of the components that the study observes."""
-    observed = study.observation
-    seen = ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components
-    noise = sigma[:, None] * generator.standard_normal(field.shape)
-    readings = np.where([name in seen for name in COMPONENTS], field + noise, np.nan)
+    noise = sigma * generator.standard_normal(field.shape)
+    readings = np.where([name in observed(study) for name in COMPONENTS], field + noise, np.nan)
     # the study tells the noise of flux densities itself
-    known = (None if observed.quantity == "flux_density"
-             else np.repeat(sigma[:, None], 3, axis=1))
+    known = None if study.observation.quantity == "flux_density" else sigma
     return field_map(points, readings.round(DIGITS), known, seal)
 
 
