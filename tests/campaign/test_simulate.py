@@ -15,14 +15,15 @@ from halbach_fe.campaign.blocks import coil_table, draw
 from halbach_fe.campaign.bodies import magnet_of
 from halbach_fe.campaign.lone import moment_matrix
 from halbach_fe.campaign.positions import between
-from halbach_fe.campaign.simulate import simulate, write_campaign
+from halbach_fe.campaign.simulate import real_places, simulate, write_campaign
 from halbach_fe.cli import main
 from halbach_fe.errors import EXIT_CODES, StudyError
-from halbach_fe.exact_field import demagnetizing_tensors
+from halbach_fe.exact_field import demagnetizing_tensors, gradient_of
 from halbach_fe.field_map import points_of, read_map
 from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.observation import fourier_of, observe, points_from, reading_noise
-from halbach_fe.study import MU_0, read_study
+from halbach_fe.study import MU_0, parse_study, read_study
+from tests.conftest import DIPOLE, changed
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -348,3 +349,18 @@ def test_a_study_can_be_read_and_simulated(campaigns):
     truth = json.loads((folder / "truth" / "truth.json").read_text())
     assert truth["study"] == read_study(study).name
     assert 0.5 < truth["noise_free"]["largest_T"] < 0.65
+
+
+def test_uncertain_positions_move_the_probe():
+    """Two campaigns of one seed differ by the gradient times the displacements of one."""
+    study = parse_study(changed(DIPOLE, noise={"regions": [{"name": "all", "sigma_T": 1e-9}]}))
+    loose = study.model_copy(update={"noise": study.noise.model_copy(
+        update={"position_sd_m": (1e-4, 1e-4, 1e-4)})})
+    points = points_from(study.observation.positions)
+    moved = real_places(loose, points, np.random.default_rng(1)) - points
+    assert np.std(moved) == pytest.approx(1e-4, rel=0.3)  # 72 draws
+    assert real_places(study, points, np.random.default_rng(1)) is points
+    one, other = (simulate(each, 2).readings["B_T"].values for each in (study, loose))
+    gradient = gradient_of(blocks_of(study), points)
+    spread = np.sqrt(np.mean((gradient[:, :2] ** 2).sum(axis=2))) * 1e-4
+    assert np.sqrt(np.nanmean((one - other)[:, :2] ** 2)) == pytest.approx(spread, rel=0.3)
