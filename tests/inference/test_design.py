@@ -73,6 +73,7 @@ def test_plan_in_a_cross_section(dipole, workshop):
 
 def test_plan_with_correlated_noise(dipole, workshop):
     """All points together tell what the dense covariance says; its diagonal says something else.
+
     (In a plane, where curl and divergence vanish, equal errors along x and y do not correlate.)
     """
     study = dipole(array__recoil_permeability=1.0, observation__components=["x", "y"],
