@@ -263,6 +263,13 @@ class Magnet:
         return self.iron is None and all(
             body.along == body.across == 1.0 for body in self.bodies)
 
+    def with_magnetizations(self, magnetizations: Floats) -> Magnet:
+        """The same magnet with other M, (bodies, dimension) in A/m along its axes."""
+        full = np.zeros((len(self.bodies), 3))
+        full[:, :self.dimension] = magnetizations
+        return replace(self, bodies=tuple(
+            body.with_magnetization(one) for body, one in zip(self.bodies, full, strict=True)))
+
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m are inside of some material."""
         inside = np.zeros(len(points), bool)

@@ -249,14 +249,6 @@ def half_field(law: Froehlich) -> float:
     return law.saturation / (law.initial - 1)
 
 
-def reluctivity(law: Froehlich, square: Any) -> Any:
-    """mu_0 H / B at B^2 in T^2: the positive root of mu_0 H^2 + (mu_0 h + J_s - B) H = B h."""
-    root = needed("ngsolve").sqrt if not isinstance(square, float | np.ndarray) else np.sqrt
-    size, half = root(square + 1e-24), half_field(law)
-    p = half + law.saturation - size
-    return 2 * half / (p + root(p * p + 4 * half * size))
-
-
 def _polarization(table: Table) -> Any:
     """J in T at mu_0 H in T: piecewise linear, through a monotone curve through the table."""
     from scipy.interpolate import PchipInterpolator

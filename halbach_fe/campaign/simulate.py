@@ -81,7 +81,9 @@ def simulate(
     table, calibration = coil_table(study, nominal, drawn.single, coil_sd, coil)
     magnet = drawn.mounted
     check_air(study, magnet, np.vstack([points, others]))
-    field = field_of(magnet, np.vstack([points, others]), elements, progress).round(DIGITS)
+    places = [real_places(study, one, generator)
+              for one, generator in ((points, noise), (others, other_noise))]
+    field = field_of(magnet, np.vstack(places), elements, progress).round(DIGITS)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
@@ -140,6 +142,14 @@ def observed_components(study: Study) -> tuple[str, ...]:
     """Which components of B a study's readings are made of."""
     observed = study.observation
     return ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components
+
+
+def real_places(study: Study, points: Floats, generator: np.random.Generator) -> Floats:
+    """Where the probe was, (n, 3) in m, in place of points that are uncertain."""
+    if study.noise is None or study.noise.position_sd_m is None:
+        return points
+    sd = np.array(study.noise.position_sd_m)
+    return np.asarray(points + sd * generator.standard_normal(points.shape))
 
 
 def check_air(study: Study, magnet: Magnet, points: Floats) -> None:
