@@ -7,6 +7,7 @@ By magpylib and NGSolve; needs the extra ``campaign``, and some minutes::
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from halbach_fe.campaign.simulate import simulate, write_campaign
@@ -20,7 +21,8 @@ SEED = 4
 def main() -> None:
     """Write the folder twin."""
     study = read_study(HERE / "twin.toml")
-    write_campaign(simulate(study, SEED), HERE / "twin")
+    twin = replace(simulate(study, SEED), held_out=None)  # the axis takes its place
+    write_campaign(twin, HERE / "twin")
     axis = FluxDensity(quantity="flux_density", components=("x",), positions=LinePositions(
         kind="line", start_m=(0, 0, -0.775), end_m=(0, 0, 0.775), count=156))
     profile = simulate(study.model_copy(update={"observation": axis}), SEED)  # the same magnet

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the twin and print its table."""
     study, axis = read_study(arguments.study), read_map(HERE / "twin" / "axis.csv")
     with common.workshop(arguments) as workshop:
-        update = infer(study, read_map(HERE / "twin" / "map.h5"), workshop,
+        update = infer(study, read_map(HERE / "twin" / "map.csv"), workshop,
                        read_blocks(HERE / "twin" / "blocks.csv"))
         points = points_of(axis)
         line = study.model_copy(update={"observation": FluxDensity(
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         on_axis = response(line, seen, replace(workshop, folder=arguments.output / "axis"))
     write_update(update, arguments.output)
     write_report(update, arguments.output)
-    measured = seen.read(np.nan_to_num(axis["B_T"].values))
+    measured = seen.apply(np.nan_to_num(axis["B_T"].values))
     blocks = json.loads((HERE / "twin" / "truth" / "truth.json").read_text())["blocks"]
     truth = np.array([one["magnetization_A_per_m"] for one in blocks]).ravel()
     known = {"prior": update.prior, "posterior": update.posterior}
