@@ -117,29 +117,31 @@ def model_of(magnet: Magnet) -> dict[str, str]:
 
 
 def point_noise(study: Study, points: Floats) -> Floats:
-    """Standard deviation (n, 3) in T of the components at points (n, 3) in m.
+    """Standard deviations (n, 3) in T of the components at points (n, 3) in m; NaN of those that
+    the study does not observe.
 
     Fourier coefficients of n points have 2/n of the points' variance, and the study's sigma is
     theirs.
     """
     if study.noise is None or not study.noise.regions:
-        raise StudyError(must_be("`noise.regions`", f"study {study.name}",
+        raise StudyError(must_be("`noise`", f"study {study.name}",
                                  "given for a simulated measurement", "nothing",
                                  "Add [[noise.regions]]."))
     sigma = np.array([region.sigma_T for region in study.noise.regions])
-    fourier = study.observation.quantity == "fourier_coefficients"
-    names = ["" if fourier or name not in observed(study) else name for name in COMPONENTS]
-    chosen = sigma[noise_regions(study.noise, np.repeat(points[:, 2], 3), names * len(points))]
+    result = np.full((len(points), 3), np.nan)
+    for number, name in enumerate(COMPONENTS):
+        if name in observed_components(study):
+            result[:, number] = sigma[noise_regions(study.noise, points[:, 2],
+                                                    (name,) * len(points))]
     if study.observation.quantity == "fourier_coefficients":
-        chosen = chosen * np.sqrt(study.observation.positions.angles / 2)
-    return chosen.reshape(-1, 3)
+        result *= np.sqrt(study.observation.positions.angles / 2)
+    return result
 
 
-def observed(study: Study) -> tuple[str, ...]:
-    """Components that the study's map holds."""
-    if study.observation.quantity == "fourier_coefficients":
-        return "x", "y"
-    return study.observation.components
+def observed_components(study: Study) -> tuple[str, ...]:
+    """Which components of B a study's readings are made of."""
+    observed = study.observation
+    return ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components
 
 
 def real_places(study: Study, points: Floats, generator: np.random.Generator) -> Floats:
@@ -165,8 +167,9 @@ def _measured(
     seal: dict[str, str],
 ) -> xr.Dataset:
     """A map with noise, of the components that the study observes."""
+    seen = [name in observed_components(study) for name in COMPONENTS]
     noise = sigma * generator.standard_normal(field.shape)
-    readings = np.where([name in observed(study) for name in COMPONENTS], field + noise, np.nan)
+    readings = np.where(seen, field + noise, np.nan)
     # the study tells the noise of flux densities itself
     known = None if study.observation.quantity == "flux_density" else sigma
     return field_map(points, readings.round(DIGITS), known, seal)
