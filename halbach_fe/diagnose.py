@@ -10,15 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats
+from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
-from halbach_fe.diagnosis.selection import Candidate, Found, probabilities, select
+from halbach_fe.diagnosis.selection import (
+    ALIKE,
+    EFFECT_ODDS,
+    FOUND,
+    Candidate,
+    Found,
+    gains,
+    log_evidence,
+    probabilities,
+    select,
+    with_candidates,
+)
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Place
 from halbach_fe.field_map import points_of
@@ -34,6 +47,8 @@ SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
 Say = Callable[[str], None]
+Signatures = dict[tuple[str, Place], Floats]
+"""Whitened training readings (rows, k) per unit of each parameter, by effect and place."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +80,49 @@ class Named:
 
 @dataclass(frozen=True)
 class Search:
-    """All effects compared at one point of linearization."""
+    """All effects compared at one point of linearization.
+
+    ``columns`` are the whitened signatures (rows, k), ``residual`` (rows,) what they explain;
+    ``training`` is the whitened residual of the training readings from the prior mean, with named
+    effects in the model.
+    """
 
     hypotheses: tuple[Hypothesis, ...]
     candidates: tuple[Candidate, ...]
     evidence: Evidence
-    marginal: Marginal
+    columns: Floats
     residual: Floats
+    marginal: Marginal
+    training: Floats
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Something that no effect of the catalogue explains.
+
+    Attributes
+    ----------
+    kind : str
+        ``field``: it solves Maxwell's equations in the bore, so that a source is missing;
+        ``instrument``: it cannot; ``either``: the readings do not tell.
+    log_bayes_factor : float
+        Over the named effects alone.
+    alone : bool
+        Whether it is the better explanation by itself: no effect is named then.
+    largest_T : float
+        Of it at any training reading.
+    at_m : tuple of float
+        Where that is.
+    source_m : tuple of float or None
+        Where a point dipole would have to be that is the best source, if a field is missing.
+    """
+
+    kind: Literal["field", "instrument", "either"]
+    log_bayes_factor: float
+    alone: bool
+    largest_T: float
+    at_m: tuple[float, ...]
+    source_m: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
@@ -83,6 +134,8 @@ class Diagnosis:
     before, after : Update
         The inference with the study as it was, and with the effects that were named.
     named : tuple of Named
+    unknown : Unknown or None
+        What they leave unexplained, if anything.
     probabilities : dict
         Of each effect, and of none, if at most one is missing.
     groups_before, groups_after : list of Group
@@ -95,6 +148,7 @@ class Diagnosis:
     before: Update
     after: Update
     named: tuple[Named, ...]
+    unknown: Unknown | None
     probabilities: dict[str, float]
     groups_before: list[Group]
     groups_after: list[Group]
@@ -121,26 +175,30 @@ def diagnose(
     """
     effects = catalogue() if effects is None else effects
     named: tuple[Named, ...] = ()
+    signatures: Signatures = {}
     first: tuple[Update, Search] | None = None
     for number in range(MOST_ROUNDS):
         say(f"round {number + 1}: the model with "
             f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
         now = applied(study, named)
         update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks)
-        search = look(study, update, data, workshop, effects, named)
+        search = look(study, update, data, workshop, effects, named, signatures)
         first = first or (update, search)
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
             break
         named = found
     assert first is not None
+    rest = unknown(search, update, named)
+    if rest is not None and rest.alone:
+        named, (update, search) = (), first
     return Diagnosis(
-        before=first[0], after=update, named=named,
+        before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
-        groups_before=_groups(first[0], first[1].marginal, _residual(first[0])),
-        groups_after=_groups(update, _marginal(update), _residual(update)),
-        left_out_before=left_out(first[1].marginal, first[1].residual),
-        left_out_after=left_out(_marginal(update), _residual(update)), rounds=number + 1)
+        groups_before=_groups(first[0], first[1].marginal, first[1].training),
+        groups_after=_groups(update, search.marginal, search.training),
+        left_out_before=left_out(first[1].marginal, first[1].training),
+        left_out_after=left_out(search.marginal, search.training), rounds=number + 1)
 
 
 def applied(study: Study, named: Sequence[Named]) -> Study:
@@ -152,16 +210,26 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 def look(
     study: Study, update: Update, data: xr.Dataset, workshop: Workshop,
-    effects: Sequence[Effect], named: Sequence[Named],
+    effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
 
     The residual is that of the study without them: what they do is added back, by their signatures
-    at this point.
+    at this point. Other effects keep the ``signatures`` that they had first.
     """
-    scene = scene_of(update.study, data, workshop)
-    bare = scene_of(study, data, workshop) if named else scene
-    marginal, residual = _marginal(update), _residual(update)
+    rows = np.flatnonzero(~update.held_out)
+    noise = update.errors.part(rows)
+
+    def whitened(readings: Floats) -> Floats:
+        """All readings (..., readings) to training ones (rows, ...)."""
+        return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
+
+    marginal = Marginal.of(noise.whiten(update.response.matrix[rows] @ update.prior.root))
+    training = whitened(update.readings - update.response.offset
+                        - update.response.matrix @ update.prior.mean)
+    residual = training
+    scene = _scene_of(update.study, data, workshop)
+    bare = _scene_of(study, data, workshop)
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     hypotheses: list[Hypothesis] = []
     candidates: list[Candidate] = []
@@ -170,41 +238,72 @@ def look(
     for effect in effects:
         scale = np.array([parameter.sd for parameter in effect.parameters])
         for place in effect.places(study):
-            present = there.get((effect.name, place))
-            whole = present is not None and effect.discrete
-            signature = effect.signature(bare if whole else scene, place)
-            readings = update.observation.read(signature)
+            key = effect.name, place
+            present = there.get(key)
+            if present is not None and not effect.discrete:
+                signatures.pop(key)
+            if key not in signatures:
+                seen = effect.signature(bare if present is None else scene, place)
+                signatures[key] = whitened(update.observation.read(seen))
             if present is not None:
                 amount = np.ones(1) if effect.discrete else present.values
-                residual = residual + whitened(update, amount @ readings)
-            columns.append(whitened(update, (scale[:, None] * readings).T))
+                residual = residual + signatures[key] @ amount
+            columns.append(signatures[key] * scale)
             hypotheses.append(Hypothesis(effect, place))
             candidates.append(Candidate(effect.name, place.name, tuple(
                 range(width, width + len(scale))), effect.certain))
             width += len(scale)
-    evidence = marginal.evidence(np.hstack(columns), residual)
-    return Search(tuple(hypotheses), tuple(candidates), evidence, marginal, residual)
+    stacked = np.hstack(columns)
+    return Search(tuple(hypotheses), tuple(candidates), marginal.evidence(stacked, residual),
+                  stacked, residual, marginal, training)
 
 
-def scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
-    """The scene of a map."""
+def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown | None:
+    """Judge what named effects leave: a smooth field, or a smooth error of the sensors."""
+    rows = np.flatnonzero(~update.held_out)
+    noise, observation = update.errors.part(rows), update.observation
+    points, scale = observation.map_points, float(np.median(update.errors.sd))
+    mine = [one.found.candidate for one in named]
+    held = [column for one in mine for column in one.columns]
+    own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
+           for one in mine]
+    kinds: dict[Literal["field", "instrument", "either"], Terms] = {
+        "field": harmonic_fields(points), "instrument": sensor_errors(points)}
+    beside, instead = [], []
+    for kind, terms in kinds.items():
+        readings = observation.read(scale * terms.fields)
+        smooth = noise.whiten(np.ascontiguousarray(readings[:, rows].T))
+        both = search.marginal.evidence(
+            np.hstack([search.columns[:, held], smooth]), search.residual)
+        added = range(len(held), both.information.shape[0])
+        rest = judge(with_candidates(both, own).only(added), terms.fineness)
+        alone = judge(both.only(added), terms.fineness)
+        beside.append((rest.log_bayes_factor, kind, rest))
+        instead.append((alone.log_bayes_factor, kind, alone))
+    beside.sort(key=lambda one: -one[0])
+    instead.sort(key=lambda one: -one[0])
+    if beside[0][0] + np.log(EFFECT_ODDS) < FOUND:
+        return None
+    alone_better = bool(mine) and instead[0][0] > log_evidence(both, own) + FOUND
+    (factor, kind, best), (second, *_) = instead if alone_better else beside
+    size = scale * np.linalg.norm(np.tensordot(best.mean, kinds[kind].fields, 1), axis=1)
+    source = None
+    if kind == "field":
+        others = [] if alone_better else mine
+        odds = gains(with_candidates(search.evidence, others), search.candidates)
+        dipoles = [number for number, one in enumerate(search.hypotheses)
+                   if one.effect.name == "ferromagnetic_object"]
+        if dipoles:
+            source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
+    return Unknown("either" if factor - second < ALIKE else kind, factor,
+                   alone_better or not mine, float(size.max()),
+                   tuple(points[int(np.argmax(size))].tolist()), source)
+
+
+def _scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
     points = points_of(data)
     return Scene(study, points, map_time(data),
                  lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
-
-
-def whitened(update: Update, readings: Floats) -> Floats:
-    """Training readings (n,) or (n, k) of all (readings,) or (readings, k), whitened."""
-    return update.errors.part(~update.held_out).whiten(readings[~update.held_out])
-
-
-def _marginal(update: Update) -> Marginal:
-    return Marginal.of(whitened(update, update.response.matrix @ update.prior.root))
-
-
-def _residual(update: Update) -> Floats:
-    return whitened(update, update.readings - update.response.offset
-                    - update.response.matrix @ update.prior.mean)
 
 
 def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:

@@ -9,6 +9,9 @@ from halbach_fe.exact_field import field_of
 from halbach_fe.study import MU_0, External, Neighbour, Study
 from halbach_fe.symmetry import turn_matrix
 
+EXACT = 12
+"""Gauss points per panel for the field as exact as it is computed anywhere."""
+
 
 def external_field(study: Study, points: Floats) -> Floats:
     """B (n, 3) in T at points (n, 3) in m of what the study has outside the magnet."""
@@ -21,12 +24,14 @@ def external_field(study: Study, points: Floats) -> Floats:
     return field
 
 
-def neighbour_field(study: Study, neighbour: Neighbour, points: Floats) -> Floats:
-    """B (n, 3) in T of a magnet like the study's, in vacuum."""
+def neighbour_field(
+    study: Study, neighbour: Neighbour, points: Floats, order: int = EXACT
+) -> Floats:
+    """B (n, 3) in T of a magnet like the study's, in vacuum, by ``order`` Gauss points a panel."""
     turn = turn_matrix(np.radians(neighbour.turn_deg))
     seen = (points - [0.0, 0.0, neighbour.z_m]) @ turn
     alone = study.model_copy(update={"external": External()})
-    return np.asarray(neighbour.factor * field_of(blocks_of(alone), seen) @ turn.T)
+    return np.asarray(neighbour.factor * field_of(blocks_of(alone), seen, order) @ turn.T)
 
 
 def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:

@@ -38,6 +38,8 @@ class Observation:
         Applied to B in T there, flattened point by point.
     analysis : sparse array, shape (readings, 3 m)
         Applied to a map of m points, flattened point by point.
+    map_points : ndarray, shape (m, 3), in m
+        Where the map says they were.
     labels : tuple of str
         Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
     positions : ndarray, shape (readings, 3), in m
@@ -47,6 +49,7 @@ class Observation:
     points: Floats
     operator: sparse.csr_array
     analysis: sparse.csr_array
+    map_points: Floats
     labels: tuple[str, ...]
     positions: Floats
 
@@ -127,8 +130,8 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
             shape=(len(point), 3 * len(points)))
         labels, positions = tuple(f"B{COMPONENTS[c]}" for c in component), points[point]
     used = probe(study.instrument, points)
-    return Observation(used.points, sparse.csr_array(analysis @ used.operator), analysis, labels,
-                       positions)
+    return Observation(used.points, sparse.csr_array(analysis @ used.operator), analysis, points,
+                       labels, positions)
 
 
 def circles(
@@ -251,10 +254,10 @@ def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.
     The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
     the bore some per cent of the field, is left out of this scale of the noise.
     """
-    gradient = gradient_of(blocks_of(study), observation.points) * sd
+    gradient = gradient_of(blocks_of(study), observation.map_points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
-        observation.operator @ sparse.bsr_array((gradient, number[:-1], number)))
+        observation.analysis @ sparse.bsr_array((gradient, number[:-1], number)))
 
 
 def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:

@@ -87,6 +87,12 @@ class Evidence:
             self.information - self.information[index].T @ cross, self.score - weights,
             self.chi2 - float(self.score[index] @ fit.mean), self.readings)
 
+    def only(self, chosen: Sequence[int]) -> Evidence:
+        """The same of some columns."""
+        index = np.asarray(chosen, int)
+        return Evidence(self.information[np.ix_(index, index)], self.score[index], self.chi2,
+                        self.readings)
+
     def shifted(self, column: int) -> Evidence:
         """The same of readings less one signature, of amplitude 1."""
         row = self.information[column]

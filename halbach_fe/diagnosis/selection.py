@@ -106,6 +106,18 @@ def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evid
                            for column in one.columns])
 
 
+def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
+    """Log evidence of some candidates together, over that of none."""
+    total = 0.0
+    for one in candidates:
+        if one.certain:
+            (column,) = one.columns
+            total += float(evidence.score[column] - evidence.information[column, column] / 2)
+            evidence = evidence.shifted(column)
+    return total + evidence.fit([column for one in candidates if not one.certain
+                                 for column in one.columns]).log_evidence
+
+
 def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -> list[Found]:
     """Find missing effects one after the other; drop those that later ones make needless.
 

@@ -10,7 +10,7 @@ from halbach_fe.external import neighbour_field
 from halbach_fe.scene import Scene
 from halbach_fe.study import Neighbour, Study
 
-GAPS_M = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0)
+GAPS_M = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7)
 """Between the magnets."""
 
 
@@ -31,7 +31,8 @@ class NeighbourMagnet(Effect):
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return neighbour_field(scene.study, Neighbour(z_m=place.at_m[0]), scene.points)[None]
+        return neighbour_field(scene.study, Neighbour(z_m=place.at_m[0]), scene.points,
+                               order=4)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,0 +1,83 @@
+"""The catalogue: signatures are the derivatives of what the effects do to a study."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.blocks import blocks_of
+from halbach_fe.effects import catalogue
+from halbach_fe.exact_field import field_of
+from halbach_fe.external import external_field
+from halbach_fe.instrument import probe, remainder
+from halbach_fe.scene import Scene
+from halbach_fe.study import parse_study
+from tests.conftest import DIPOLE, changed, circle
+
+STUDY = parse_study(changed(
+    DIPOLE, dimension=3, array__rings=4, array__ring_length_m=0.083,
+    array__recoil_permeability=1.0))
+POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
+TIME = np.linspace(0, 1, len(POINTS))
+EFFECTS = {effect.name: effect for effect in catalogue()}
+SOLVED = {"iron_ring", "recoil_permeability", "recoil_permeability_across"}
+STEP = 0.05
+"""Of the amplitudes' standard deviations: as far as most effects are linear."""
+
+
+def shown(study):
+    """What a map of a study shows, without what permeability and iron add."""
+    used = probe(study.instrument, POINTS)
+    field = field_of(blocks_of(study), used.points) + external_field(study, used.points)
+    linear = (used.operator @ field.ravel()).reshape(-1, 3)
+    return linear + remainder(study.instrument, linear, TIME)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene(STUDY, POINTS, TIME, lambda study: field_of(blocks_of(study), POINTS))
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED))
+def test_signatures_are_derivatives(name, scene):
+    effect = EFFECTS[name]
+    places = effect.places(STUDY)
+    for place in (places[0], places[len(places) // 3]):
+        signature = effect.signature(scene, place)
+        assert signature.shape == (len(effect.parameters), len(POINTS), 3)
+        for number, parameter in enumerate(effect.parameters):
+            step = parameter.sd * (1 if effect.certain else STEP)
+            values = step * np.eye(len(effect.parameters))[number]
+            change = shown(effect.apply(STUDY, place, values.tolist())) - shown(STUDY)
+            size = np.abs(change).max()
+            # what is not linear: 4e-3 at most (length), mostly 1e-4
+            assert np.abs(change - step * signature[number]).max() < 1e-2 * size
+            # negative controls: the wrong sign, another component
+            assert np.abs(change + step * signature[number]).max() > size
+            assert np.abs(change - step * signature[number][:, [1, 2, 0]]).max() > 0.5 * size
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_effects_of_no_size_change_nothing(name):
+    effect = EFFECTS[name]
+    if effect.discrete:
+        pytest.skip("all or nothing")
+    place = effect.places(STUDY)[0]
+    applied = effect.apply(STUDY, place, [0.0] * len(effect.parameters))
+    assert shown(applied) == pytest.approx(shown(STUDY), abs=1e-15)
+
+
+def test_places_are_in_the_magnet():
+    assert len(EFFECTS["block_displaced"].places(STUDY)) == 64
+    assert len(EFFECTS["ring_gap"].places(STUDY)) == 3
+    flat = parse_study(changed(DIPOLE))
+    for name in ("ring_gap", "ring_twisted", "ring_shifted", "length", "neighbour_magnet"):
+        assert EFFECTS[name].places(flat) == []
+
+
+def test_seams_move_what_is_beyond_them_outwards():
+    effect = EFFECTS["ring_gap"]
+    moved = [[block.shift[2] for block in blocks_of(effect.apply(STUDY, place, [1e-3]))[::16]]
+             for place in effect.places(STUDY)]
+    assert moved == pytest.approx(np.array([
+        [-1e-3, 0, 0, 0], [-5e-4, -5e-4, 5e-4, 5e-4], [0, 0, 0, 1e-3]]))

@@ -1,0 +1,146 @@
+"""Evidence of signatures with the blocks integrated out, against dense normal distributions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.residuals import groups, left_out
+from halbach_fe.diagnosis.selection import Candidate, gains, log_evidence, select
+
+
+@pytest.fixture
+def problem():
+    """Whitened response of 6 parameters and 5 signatures on 40 readings, and a residual."""
+    generator = np.random.default_rng(4)
+    response, signatures = generator.standard_normal((40, 6)), generator.standard_normal((40, 5))
+    residual = (3 * signatures[:, 1] + response @ generator.standard_normal(6)
+                + generator.standard_normal(40))
+    return response, signatures, residual
+
+
+def dense(response, signatures, residual):
+    """Log density of a residual whose covariance has these parts."""
+    covariance = np.eye(len(residual)) + response @ response.T + signatures @ signatures.T
+    return stats.multivariate_normal(cov=covariance).logpdf(residual)
+
+
+@pytest.mark.parametrize("chosen", [[1], [0, 3], [4, 1, 2]])
+def test_log_evidence_is_that_of_the_dense_covariance(problem, chosen):
+    response, signatures, residual = problem
+    evidence = Marginal.of(response).evidence(signatures, residual)
+    expected = dense(response, signatures[:, chosen], residual) - dense(
+        response, signatures[:, :0], residual)
+    assert evidence.fit(chosen).log_evidence == pytest.approx(expected)
+    assert evidence.log_evidences([chosen])[0] == pytest.approx(expected)
+    # negative control: blocks that are not integrated out make another of it
+    bare = Marginal.of(0 * response).evidence(signatures, residual)
+    assert abs(bare.fit(chosen).log_evidence - expected) > 1
+
+
+def test_amplitudes_are_those_of_the_joint_regression(problem):
+    response, signatures, residual = problem
+    fit = Marginal.of(response).evidence(signatures, residual).fit([0, 1])
+    joint = np.hstack([response, signatures[:, :2]])
+    covariance = np.linalg.inv(joint.T @ joint + np.eye(8))
+    assert fit.mean == pytest.approx((covariance @ joint.T @ residual)[6:])
+    assert fit.covariance == pytest.approx(covariance[6:, 6:])
+
+
+def test_given_is_the_evidence_of_what_remains(problem):
+    response, signatures, residual = problem
+    evidence = Marginal.of(response).evidence(signatures, residual)
+    both = evidence.fit([1, 2]).log_evidence
+    assert evidence.given([1]).fit([2]).log_evidence == pytest.approx(
+        both - evidence.fit([1]).log_evidence)
+    assert evidence.given([1]).chi2 == pytest.approx(residual @ np.linalg.solve(
+        np.eye(40) + response @ response.T + np.outer(signatures[:, 1], signatures[:, 1]),
+        residual))
+
+
+def test_a_certain_effect_shifts_the_readings(problem):
+    response, signatures, residual = problem
+    evidence = Marginal.of(response).evidence(signatures, residual)
+    expected = dense(response, signatures[:, :0], residual - signatures[:, 1]) - dense(
+        response, signatures[:, :0], residual)
+    certain = Candidate("missing", "", (1,), certain=True)
+    assert gains(evidence, [certain])[0] == pytest.approx(expected)
+    other = Candidate("other", "", (3,))
+    together = dense(response, signatures[:, [3]], residual - signatures[:, 1]) - dense(
+        response, signatures[:, :0], residual)
+    assert log_evidence(evidence, [certain, other]) == pytest.approx(together)
+
+
+def test_left_out_residuals_are_those_of_each_reading_given_the_others(problem):
+    response, _, residual = problem
+    covariance = np.eye(40) + response @ response.T
+    others = np.arange(1, 40)
+    weights = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, 0])
+    mean, variance = weights @ residual[others], covariance[0, 0] - weights @ covariance[others, 0]
+    assert left_out(Marginal.of(response), residual)[0] == pytest.approx(
+        (residual[0] - mean) / np.sqrt(variance))
+
+
+def test_groups_are_judged_given_all_other_readings(problem):
+    response, _, residual = problem
+    members = {"half": ["first"] * 15 + ["second"] * 25}
+    found = groups(Marginal.of(response), residual, members)
+    covariance = np.eye(40) + response @ response.T
+    one, two = np.arange(15), np.arange(15, 40)
+    weights = np.linalg.solve(covariance[np.ix_(two, two)], covariance[np.ix_(two, one)])
+    rest = residual[one] - weights.T @ residual[two]
+    spread = covariance[np.ix_(one, one)] - weights.T @ covariance[np.ix_(two, one)]
+    assert found[0].chi2_per_reading == pytest.approx(rest @ np.linalg.solve(spread, rest) / 15)
+
+
+def test_a_group_disagrees_where_readings_do():
+    generator = np.random.default_rng(2)
+    response = generator.standard_normal((60, 4))
+    names = {"third": [str(number // 20) for number in range(60)]}
+    clean = response @ generator.standard_normal(4) + generator.standard_normal(60)
+    marginal = Marginal.of(response)
+    assert not any(group.disagrees for group in groups(marginal, clean, names))
+    clean[20:40] += 3.0 * (-1) ** np.arange(20)
+    wrong = groups(marginal, clean, names)
+    assert wrong[1].disagrees
+    assert wrong[1].chi2_per_reading > 2 * max(wrong[0].chi2_per_reading, wrong[2].chi2_per_reading)
+
+
+def hidden(amplitudes, seed=0, readings=200):
+    """Evidence of 20 signatures, of which some are in the readings, and their candidates."""
+    generator = np.random.default_rng(seed)
+    response = generator.standard_normal((readings, 10))
+    signatures = generator.standard_normal((readings, 20))
+    signatures[:, 19] = signatures[:, 0] + 0.02 * generator.standard_normal(readings)  # a twin
+    residual = (response @ generator.standard_normal(10) + generator.standard_normal(readings)
+                + sum(size * signatures[:, column] for column, size in amplitudes.items()))
+    candidates = [Candidate(f"effect {number}", "", (number,)) for number in range(20)]
+    return Marginal.of(response).evidence(signatures, residual), candidates
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_is_found_where_nothing_is(seed):
+    assert select(*hidden({}, seed)) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_several_effects_are_found_together(seed):
+    found = select(*hidden({3: 1.0, 7: -0.8}, seed))
+    assert {one.candidate.effect for one in found} == {"effect 3", "effect 7"}
+    assert all(one.effects == (one.candidate.effect,) for one in found)
+
+
+def test_twins_are_named_together():
+    (found,) = select(*hidden({0: 1.0}))
+    assert set(found.effects) == {"effect 0", "effect 19"}
+
+
+def test_shuffled_signatures_break_the_naming():
+    evidence, candidates = hidden({3: 1.0, 7: -0.8})
+    names = [candidate.effect for candidate in candidates]
+    wrong = [Candidate(names[(number + 5) % 20], "", candidate.columns)
+             for number, candidate in enumerate(candidates)]
+    assert {one.candidate.effect for one in select(evidence, wrong)}.isdisjoint(
+        {"effect 3", "effect 7"})
