@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Sequence
 from importlib import metadata
 
-from halbach_fe.cli import common, doctor, infer, plan, prior, schema, solve, verify
+from halbach_fe.cli import common, diagnose, doctor, infer, plan, prior, schema, solve, verify
 from halbach_fe.errors import EXIT_CODES
 
-VERBS = {"solve": solve, "infer": infer, "verify": verify, "plan": plan, "prior": prior,
-         "doctor": doctor, "schema": schema}
+VERBS = {"solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify, "plan": plan,
+         "prior": prior, "doctor": doctor, "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:

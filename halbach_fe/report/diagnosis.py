@@ -1,0 +1,480 @@
+"""Tables, figures and the HTML page of a diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from halbach_fe.blocks import Floats, Ints
+from halbach_fe.diagnose import Diagnosis, Named
+from halbach_fe.diagnosed import (
+    STUDY_FILE,
+    SUMMARY_FILE,
+    amounts,
+    rivals,
+    scores,
+    where,
+)
+from halbach_fe.diagnosis.residuals import DISCOVERIES, Group
+from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND
+from halbach_fe.effects import catalogue
+from halbach_fe.next_measurement import ENOUGH, Separation
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.update import ALL_READINGS, COVERAGE_Z, Update
+
+NOTHING = "–"
+MOST_BARS = 8
+BEFORE, AFTER = PRIOR, POSTERIOR
+RESIDUAL_LIMIT = 5.0
+"""Standard deviations at the end of the colour scale."""
+
+GROUP_TITLES = {"z": "along z", "angle": "by angle", "radius": "by radius", "label": "by reading"}
+UNKNOWN_KINDS = {
+    "field": "a smooth field, as of a source that no effect of the catalogue is",
+    "instrument": "a smooth error of the sensors that no field could be",
+    "either": "something smooth, a field or an error of the sensors"}
+
+
+def verdict(diagnosis: Diagnosis) -> list[str]:
+    """What was found, in sentences."""
+    effects = _catalogue_titles(diagnosis)
+    before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
+    said = []
+    if diagnosis.named:
+        said.append("The map is explained by: " + "; ".join(
+            _named(one) for one in diagnosis.named) + ".")
+        said += [f"It does not tell {one.hypothesis.effect.title} from "
+                 f"{_either(_titles(one, effects))}." for one in diagnosis.named if rivals(one)]
+    elif unknown is None and before.prior_conflict <= before.conflict_limit:
+        return [f"Nothing is missing: the map agrees with the study within noise (chi² per reading "
+                f"{before.prior_conflict:.3g})."]
+    if unknown is not None:
+        x, y, z = (f"{1e3 * one:.0f}" for one in unknown.at_m)
+        said.append(
+            f"Something outside the catalogue {'remains' if diagnosis.named else 'is missing'}: "
+            f"{UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
+            f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
+            f"{unknown.log_bayes_factor:.3g}).")
+        if unknown.source_m is not None:
+            x, y, z = (f"{1e3 * one:.0f}" for one in unknown.source_m)
+            said.append(f"If it is a small magnetized object, then near ({x}, {y}, {z}) mm.")
+    elif not diagnosis.named:
+        return [f"The map disagrees with the study (chi² per reading {before.prior_conflict:.3g}, "
+                f"where {before.conflict_limit:.3g} would be rare), and no effect of the catalogue "
+                "explains it, nor anything smooth: look for outliers, and at the noise."]
+    if diagnosis.named:
+        old, new = (next((one for one in found[1:] if one.region == ALL_READINGS), found[0])
+                    for found in (scores(before, diagnosis.left_out_before),
+                                  scores(after, diagnosis.left_out_after)))
+        said.append(f"With {'it' if len(diagnosis.named) == 1 else 'them'} in the model, chi² per "
+                    f"{old.part.replace(' ', '-')} reading is {new.chi2_per_reading:.3g} (before: "
+                    f"{old.chi2_per_reading:.3g}).")
+        if after.prior_conflict > after.conflict_limit and unknown is None:
+            said.append("That is still too much: they are not all that is wrong.")
+    return said
+
+
+def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Rows of the effects that a study lacks, as text."""
+    return [{"effect": one.found.candidate.effect, "place": where(one.hypothesis.place),
+             "amplitude": "; ".join(amounts(one)),
+             "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
+             "it could be": ", ".join(candidate.effect for candidate, _ in rivals(one)) or NOTHING}
+            for one in diagnosis.named]
+
+
+def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Rows of scores before and after, as text."""
+    before = scores(diagnosis.before, diagnosis.left_out_before)
+    after = scores(diagnosis.after, diagnosis.left_out_after)
+    rows = []
+    for old, new in zip(before, after, strict=True):
+        region = "" if old.region == ALL_READINGS else f", {old.region}"
+        rows.append({"readings": f"{old.part}{region}", "count": str(old.readings)} | {
+            name: f"{text(getattr(old, key))} → {text(getattr(new, key))}"
+            for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
+                                    ("median error", "median_relative_error", _percent),
+                                    ("95 % band holds", "coverage95", _fraction))})
+    return rows
+
+
+def write_report(
+    diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path
+) -> None:
+    """Write diagnosis.html, self-contained, and its figures as PNG into ``folder``."""
+    figures = {
+        "groups": (_groups(diagnosis), "Chi² per reading of groups of readings, each foretold by "
+                   "all others, before and after; filled where chance is no explanation"),
+        "residuals": (_residuals(diagnosis), "Standardized difference of each training reading "
+                      "from what all others foretell, along z and by angle, before and after"),
+        "probabilities": (_probabilities(diagnosis), "Posterior probability of each effect if at "
+                          "most one is missing, and log Bayes factors of the found effects and "
+                          "of those that would do as well; dashed: what an effect needs"),
+        "profile": (_profile(diagnosis), "The readings that fitted worst, with the updated model's "
+                    "predictions before and after, and what is left; the band holds 95 % of it by "
+                    "prediction and noise"),
+        "magnetizations": (_magnetizations(diagnosis), "Inferred change of the magnetizations from "
+                           "the prior by ring and slot, along and across the easy axis and along "
+                           "the magnet, before and after"),
+    }
+    pictures = save({f"diagnosis_{name}.png": one for name, one in figures.items()}, folder)
+    titles = _catalogue_titles(diagnosis)
+    write_page(
+        folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
+        study=diagnosis.before.study, verdict=verdict(diagnosis),
+        shown=dict(zip(figures, pictures, strict=True)),
+        found=[{"what": one.hypothesis.effect.title, "where": where(one.hypothesis.place) or
+                NOTHING, "how much": "; ".join(amounts(one)).replace(" ", "\u00a0"),
+                "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
+                "name": one.found.candidate.effect} for one in diagnosis.named],
+        changes=change_table(diagnosis), disagreeing=[_disagreeing(found) for found in (
+            diagnosis.groups_before, diagnosis.groups_after)],
+        classes=[_class(one, titles) for one in diagnosis.named if rivals(one)],
+        structure=_structure(diagnosis),
+        further=[_next(one, separations, titles) for one in diagnosis.named if rivals(one)],
+        ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
+                "discoveries": DISCOVERIES},
+        study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
+
+
+def _named(one: Named) -> str:
+    """An effect in words, with its amplitude."""
+    place = where(one.hypothesis.place)
+    what = one.hypothesis.effect.title + (f", {place}" if place else "")
+    return what if one.hypothesis.effect.certain else f"{what} ({'; '.join(amounts(one))})"
+
+
+def _catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
+    """Effects in words."""
+    return {effect.name: effect.title for effect in (
+        *catalogue(), *(one.hypothesis.effect for one in diagnosis.named))}
+
+
+def _titles(named: Named, titles: dict[str, str]) -> list[str]:
+    """Rivals of an effect in words."""
+    return [_title(candidate.effect, titles) for candidate, _ in rivals(named)]
+
+
+def _title(name: str, titles: dict[str, str]) -> str:
+    """An effect in words, with its name if others have the same words."""
+    title = titles.get(name, name)
+    return f"{title} ({name})" if list(titles.values()).count(title) > 1 else title
+
+
+def _disagreeing(found: Sequence[Group]) -> str:
+    """How many groups of readings disagree, and which most."""
+    wrong = [one for one in found if one.disagrees]
+    if not wrong:
+        return f"none of {len(found)}"
+    worst = max(wrong, key=lambda one: one.chi2_per_reading)
+    return (f"{len(wrong)} of {len(found)}, most of all {worst.name} "
+            f"({worst.chi2_per_reading:.2g})")
+
+
+def _class(one: Named, titles: dict[str, str]) -> str:
+    """What cannot be told apart, in words."""
+    found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
+             for title, (candidate, factor) in zip(_titles(one, titles), rivals(one), strict=True)]
+    return (f"What is called {one.hypothesis.effect.title} here (log Bayes factor "
+            f"{one.found.log_bayes_factor:.1f}) could as well be: {'; '.join(found)}.")
+
+
+def _either(parts: Sequence[str]) -> str:
+    return " or ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
+
+
+def _next(
+    named: Named, separations: Sequence[Separation], titles: dict[str, str],
+) -> dict[str, object]:
+    """What would separate an effect from its rivals, in words and numbers."""
+    own = [one for one in separations if one.named == named.hypothesis]
+    choices = dict.fromkeys(name for one in own for name in one.gains)
+    return {
+        "what": named.hypothesis.effect.title,
+        "advice": [(_title(one.rival.effect.name, titles),
+                    one.recommended.title if one.recommended else "") for one in own],
+        "rows": [{"expected gain of": name.replace("_", " ")} | {
+            f"over {one.rival.effect.name}": _gain(one.gains.get(name)) for one in own}
+            for name in choices]}
+
+
+def _gain(value: float | None) -> str:
+    return NOTHING if value is None else f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
+
+
+def _percent(value: float | None) -> str:
+    return NOTHING if value is None else f"{100 * value:.2g}\u00a0%"
+
+
+def _fraction(value: float) -> str:
+    return f"{100 * value:.1f}\u00a0%"
+
+
+def _figure(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _groups(diagnosis: Diagnosis) -> Figure:
+    """The kind with most groups on the left, all others on the right."""
+    kinds = [one.kind for one in diagnosis.groups_before]
+    sizes = {kind: kinds.count(kind) for kind in kinds}
+    if not sizes:
+        return _empty("too few readings to group them")
+    first, *others = sorted(sizes, key=lambda kind: -sizes[kind])
+    tallest = max(sizes[first], sum(sizes[kind] + 1.5 for kind in others))
+    figure = Figure(figsize=(9, 1.1 + 0.21 * tallest), layout="constrained")
+    left, *right = figure.subfigures(1, 2 if others else 1, squeeze=False)[0]
+    axes = [left.subplots()]
+    if others:
+        axes += right[0].subplots(len(others), 1, sharex=True, squeeze=False, gridspec_kw={
+            "height_ratios": [sizes[kind] + 0.5 for kind in others]})[:, 0].tolist()
+    everything = [one.chi2_per_reading
+                  for one in (*diagnosis.groups_before, *diagnosis.groups_after)]
+    least, largest = min(0.9, *everything), max(1.1, *everything)
+    for axis, kind in zip(axes, [first, *others], strict=True):
+        names = [one.name for one in diagnosis.groups_before if one.kind == kind]
+        axis.axvline(1.0, color=PUBLISHED, lw=0.8)
+        for found, colour, marker, label in (
+                (diagnosis.groups_before, BEFORE, "o", "before"),
+                (diagnosis.groups_after, AFTER, "s", "after")):
+            for one in found:
+                if one.kind == kind and one.name in names:
+                    axis.plot(one.chi2_per_reading, names.index(one.name), marker, color=colour,
+                              ms=6, mfc=colour if one.disagrees else "white")
+            axis.plot([], [], marker, color=colour, label=label)
+        axis.set_yticks(range(len(names)), names, fontsize="small")
+        axis.set_ylim(len(names) - 0.4, -0.6)
+        axis.set_title(GROUP_TITLES.get(kind, kind), fontsize="medium", loc="left")
+        axis.grid(alpha=0.3, axis="x")
+        if largest > 5:
+            axis.set_xscale("log")
+        axis.set_xlim(0.9 * least, 1.05 * largest)
+    axes[0].legend(fontsize="small")
+    for axis in (axes[0], axes[-1]):
+        axis.set_xlabel("chi² per reading (1 expected)")
+    return figure
+
+
+def _residuals(diagnosis: Diagnosis) -> Figure:
+    """One row for each component (or kind of coefficient) and radius, if they are not too many."""
+    observation = diagnosis.before.observation
+    chosen = ~diagnosis.before.held_out
+    labels = np.array(["".join(c for c in label if not c.isdigit())
+                       for label in observation.labels])[chosen]
+    radius = np.round(observation.radii[chosen], 5)
+    rows = [(label, r) for label in dict.fromkeys(labels.tolist()) for r in np.unique(radius)]
+    apart = len(rows) <= MOST_BARS
+    if not apart:
+        rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
+    figure = Figure(figsize=(9, 1.2 + 1.15 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+    coloured = False
+    for (label, r), pair in zip(rows, axes, strict=True):
+        mine = np.flatnonzero((labels == label) & ((radius == r) | (not apart)))
+        for axis, values in zip(pair, (diagnosis.left_out_before, diagnosis.left_out_after),
+                                strict=True):
+            coloured |= _residual_map(axis, diagnosis.before, np.flatnonzero(chosen)[mine],
+                                      values[mine])
+        pair[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
+                           + "\n" + pair[0].get_ylabel())
+        pair[1].set_ylabel("")
+    for axis, when in zip(axes[0], ("before", "after"), strict=True):
+        axis.set_title(when)
+    for axis in axes[-1]:
+        axis.set_xlabel("z in m")
+    if coloured:
+        figure.colorbar(_colours(RESIDUAL_LIMIT), ax=list(axes.ravel()), extend="both", aspect=40,
+                        shrink=0.8, label="standardized residual")
+    return figure
+
+
+def _residual_map(axis: Axes, update: Update, readings: Ints, values: Floats) -> bool:
+    """Residuals over z and angle, or over z alone where there is but one line; tells which."""
+    x, y, z = update.observation.positions[readings].T
+    numbers = ["".join(c for c in update.observation.labels[one] if c.isdigit())
+               for one in readings]
+    up = np.degrees(np.arctan2(y, x)) % 360
+    name = "angle in °"
+    if all(numbers):
+        up, name = np.array(numbers, float), "order"
+    if len(np.unique(np.round(up))) < 3:
+        axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.3, lw=0)
+        axis.plot(z, values, ".", color=MEASURED, ms=3)
+        axis.set_ylabel("residual")
+        return False
+    columns, column = np.unique(np.round(z, 6), return_inverse=True)
+    rows, row = np.unique(np.round(up, 3), return_inverse=True)
+    limits = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
+    if len(columns) * len(rows) <= 4 * len(values) and len(columns) > 1:
+        grid = np.full((len(rows), len(columns)), np.nan)
+        order = np.argsort(np.abs(values))  # the largest of a cell shows
+        grid[row[order], column[order]] = values[order]
+        axis.pcolormesh(columns, rows, grid, shading="nearest", rasterized=True, **limits)
+    else:
+        axis.scatter(z, up, c=values, s=9, **limits)
+    if name == "order":
+        axis.set_yticks(rows)
+    else:
+        axis.set_yticks([0, 120, 240])
+    axis.set_facecolor("#eeeeee")
+    axis.set_ylabel(name)
+    return True
+
+
+def _colours(limit: float) -> ScalarMappable:
+    return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
+
+
+def _probabilities(diagnosis: Diagnosis) -> Figure:
+    top = sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])[:MOST_BARS]
+    bars = []
+    for one in diagnosis.named:
+        bars.append((one.found.candidate.name, one.found.log_bayes_factor, AFTER))
+        bars += [(f"or {candidate.name}", factor, PUBLISHED) for candidate, factor in rivals(one)]
+    bars = bars[:2 * MOST_BARS]
+    figure = Figure(figsize=(9, 1.4 + 0.3 * max(len(top), len(bars))), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.barh([name for name, _ in top], [100 * value for _, value in top], color=AFTER)
+    for height, (_, value) in enumerate(top):
+        said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
+        left.text(100 * value + 1, height, said, va="center", fontsize="small")
+    left.set_xlim(0, 130)
+    left.set_xticks(range(0, 101, 20))
+    left.set_xlabel("probability in %, if at most one is missing")
+    if bars:
+        right.barh(range(len(bars)), [value for _, value, _ in bars],
+                   color=[colour for *_, colour in bars])
+        right.set_yticks(range(len(bars)), [name for name, *_ in bars])
+        right.axvline(FOUND, color=MEASURED, lw=0.8, ls="--")
+        right.set_xlabel("log Bayes factor")
+    else:
+        right.text(0.5, 0.5, "no effect was found", ha="center", transform=right.transAxes)
+        right.set_axis_off()
+    for axis in (left, right):
+        axis.set_ylim(max(len(top), len(bars)) - 0.4, -0.6)
+    return figure
+
+
+def _profile(diagnosis: Diagnosis) -> Figure:
+    before, after = diagnosis.before, diagnosis.after
+    label, index, along, name = _line(before, diagnosis.left_out_before)
+    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
+    held, measured = before.held_out[index], before.readings[index]
+    for update, colour, when in ((before, BEFORE, "predicted, before"),
+                                 (after, AFTER, "predicted, after")):
+        top.plot(along, update.prediction_posterior.mean[index], color=colour, lw=1.2, label=when)
+        residual = 1e3 * (update.readings - update.prediction_posterior.mean)[index]
+        bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
+        bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
+    top.plot(along[~held], measured[~held], ".", color=MEASURED, ms=4, label="measured, training")
+    top.plot(along[held], measured[held], "o", mfc="none", color=MEASURED, ms=4,
+             label="measured, held out")
+    band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
+    bottom.fill_between(along, -band, band, color=AFTER, alpha=0.2, lw=0)
+    x, y, _ = 1e3 * before.observation.positions[index[0]]
+    top.set_title(f"{label} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
+                  else f"{label} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
+    top.set_ylabel(f"{label} in T")
+    top.legend(fontsize="small")
+    bottom.set_ylabel("measured − predicted\nin mT")
+    bottom.set_xlabel(name)
+    for axis in (top, bottom):
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def _line(update: Update, left_out: Floats) -> tuple[str, Ints, Floats, str]:
+    """The readings of a profile: the line along z, or circle, of one component that fitted worst.
+
+    ``left_out`` are the standardized residuals of the training readings.
+    """
+    worst = np.full(len(update.readings), np.nan)
+    worst[~update.held_out] = left_out**2
+    labels, positions = np.array(update.observation.labels), update.observation.positions
+    along_z = float(np.ptp(positions[:, 2])) > 0
+    where_to = np.round(positions[:, :2] if along_z else update.observation.radii[:, None], 6)
+    groups = [np.flatnonzero((labels == label) & (where_to == one).all(axis=1))
+              for label in dict.fromkeys(update.observation.labels)
+              for one in np.unique(where_to, axis=0)]
+    longest = max(len(group) for group in groups)
+    index = max((group for group in groups if 2 * len(group) >= longest
+                 and not np.isnan(worst[group]).all()),
+                key=lambda group: float(np.nanmean(worst[group])))
+    x, y, z = positions[index].T
+    along = z if along_z else np.degrees(np.arctan2(y, x)) % 360
+    order = np.argsort(along, kind="stable")
+    return (str(labels[index[0]]), index[order], along[order],
+            "z in m" if along_z else "angle in °")
+
+
+def _parts(update: Update, vectors: Floats) -> dict[str, Floats]:
+    """Magnetizations (parameters, ...) in A/m by block, (blocks, ...): along and across the easy
+    axis and along z, in % and mrad of the nominal one.
+    """
+    dimension = update.study.dimension
+    nominal = update.response.nominal.reshape(-1, dimension)
+    length = np.linalg.norm(nominal, axis=1)
+    length[length == 0] = np.inf  # a block that is missing
+    axis = nominal / length[:, None]
+    across = np.zeros_like(axis)
+    across[:, 0], across[:, 1] = -axis[:, 1], axis[:, 0]
+    relative = vectors.reshape(len(nominal), dimension, -1) / length[:, None, None]
+    found = {"along the easy axis in %": 100 * np.einsum("bck,bc->bk", relative, axis),
+             "across it in mrad": 1e3 * np.einsum("bck,bc->bk", relative, across)}
+    if dimension == 3:
+        found["along z in mrad"] = 1e3 * relative[:, 2]
+    return found
+
+
+def _deviations(update: Update) -> dict[str, Floats]:
+    """Posterior less prior mean by component, (rings, slots)."""
+    array = update.study.array
+    return {name: values.reshape(array.rings, array.blocks_per_ring) for name, values in
+            _parts(update, update.posterior.mean - update.prior.mean).items()}
+
+
+def _magnetizations(diagnosis: Diagnosis) -> Figure:
+    before, after = _deviations(diagnosis.before), _deviations(diagnosis.after)
+    array = diagnosis.before.study.array
+    figure = Figure(figsize=(9, 1.0 + len(before) * (1.0 + 0.14 * array.rings)),
+                    layout="constrained")
+    axes = figure.subplots(len(before), 2, sharex=True, sharey=True, squeeze=False)
+    for pair, (name, old) in zip(axes, before.items(), strict=True):
+        limit = float(max(np.abs(old).max(), np.abs(after[name]).max())) or 1.0
+        for axis, values in zip(pair, (old, after[name]), strict=True):
+            axis.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
+                        origin="lower",
+                        extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
+            axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 6)))
+        figure.colorbar(_colours(limit), ax=list(pair), label=name.replace(" in", "\nin"))
+        pair[0].set_ylabel("ring")
+    for axis, when in zip(axes[0], ("before", "after"), strict=True):
+        axis.set_title(when)
+    for axis in axes[-1]:
+        axis.set_xlabel("slot")
+    return figure
+
+
+def _structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Rms changes of the magnetizations, before and after, and what the prior allows."""
+    before, after = _deviations(diagnosis.before), _deviations(diagnosis.after)
+    prior = _parts(diagnosis.before, diagnosis.before.prior.root)
+    return [{"rms change of the magnetizations": name,
+             "prior sd": f"{np.sqrt(np.mean(np.sum(prior[name]**2, axis=1))):.3g}"} | {
+        when: f"{np.sqrt(np.mean(one[name]**2)):.3g}"
+        for when, one in (("before", before), ("after", after))} for name in before]
+
+
+def _empty(text: str) -> Figure:
+    figure = Figure(figsize=(8, 1), layout="constrained")
+    axis = figure.subplots()
+    axis.text(0.5, 0.5, text, ha="center", transform=axis.transAxes)
+    axis.set_axis_off()
+    return figure
