@@ -56,6 +56,22 @@ def posterior_time(note: Note) -> None:
          f"whitening and numpy's product in one piece: {product:.2f} s")
 
 
+def linear_errors(note: Note) -> None:
+    """The paper's linear case from B: errors of all magnetizations over their sd."""
+    folder = STUDIES / "linear-3d"
+    study, field = read_study(folder / "study.toml"), read_map(folder / "field.h5")
+    assert study.noise is not None
+    sigma = study.noise.regions[0].sigma_T
+    noise = sigma * np.random.default_rng(1).standard_normal(field["B_T"].shape)
+    truth = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1).ravel()
+    with tempfile.TemporaryDirectory() as name:
+        update = infer(study, field.assign(B_T=field["B_T"] + noise),
+                       Workshop(find_getdp(), Path(name), jobs=2))
+    z = (update.posterior.mean - truth) / update.posterior.sd
+    note("inference.linear_z_rms", float(np.sqrt(np.mean(z**2))), "",
+         f"{len(truth)} parameters from {len(update.readings)} readings of magpylib and NGSolve")
+
+
 def nonlinear(note: Note) -> None:
     """The paper's non-linear case, with the truth drawn from its prior; and the paper's sampler."""
     folder = STUDIES / "nonlinear-2d"
@@ -96,4 +112,5 @@ def nonlinear(note: Note) -> None:
 def run(note: Note) -> None:
     """Measure and note."""
     posterior_time(note)
+    linear_errors(note)
     nonlinear(note)

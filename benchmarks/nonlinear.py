@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.note import Note
 from halbach_fe import getdp as runner
+from halbach_fe.campaign.bodies import law_of
 from halbach_fe.cli import common
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.getdp import find_getdp
@@ -23,7 +24,7 @@ from halbach_fe.observation import observe, points_from
 from halbach_fe.routes import exact_part, finite_element_part
 from halbach_fe.solve import CROSS_SECTION, Workshop, newton_history, stage
 from halbach_fe.study import Study, read_study
-from tests.oracles import dipole_of, iron_of, ngsolve_model, ngsolve_nonlinear
+from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 
 STUDIES = Path(__file__).parent.parent / "studies"
 STUDY, FASER_IRON = STUDIES / "sensitivity" / "study.toml", STUDIES / "faser" / "iron.toml"
@@ -74,7 +75,7 @@ def faser(note: Note) -> None:
         "GiB", "peak of this process and of two of GetDP's")
     main_field = float(np.abs(exact_part(study, points) + part).max())
     common.say("the same by NGSolve")
-    dipole, iron = dipole_of(study), iron_of(study.iron_ring)
+    dipole, iron = dipole_of(study), law_of(study.iron_ring)
     with ngsolve.TaskManager():
         mesh = ngsolve_model.eighth(dipole, 0.02, bore_size=0.04, far=3.0, grading=0.35)
         theirs = ngsolve_nonlinear.potential_reaction(dipole, iron, mesh, 3, points)

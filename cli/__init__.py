@@ -6,11 +6,23 @@ import argparse
 from collections.abc import Sequence
 from importlib import metadata
 
-from halbach_fe.cli import common, diagnose, doctor, infer, plan, prior, schema, solve, verify
+from halbach_fe.cli import (
+    common,
+    diagnose,
+    doctor,
+    infer,
+    plan,
+    prior,
+    schema,
+    simulate_measurement,
+    solve,
+    verify,
+)
 from halbach_fe.errors import EXIT_CODES
 
 VERBS = {"solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify, "plan": plan,
-         "prior": prior, "doctor": doctor, "schema": schema}
+         "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
+         "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:

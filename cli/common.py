@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import signal
 import sys
@@ -83,6 +84,14 @@ def positive(text: str) -> int:
     return value
 
 
+def positive_number(text: str) -> float:
+    """Parse a number above 0."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
+    return value
+
+
 def guarded(run: Callable[[], int]) -> int:
     """Run something and return its exit code; errors become one sentence on stderr.
 
@@ -116,15 +125,21 @@ def guarded(run: Callable[[], int]) -> int:
 def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
     """A workshop in the output folder; shows progress on a terminal's stderr."""
     getdp = find_getdp(arguments.getdp)
+    with progress_bar("solving") as show:
+        yield Workshop(
+            getdp=getdp, folder=arguments.output, jobs=arguments.jobs,
+            time_limit_s=arguments.time_limit, progress=show)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """What is called with done and total, and shows it on a terminal's stderr."""
     console = Console(stderr=True)
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
                   MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
                   disable=not console.is_terminal) as bar:
-        task = bar.add_task("solving", total=None)
-        yield Workshop(
-            getdp=getdp, folder=arguments.output, jobs=arguments.jobs,
-            time_limit_s=arguments.time_limit,
-            progress=lambda done, total: bar.update(task, completed=done, total=total))
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def print_json(value: object) -> None:

@@ -21,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
+    parser.add_argument("--held-out", type=Path, metavar="MAP",
+                        help="another map, which is only predicted, at positions of its own")
     parser.add_argument("--blocks", type=Path, metavar="CSV",
                         help="moments of the single blocks, in place of the study's prior")
     parser.add_argument("--samples", type=common.positive, metavar="N",
@@ -43,8 +45,10 @@ def run(arguments: argparse.Namespace) -> int:
             f"Input --samples must go with iron that has an H(B) curve; study {study.name} is "
             "linear, and its posterior has a closed form. Leave it out.")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    unseen = read_map(arguments.held_out) if arguments.held_out else None
     with common.workshop(arguments) as workshop:
-        update = infer(study, data, workshop, blocks, linearized_only=bool(arguments.samples))
+        update = infer(study, data, workshop, blocks, linearized_only=bool(arguments.samples),
+                       unseen=unseen)
         if arguments.samples:
             write_update(update, arguments.output)  # should the chains not do
             from halbach_fe.sampled import (  # ArviZ takes seconds to load

@@ -34,7 +34,6 @@ from halbach_fe.diagnosis.selection import (
 )
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Place
-from halbach_fe.field_map import points_of
 from halbach_fe.instrument import map_time
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
@@ -164,7 +163,8 @@ class Diagnosis:
 
 def diagnose(
     study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
-    effects: Sequence[Effect] | None = None, say: Say = lambda text: None,
+    effects: Sequence[Effect] | None = None, unseen: xr.Dataset | None = None,
+    say: Say = lambda text: None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain a map.
 
@@ -172,17 +172,21 @@ def diagnose(
     ----------
     effects : sequence of Effect, optional
         To choose from; default the whole catalogue.
+    unseen : Dataset, optional
+        Another map, which is only predicted.
     """
     effects = catalogue() if effects is None else effects
     named: tuple[Named, ...] = ()
     signatures: Signatures = {}
+    times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
     for number in range(MOST_ROUNDS):
         say(f"round {number + 1}: the model with "
             f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
         now = applied(study, named)
-        update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks)
-        search = look(study, update, data, workshop, effects, named, signatures)
+        update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks,
+                       unseen=unseen)
+        search = look(study, update, times, workshop, effects, named, signatures)
         first = first or (update, search)
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
@@ -209,7 +213,7 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 
 def look(
-    study: Study, update: Update, data: xr.Dataset, workshop: Workshop,
+    study: Study, update: Update, times: Floats, workshop: Workshop,
     effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
@@ -228,8 +232,8 @@ def look(
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
-    scene = _scene_of(update.study, data, workshop)
-    bare = _scene_of(study, data, workshop)
+    scene = _scene_of(update.study, update, times, workshop)
+    bare = _scene_of(study, update, times, workshop)
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     hypotheses: list[Hypothesis] = []
     candidates: list[Candidate] = []
@@ -300,9 +304,9 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
                    tuple(points[int(np.argmax(size))].tolist()), source)
 
 
-def _scene_of(study: Study, data: xr.Dataset, workshop: Workshop) -> Scene:
-    points = points_of(data)
-    return Scene(study, points, map_time(data),
+def _scene_of(study: Study, update: Update, times: Floats, workshop: Workshop) -> Scene:
+    points = update.observation.map_points
+    return Scene(study, points, times,
                  lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
 
 

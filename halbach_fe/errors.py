@@ -80,6 +80,12 @@ class SamplingError(HalbachError):
     exit_code = 10
 
 
+class ExtraMissingError(HalbachError):
+    """An optional part of the installation is needed and is not there."""
+
+    exit_code = 11
+
+
 class CheckFailedError(HalbachError):
     """A self-check ran and its figure was out of bounds."""
 
@@ -98,6 +104,7 @@ EXIT_CODES: dict[int, str] = {
     OutputError.exit_code: "results could not be written or read back",
     CheckFailedError.exit_code: "a self-check failed",
     SamplingError.exit_code: "the posterior was not sampled well enough",
+    ExtraMissingError.exit_code: "an optional part is not installed",
     130: "interrupted (Ctrl-C)",
 }
 

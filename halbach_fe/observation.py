@@ -22,6 +22,9 @@ from halbach_fe.instrument import probe
 from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
 from halbach_fe.study import Noise as NoiseSettings
 
+RADIUS_M = 1e-4
+"""How well a radius is met: maps have rounded coordinates, and circles lie farther apart."""
+
 ROUNDING = 1e-12
 """Correlations below it are none: sums over a circle's points cancel to 1e-15."""
 
@@ -84,9 +87,20 @@ class Observation:
             sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
             norms = np.linalg.norm(field, axis=1)[::sensors]
             return np.asarray(norms[self.analysis.indices // len(COMPONENTS)])
-        circles = len(np.unique(self.positions, axis=0))
-        parts = self.apply(field).reshape(circles, 2, -1)  # A_1 ... A_K, B_1 ... B_K of each
+        harmonics = int(self.labels[-1][1:])
+        parts = self.apply(field).reshape(-1, 2, harmonics)  # A_1 ... A_K, B_1 ... B_K of each
         return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
+
+
+def together(one: Observation, other: Observation) -> Observation:
+    """The readings of two maps, one after the other."""
+    def joined(first: sparse.csr_array, second: sparse.csr_array) -> sparse.csr_array:
+        return sparse.csr_array(sparse.block_diag([first, second]))
+
+    return Observation(
+        np.vstack([one.points, other.points]), joined(one.operator, other.operator),
+        joined(one.analysis, other.analysis), np.vstack([one.map_points, other.map_points]),
+        one.labels + other.labels, np.vstack([one.positions, other.positions]))
 
 
 def points_from(positions: Positions) -> Floats:
@@ -272,10 +286,41 @@ def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
                             shape=covariance.shape)
 
 
-def held_out(study: Study, z: Floats) -> NDArray[np.bool_]:
-    """Tell which readings at heights z (n,) in m the study keeps from the update."""
+def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:
+    """Tell which readings the study keeps from the update, (readings,).
+
+    Raises
+    ------
+    MeasurementError
+        If a key of the study holds out none, or all together hold out all.
+    """
     settings = study.inference.held_out
+    chosen = np.zeros(len(observation), bool)
     if settings is None:
-        return np.zeros(len(z), bool)
-    _, rank = np.unique(np.round(z, 9), return_inverse=True)
-    return np.asarray((rank // settings.window) % settings.every == settings.every - 1)
+        return chosen
+    z = observation.positions[:, 2]
+    if settings.every is not None:
+        _, rank = np.unique(np.round(z, 9), return_inverse=True)
+        chosen = (rank // settings.window) % settings.every == settings.every - 1
+        if not chosen.any():
+            raise MeasurementError(must_be(
+                "readings", "map", "at enough z positions for the study to hold some out",
+                f"{rank.max() + 1} positions",
+                "Remove inference.held_out, or make its window smaller."))
+    named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, RADIUS_M)
+             for radius in settings.radii_m}
+    named |= {f"components = {one}": np.array(observation.components) == one
+              for one in settings.components}
+    named |= {f"z_ranges_m = {low:g}, {high:g}": (z >= low) & (z <= high)
+              for low, high in settings.z_ranges_m}
+    for name, mask in named.items():
+        if not mask.any():
+            raise MeasurementError(must_be(
+                "readings", "map", f"such that `inference.held_out.{name}` holds some of them out",
+                "none", "Correct or remove it."))
+        chosen = chosen | mask
+    if chosen.all():
+        raise MeasurementError(must_be(
+            "readings", "map", "enough for the study to leave some for the update",
+            f"{len(chosen)}, all held out", "Change inference.held_out."))
+    return chosen

@@ -495,14 +495,34 @@ class Prior(_Model):
 
 
 class HeldOut(_Model):
-    """Which readings are kept from the update and only predicted.
+    """Which readings are kept from the update and only predicted: all that any key names.
 
     Readings are grouped in runs of ``window`` consecutive z positions; the last of every
-    ``every`` runs is held out.
+    ``every`` runs is held out (without any key: of every 2). ``radii_m`` are distances from the
+    axis, ``z_ranges_m`` pairs of limits.
     """
 
-    every: Annotated[int, Field(ge=2, le=1000)] = 2
+    every: Annotated[int, Field(ge=2, le=1000)] | None = None
     window: Annotated[int, Field(ge=1, le=100_000)] = 1
+    radii_m: tuple[Gap, ...] = ()
+    components: tuple[Component, ...] = ()
+    z_ranges_m: tuple[tuple[Coordinate, Coordinate], ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _windows(cls, given: Any) -> Any:
+        alone = isinstance(given, dict) and not given.keys() - {"window"}
+        return given | {"every": 2} if alone else given
+
+    @model_validator(mode="after")
+    def _consistent(self) -> HeldOut:
+        if self.every is None and self.window > 1:
+            raise ValueError("window needs every: the last of how many windows is held out?")
+        for low, high in self.z_ranges_m:
+            if low > high:
+                raise ValueError(f"z_ranges_m must be pairs of a lower and an upper limit, not "
+                                 f"[{low}, {high}]")
+        return self
 
 
 class Inference(_Model):
@@ -563,11 +583,14 @@ class Study(_Model):
             raise ValueError("a 3D study needs array.ring_length_m")
         if self.dimension == 2 and self.array.rings != 1:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
-        fourier = self.observation.quantity == "fourier_coefficients"
-        regions = self.noise.regions if self.noise else ()
-        if fourier and any(set(one.components) != set(COMPONENTS) for one in regions):
-            raise ValueError("noise.regions may name components of flux_density only; Fourier "
-                             "coefficients have none")
+        held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
+        by_component = {
+            "noise.regions": any(set(one.components) != set(COMPONENTS) for one in regions),
+            "inference.held_out": bool(held_out and held_out.components)}
+        for key, named in by_component.items():
+            if named and self.observation.quantity == "fourier_coefficients":
+                raise ValueError(f"{key} may name components of flux_density only; Fourier "
+                                 "coefficients have none")
         slots = sorted(slot for one in self.prior.types.values() for slot in one)
         if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
             raise ValueError(f"prior.types must name every slot from 1 to "

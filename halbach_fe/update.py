@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -37,6 +37,7 @@ from halbach_fe.observation import (
     noise_regions,
     observe,
     reading_noise,
+    together,
 )
 from halbach_fe.response import Response, response
 from halbach_fe.solve import Workshop
@@ -45,7 +46,7 @@ from halbach_fe.study import Study, is_nonlinear
 ALL_READINGS = "all"
 """The one region of a study without noise regions."""
 
-TRAINING, HELD_OUT = "training", "held out"
+TRAINING, HELD_OUT, HELD_OUT_MAP = "training", "held out", "held-out map"
 LINEAR_ENOUGH = 0.3
 """Of the error bar: what linearizing the iron may move a reading without a word."""
 
@@ -74,9 +75,10 @@ class RegionScore:
     """How prior and posterior predict the readings of one region.
 
     Relative errors are ``|measured - predicted| / |measured|``, of readings that are not 0;
-    coverage is the fraction of readings within the 95 % band of prediction and noise; chi2 is per
-    reading, by the full covariance of both. Both are None for training readings, which the
-    posterior has seen.
+    standardized residuals are those over the standard deviation of prediction and noise, coverage
+    the fraction within their 95 % band; chi2 is per reading, by the full covariance of both.
+    Coverage and chi2 are None for training readings, which the posterior has seen, and whose
+    standardized residuals by it are therefore smaller than 1.
     """
 
     region: str
@@ -84,6 +86,8 @@ class RegionScore:
     readings: int
     median_relative_error_prior: float | None
     median_relative_error_posterior: float | None
+    rms_standardized_prior: float
+    rms_standardized_posterior: float
     coverage95_prior: float | None
     coverage95_posterior: float | None
     chi2_prior: float | None
@@ -94,14 +98,16 @@ class RegionScore:
 class Update:
     """A study, a map, and what the one says about the other.
 
-    ``measured_blocks`` is how many blocks the prior was measured of; None if it is the study's.
+    ``parts`` and ``regions`` are those of each reading: training, held out, or of a map that is
+    only predicted; and the noise region. ``measured_blocks`` is how many blocks the prior was
+    measured of; None if it is the study's.
     """
 
     study: Study
     observation: Observation
     readings: Floats
     noise: Noise
-    held_out: NDArray[np.bool_]
+    parts: tuple[str, ...]
     regions: tuple[str, ...]
     response: Response
     prior: Gaussian
@@ -115,6 +121,11 @@ class Update:
     measured_blocks: int | None = None
 
     @cached_property
+    def held_out(self) -> NDArray[np.bool_]:
+        """Which readings (readings,) the update has not seen."""
+        return np.array(self.parts) != TRAINING
+
+    @cached_property
     def errors(self) -> Noise:
         """What readings may differ by from the model: their noise and the solver's error."""
         return self.noise.plus(self.response.error)
@@ -126,14 +137,18 @@ class Update:
 
     @property
     def scores(self) -> tuple[RegionScore, ...]:
-        """Scores by region, training and held-out readings apart."""
+        """Scores by region, and by part."""
         noise = self.study.noise
         names = [region.name for region in noise.regions] if noise else []
         return tuple(
             self._score(region, part, chosen)
             for region in dict.fromkeys(names or [ALL_READINGS])
-            for part, mask in ((TRAINING, ~self.held_out), (HELD_OUT, self.held_out))
-            if (chosen := mask & (np.array(self.regions) == region)).any())
+            for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)
+            if (chosen := self.chosen(region, part)).any())
+
+    def chosen(self, region: str, part: str) -> NDArray[np.bool_]:
+        """Which readings (readings,) are in a region and a part."""
+        return (np.array(self.regions) == region) & (np.array(self.parts) == part)
 
     @property
     def conflict_limit(self) -> float:
@@ -145,25 +160,53 @@ class Update:
         measured = np.where(self.readings != 0, np.abs(self.readings), np.nan)
         return np.asarray(np.abs(self.readings - prediction.mean) / measured)
 
+    def standardized(self, prediction: Prediction) -> Floats:
+        """Measured less predicted over the standard deviation of prediction, noise and solver
+        together, (readings,).
+
+        Of held-out readings whose noise is correlated with that of training readings, as that of
+        another component of the same point, with what the latter foretell taken off.
+        """
+        result = (self.readings - prediction.mean) / np.hypot(prediction.sd, self.sigma)
+        if not self.errors.independent and self.held_out.any():
+            residual, noise, root = self._unseen(prediction, self.held_out)
+            result[self.held_out] = residual / np.hypot(noise.sd, np.linalg.norm(root, axis=1))
+        return result
+
     def whitened(self, prediction: Prediction, chosen: NDArray[np.bool_]) -> Floats:
         """Residuals (chosen,) of some readings, whitened by the covariance of prediction, noise
-        and solver together.
+        and solver together: independent and standard normal if all is well and the posterior has
+        not seen them.
         """
-        residual = (self.readings - prediction.mean)[chosen]
-        return whitened(residual, self.errors.part(chosen), prediction.root(chosen))
+        return whitened(*self._unseen(prediction, chosen))
+
+    def _unseen(
+        self, prediction: Prediction, chosen: NDArray[np.bool_]
+    ) -> tuple[Floats, Noise, Floats]:
+        """Residuals of some readings, their noise, and the root of the prediction's covariance; of
+        what is left of each when all that the noise of other, training readings foretells is taken
+        off. Only then are noise and prediction independent.
+        """
+        seen = ~self.held_out & ~chosen
+        told, noise = self.errors.given(chosen, seen)
+        residual, root = self.readings - prediction.mean, prediction.root(chosen)
+        if told.nnz:
+            root = root - told @ prediction.root(seen)
+        return residual[chosen] - told @ residual[seen], noise, root
 
     def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
-        figures: dict[str, float | None] = {}
+        figures: dict[str, Any] = {}
         for name, prediction in (("prior", self.prediction_prior),
                                  ("posterior", self.prediction_posterior)):
             errors = self.relative_error(prediction)[chosen]
             errors = errors[~np.isnan(errors)]
             figures[f"median_relative_error_{name}"] = (
                 float(np.median(errors)) if len(errors) else None)
-            unseen = part == HELD_OUT
-            total = np.hypot(prediction.sd, self.sigma)[chosen]
-            inside = np.abs(self.readings - prediction.mean)[chosen] <= COVERAGE_Z * total
-            figures[f"coverage95_{name}"] = float(np.mean(inside)) if unseen else None
+            unseen = part != TRAINING
+            residuals = np.abs(self.standardized(prediction)[chosen])
+            figures[f"rms_standardized_{name}"] = float(np.sqrt(np.mean(residuals**2)))
+            figures[f"coverage95_{name}"] = float(
+                np.mean(residuals <= COVERAGE_Z)) if unseen else None
             figures[f"chi2_{name}"] = float(
                 np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
@@ -171,7 +214,7 @@ class Update:
 
 def infer(
     study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
-    prior: Gaussian | None = None, linearized_only: bool = False,
+    prior: Gaussian | None = None, linearized_only: bool = False, unseen: xr.Dataset | None = None,
 ) -> Update:
     """Update the block magnetizations of a study with a measured map.
 
@@ -188,46 +231,39 @@ def infer(
         Of the parameters in A/m, in place of both.
     linearized_only : bool
         Do not solve the updated magnet to see whether linearizing its iron was good enough.
+    unseen : Dataset, optional
+        Another map, which is only predicted.
 
     Raises
     ------
     MeasurementError
-        If the map or the blocks do not fit the study.
+        If a map or the blocks do not fit the study.
     """
     of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
-    points = points_of(data)
-    if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
+    observation, noise, readings = _measured(study, data)
+    keep = held_out(study, observation)
+    parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
+    if unseen is not None:
+        try:
+            other, its_noise, its_readings = _measured(study, unseen)
+        except MeasurementError as error:
+            raise MeasurementError(
+                str(error).replace(" of map must", " of held-out map must")) from None
+        observation, noise = together(observation, other), noise.beside(its_noise)
+        readings = np.concatenate([readings, its_readings])
+        parts += (HELD_OUT_MAP,) * len(other)
+        keep = np.array(parts) != TRAINING
+    heights = observation.points[:, 2]
+    if study.dimension == 2 and np.ptp(heights) > 0:
         raise MeasurementError(must_be(
             "points", "map", "in one plane for a 2D study",
-            f"z from {points[:, 2].min():g} to {points[:, 2].max():g} m",
+            f"z from {heights.min():g} to {heights.max():g} m",
             "Use a 3D study, or one circle of the map."))
-    inside = points_in_material(study, points)
-    if inside.any():
-        row = int(np.argmax(inside))
-        x, y, z = points[row]
-        raise MeasurementError(must_be(
-            f"reading {row + 1}", "map", "at a point in air",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron ({inside.sum()} such readings)",
-            "Check the study's radii and the map's axes and units."))
-    measured = ~np.isnan(data["B_T"].values)
-    observation = observe(study, points, measured)
-    noise = reading_noise(study, observation, data)
-    keep = held_out(study, observation.positions[:, 2])
-    if study.inference.held_out is not None and not keep.any():
-        raise MeasurementError(must_be(
-            "readings", "map", "at enough z positions for the study to hold some out",
-            f"{len(np.unique(observation.positions[:, 2]))} positions",
-            "Remove inference.held_out, or make its window smaller."))
-    if keep.all():
-        raise MeasurementError(must_be(
-            "readings", "map", "enough for the study to leave some for the update",
-            f"{len(keep)}, all held out", "Change inference.held_out."))
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
         names = [region.name for region in study.noise.regions]
         regions = tuple(names[i] for i in noise_regions(
             study.noise, observation.positions[:, 2], observation.components))
-    readings = observation.read(np.nan_to_num(without_remainder(study.instrument, data)))
     try:
         model = response(study, observation, workshop)
     except PointsOutsideError as error:
@@ -242,13 +278,29 @@ def infer(
     if is_nonlinear(study) and not linearized_only:
         _check_linearization(study, observation, workshop, model, after.mean, errors.sd)
     return Update(
-        study=study, observation=observation, readings=readings, noise=noise, held_out=keep,
+        study=study, observation=observation, readings=readings, noise=noise, parts=parts,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
         log_evidence=learnt.log_evidence,
         kind="linearized" if is_nonlinear(study) else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None)
+
+
+def _measured(study: Study, data: xr.Dataset) -> tuple[Observation, Noise, Floats]:
+    """A map as the study observes it, with its noise and its readings in T."""
+    points = points_of(data)
+    inside = points_in_material(study, points)
+    if inside.any():
+        row = int(np.argmax(inside))
+        x, y, z = points[row]
+        raise MeasurementError(must_be(
+            f"reading {row + 1}", "map", "at a point in air",
+            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron ({inside.sum()} such readings)",
+            "Check the study's radii and the map's axes and units."))
+    observation = observe(study, points, ~np.isnan(data["B_T"].values))
+    return (observation, reading_noise(study, observation, data),
+            observation.read(np.nan_to_num(without_remainder(study.instrument, data))))
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -289,11 +341,13 @@ def write_update(update: Update, folder: Path) -> None:
     columns = {
         "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
         "region": np.array(update.regions), "held_out": update.held_out.astype(int),
-        "measured_T": update.readings, "sigma_T": update.noise.sd,
+        "part": np.array(update.parts), "measured_T": update.readings, "sigma_T": update.noise.sd,
         "solver_error_T": update.response.error,
         "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
         "posterior_mean_T": update.prediction_posterior.mean,
-        "posterior_sd_T": update.prediction_posterior.sd}
+        "posterior_sd_T": update.prediction_posterior.sd,
+        "standardized_residual_prior": update.standardized(update.prediction_prior),
+        "standardized_residual": update.standardized(update.prediction_posterior)}
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(columns)

@@ -131,6 +131,21 @@ class Noise:
         """The noise of some readings."""
         return Noise(self.covariance[rows][:, rows])
 
+    def given(self, rows: Rows, seen: Rows) -> tuple[sparse.csr_array, Noise]:
+        """Matrix R (rows, seen) that foretells the noise of some readings from that of others, and
+        the noise of the first that remains: what R does not foretell is independent of the seen.
+        """
+        cross = self.covariance[rows][:, seen]
+        if not cross.nnz:
+            return cross, self.part(rows)
+        white = self.part(seen)._factors[1]
+        half = cross @ white.T
+        return half @ white, Noise(self.covariance[rows][:, rows] - half @ half.T)
+
+    def beside(self, other: Noise) -> Noise:
+        """The noise of these readings and others, which are independent of them."""
+        return Noise(sparse.csr_array(sparse.block_diag([self.covariance, other.covariance])))
+
     def plus(self, sd: Floats) -> Noise:
         """Add independent errors with standard deviations (n,) in T, which may be 0."""
         return Noise(sparse.csr_array(self.covariance + sparse.diags_array(sd**2)))

@@ -69,12 +69,12 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 f"where {before.conflict_limit:.3g} would be rare), and no effect of the catalogue "
                 "explains it, nor anything smooth: look for outliers, and at the noise."]
     if diagnosis.named:
-        old, new = (next((one for one in found[1:] if one.region == ALL_READINGS), found[0])
-                    for found in (scores(before, diagnosis.left_out_before),
-                                  scores(after, diagnosis.left_out_after)))
+        held = [next((f"; of held-out readings {one.chi2_per_reading:.3g}" for one in found[1:]), "")
+                for found in (scores(before, diagnosis.left_out_before),
+                              scores(after, diagnosis.left_out_after))]
         said.append(f"With {'it' if len(diagnosis.named) == 1 else 'them'} in the model, chi² per "
-                    f"{old.part.replace(' ', '-')} reading is {new.chi2_per_reading:.3g} (before: "
-                    f"{old.chi2_per_reading:.3g}).")
+                    f"reading is {after.prior_conflict:.3g}{held[1]} (before: "
+                    f"{before.prior_conflict:.3g}{held[0]}).")
         if after.prior_conflict > after.conflict_limit and unknown is None:
             said.append("That is still too much: they are not all that is wrong.")
     return said

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,37 +10,21 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.report.page import (
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    PUBLISHED,
-    axes_along,
-    save,
-    write_page,
+from halbach_fe.inference.linear import contraction
+from halbach_fe.report.page import POSTERIOR, save, write_page
+from halbach_fe.report.prediction import (
+    Published,
+    profile,
+    quantiles,
+    relative_error,
+    residuals,
 )
-from halbach_fe.update import COVERAGE_Z, HELD_OUT, Update
+from halbach_fe.update import Update
 
 NOTHING = "–"
+NUMBERED_SLOTS = 32
+"""More do not find room for their numbers."""
 
-
-@dataclass(frozen=True)
-class Published:
-    """Relative errors that somebody else published for the same readings.
-
-    Attributes
-    ----------
-    label : str
-    z : ndarray, shape (n,), in m
-        Increasing.
-    prior, posterior : ndarray, shape (n,)
-        Relative errors at z.
-    """
-
-    label: str
-    z: Floats
-    prior: Floats
-    posterior: Floats
 
 
 def score_table(update: Update, published: Published | None = None) -> list[dict[str, str]]:
@@ -53,6 +36,7 @@ def score_table(update: Update, published: Published | None = None) -> list[dict
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "prior": _percent(score.median_relative_error_prior),
             "posterior": _percent(score.median_relative_error_posterior),
+            "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading": NOTHING if score.chi2_posterior is None
             else f"{score.chi2_posterior:.3g}",
@@ -75,13 +59,26 @@ def write_report(
 
     ``assumptions`` are sentences that the reader must know before the numbers.
     """
+    unseen = ("of the held-out readings by prior and posterior" if update.held_out.any()
+              else "of the training readings by the prior (nothing was held out)")
     figures = {
-        "profile.png": (_profile(update), "Measured readings along z with the prior and posterior "
-                        "prediction and the posterior's residuals"),
-        "relative_error.png": (_relative_error(update, published), "Relative error along z of "
-                               "prior and posterior, logarithmic"),
+        "profile.png": (profile(update), "Measured readings with the prior and posterior "
+                        "prediction, and the posterior's residuals, along the line of the "
+                        "strongest reading"),
+        "relative_error.png": (relative_error(update, published), "Relative error of prior and "
+                               "posterior on the same line, logarithmic"),
+        "residuals.png": (residuals(update), "Residuals of all readings over the standard "
+                          "deviation of prediction and noise, before (top) and after the update "
+                          "(bottom); 95 % belong into the grey band, and more of the training "
+                          "readings after the update, which has seen them"),
+        "quantiles.png": (quantiles(update), f"Quantiles of residuals {unseen}, whitened by the "
+                          "full covariance of prediction and noise, against those of a normal "
+                          "distribution; on the line if all is well"),
         "blocks.png": (_blocks(update), "Posterior change of the magnetization along the easy "
                        "axis by ring and slot"),
+        "contraction.png": (_contraction(update), "What the readings tell of each block: by how "
+                            "much its variance shrinks from prior to posterior, 0 % nothing, "
+                            "100 % all"),
     }
     array = update.study.array
     write_page(
@@ -107,63 +104,7 @@ def _percent(value: float | None) -> str:
 
 
 def _z_of(update: Update, region: str, part: str) -> Floats:
-    mask = (np.array(update.regions) == region) & (update.held_out == (part == HELD_OUT))
-    return update.observation.positions[mask, 2]
-
-
-def _first_label(update: Update) -> tuple[str, Floats, np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """The readings that a figure along z shows: all of the first label, in order of z."""
-    label = update.observation.labels[0]
-    index = np.flatnonzero(np.array(update.observation.labels) == label)
-    z = update.observation.positions[index, 2]
-    order = np.argsort(z, kind="stable")
-    return label, z[order], index[order]
-
-
-def _profile(update: Update) -> Figure:
-    label, z, index = _first_label(update)
-    figure, (top, bottom) = axes_along(2, [2, 1])
-    held = update.held_out[index]
-    measured = update.readings[index]
-    top.plot(z, update.prediction_prior.mean[index], color=PRIOR, label="prior", lw=1.2)
-    top.plot(z, update.prediction_posterior.mean[index], color=POSTERIOR, label="posterior", lw=1.2)
-    top.plot(z[~held], measured[~held], ".", color=MEASURED, ms=4, label="measured, training")
-    top.plot(z[held], measured[held], "o", mfc="none", color=MEASURED, ms=4,
-             label="measured, held out")
-    top.set_ylabel(f"{label} in T")
-    top.legend()
-    residual = 1e3 * (measured - update.prediction_posterior.mean[index])
-    band = 1e3 * COVERAGE_Z * np.hypot(update.prediction_posterior.sd, update.sigma)[index]
-    bottom.fill_between(z, -band, band, color=POSTERIOR, alpha=0.2, lw=0, step="mid",
-                        label="95 % band of prediction and noise")
-    bottom.plot(z[~held], residual[~held], ".", color=MEASURED, ms=4)
-    bottom.plot(z[held], residual[held], "o", mfc="none", color=MEASURED, ms=4)
-    bottom.set_ylabel("measured − posterior\nin mT")
-    bottom.set_xlabel("z in m")
-    bottom.legend(loc="lower center")
-    return figure
-
-
-def _relative_error(update: Update, published: Published | None) -> Figure:
-    label, z, index = _first_label(update)
-    figure, (axis,) = axes_along(1)
-    figure.set_size_inches(8, 4.5)
-    held = update.held_out[index]
-    if published is not None:
-        axis.semilogy(published.z, published.prior, ":", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, prior")
-        axis.semilogy(published.z, published.posterior, "-", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, posterior")
-    for name, prediction, colour in (("prior", update.prediction_prior, PRIOR),
-                                     ("posterior", update.prediction_posterior, POSTERIOR)):
-        error = update.relative_error(prediction)[index]
-        axis.semilogy(z, error, "-", color=colour, lw=1, label=name)
-        axis.semilogy(z[held], error[held], "o", mfc="none", color=colour, ms=3,
-                      label=f"{name}, held out")
-    axis.set_xlabel("z in m")
-    axis.set_ylabel(f"|measured − predicted| / |measured| of {label}")
-    axis.legend(ncols=2, fontsize="small")
-    return figure
+    return update.observation.positions[update.chosen(region, part), 2]
 
 
 def _blocks(update: Update) -> Figure:
@@ -186,4 +127,30 @@ def _blocks(update: Update) -> Figure:
     axis.set_xticks(range(1, array.blocks_per_ring + 1))
     axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 12)))
     figure.colorbar(image, label="posterior change along\nthe easy axis in %")
+    return figure
+
+
+def _contraction(update: Update) -> Figure:
+    array = update.study.array
+    percent = 100 * contraction(update.prior, update.posterior, update.study.dimension).reshape(
+        array.rings, array.blocks_per_ring)
+    slots = np.arange(1, array.blocks_per_ring + 1)
+    figure = Figure(figsize=(8, 3 if array.rings == 1 else 1.8 + 0.25 * array.rings),
+                    layout="constrained")
+    axis = figure.subplots()
+    axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
+    if array.rings == 1:
+        bars = axis.bar(slots, percent[0], color=POSTERIOR)
+        if len(slots) <= NUMBERED_SLOTS:
+            axis.bar_label(bars, fmt="%.0f", fontsize=7)
+        axis.set(ylabel="variance taken in %", ylim=(0, 108), yticks=range(0, 101, 20))
+        return figure
+    image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
+                        extent=(0.5, len(slots) + 0.5, 0.5, array.rings + 0.5))
+    if len(slots) <= NUMBERED_SLOTS:
+        for (ring, slot), value in np.ndenumerate(percent):
+            axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
+                      color="white" if value < 50 else "black")
+    axis.set(ylabel="ring", yticks=range(1, array.rings + 1, max(1, array.rings // 12)))
+    figure.colorbar(image, label="variance taken in %")
     return figure

@@ -8,50 +8,71 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, save, write_page
-from halbach_fe.study import COMPONENTS
-from halbach_fe.update import Update
+from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.inference.prior import Gaussian
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, save, write_page
+from halbach_fe.study import COMPONENTS, Study
+
+
+def scores(one: Gaussian, truth: Floats) -> dict[str, float]:
+    """Errors of a distribution's mean, in A/m, and rms of error over standard deviation."""
+    error = one.mean - truth
+    return {"largest_error_A_per_m": float(np.abs(error).max()),
+            "rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
+            "z_rms": float(np.sqrt(np.mean((error / one.sd) ** 2)))}
 
 
 def write_magnetizations(
-    update: Update, truth: Floats, folder: Path, figures: Mapping[str, object], what: str,
-    ring: int = 1,
+    study: Study, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
+    files: str, figures: Mapping[str, object] | None = None, ring: int = 1,
 ) -> None:
-    """Write magnetizations.html and magnetizations.png of a ring, truth (parameters,) in A/m."""
+    """Write magnetizations.html, and magnetizations.png of a ring.
+
+    Parameters
+    ----------
+    known : mapping
+        Distributions of the magnetizations in A/m by name, the first (the prior) in orange.
+    truth : ndarray, shape (parameters,), in A/m
+    what : str
+        The page's title.
+    files : str
+        What stands beside the page for machines.
+    figures : mapping, optional
+        Other numbers to list.
+    ring : int
+        Whose magnetizations are drawn.
+    """
     pictures = save({"magnetizations.png": (
-        _figure(update, truth, ring), f"Deviation of the magnetizations of ring {ring} from "
-        "nominal: truth, prior and posterior with their standard deviations")}, folder)
-    rows = []
-    for name, one in (("prior", update.prior), ("posterior", update.posterior)):
-        error = one.mean - truth
-        rows.append((name, float(np.abs(error).max()), float(np.sqrt(np.mean(error**2))),
-                     float(np.sqrt(np.mean((error / one.sd) ** 2)))))
+        _figure(study, known, truth, ring), f"Deviation of the magnetizations of ring {ring} from "
+        f"nominal: truth, {', '.join(known)}, with their standard deviations")}, folder)
+    rows = [(name, *scores(one, truth).values()) for name, one in known.items()]
     write_page(folder / "magnetizations.html", "magnetizations.html.j2", pictures,
-               study=update.study, rows=rows, figures=figures, what=what)
+               study=study, rows=rows, figures=figures or {}, what=what, machine_files=files)
 
 
-def _figure(update: Update, truth: Floats, ring: int) -> Figure:
-    size = update.study.dimension
-    slots = update.study.array.blocks_per_ring
+def _figure(study: Study, known: Mapping[str, Gaussian], truth: Floats, ring: int) -> Figure:
+    size = study.dimension
+    slots = study.array.blocks_per_ring
     part = slice((ring - 1) * slots * size, ring * slots * size)
-    nominal = update.response.nominal[part]
+    blocks = blocks_of(study)[(ring - 1) * slots:ring * slots]
+    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     figure = Figure(figsize=(8, 1 + 2.4 * size), layout="constrained")
     axes = figure.subplots(size, 1, sharex=True)
     places = np.arange(1, slots + 1)
+    shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
     for axis, component in zip(axes, range(size), strict=True):
         def of(values: Floats, component: int = component) -> Floats:
             return np.asarray(1e-3 * values[component::size])
 
-        for name, one, colour, shift in (("prior", update.prior, PRIOR, -0.15),
-                                         ("posterior", update.posterior, POSTERIOR, 0.15)):
+        for (name, one), colour, shift in zip(known.items(), (PRIOR, POSTERIOR, SECOND), shifts,
+                                              strict=False):
             axis.errorbar(places + shift, of(one.mean[part] - nominal), of(one.sd[part]),
                           color=colour, fmt="o", ms=4, capsize=2, label=name)
         axis.plot(places, of(truth[part] - nominal), "_", color=MEASURED, ms=14, mew=2,
                   label="truth", zorder=3)
         axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
         axis.grid(alpha=0.3)
-    axes[0].legend(ncols=3, fontsize="small")
+    axes[0].legend(ncols=4, fontsize="small")
     axes[-1].set_xlabel("slot")
     axes[-1].set_xticks(places)
     return figure

@@ -21,6 +21,7 @@ from halbach_fe.update import write_text
 
 # Okabe and Ito's colours, told apart by every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
+SECOND = "#009E73"
 IRON = "#56B4E9"
 
 Picture = tuple[str, str]

@@ -18,7 +18,8 @@ import numpy as np
 from halbach_fe.blocks import Floats
 from halbach_fe.cli import common
 from halbach_fe.field_map import field_map, read_map, write_map
-from halbach_fe.report.inference import Published, score_table, write_report
+from halbach_fe.report.inference import score_table, write_report
+from halbach_fe.report.prediction import Published
 from halbach_fe.study import Study, read_study
 from halbach_fe.update import Update, infer, write_update
 

@@ -1,9 +1,9 @@
 """Write the synthetic campaigns of the study.
 
-Fields are by NGSolve (another mesher, order 5, the steel's law written anew), with noise. Needs the
-tests' dependencies::
+Fields are by magpylib and NGSolve (another mesher, order 5, the steel's law written anew), with
+noise. Needs ``halbach-fe[campaign]``::
 
-    PYTHONPATH=. python studies/nonlinear-2d/make_campaign.py
+    python studies/nonlinear-2d/make_campaign.py
 
 ``map-paper.csv`` is of the truth that the paper publishes; ``map-drawn.csv`` of one drawn from the
 paper's prior, as which the published one, 0.44 of the prior's standard deviations away, is not.
@@ -11,17 +11,17 @@ paper's prior, as which the published one, 0.44 of the prior's standard deviatio
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import ngsolve
 import numpy as np
 
 from halbach_fe.blocks import blocks_of
+from halbach_fe.campaign.bodies import magnet_of
+from halbach_fe.campaign.reaction import Elements
+from halbach_fe.campaign.simulate import field_of
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import points_from
 from halbach_fe.study import read_study
-from tests.oracles import ngsolve_nonlinear, section_of
 
 HERE = Path(__file__).parent
 SEED = 3
@@ -40,14 +40,11 @@ def main() -> None:
     sigma = study.noise.regions[0].sigma_T
     for name, deviation in (("paper", table["truth_A_per_m"]), ("drawn", drawn)):
         truth = nominal + deviation.reshape(2, -1).T
-        section = replace(section_of(study), magnetizations=truth)
-        with ngsolve.TaskManager():
-            mesh = ngsolve_nonlinear.disk(section, 0.01)
-            field = ngsolve_nonlinear.section_field(section, mesh, 5, points)
+        field = field_of(magnet_of(study).with_magnetizations(truth), points, Elements(0.01))
         field[:, :2] += sigma * generator.standard_normal((len(points), 2))
         field[:, 2] = np.nan
         write_map(field_map(points, field, attributes={
-            "source": f"NGSolve, order 5, {name} magnetizations",
+            "source": f"magpylib and NGSolve, order 5, {name} magnetizations",
             "noise": f"{sigma:g} T, seed {SEED}"}), HERE / f"map-{name}.csv")
         np.savetxt(HERE / f"truth-{name}.csv", truth, "%.6f", ",", header="Mx_A_per_m,My_A_per_m",
                    comments="")

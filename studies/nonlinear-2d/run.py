@@ -20,7 +20,7 @@ from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.cli import common
 from halbach_fe.field_map import read_map
 from halbach_fe.inference.prior import Gaussian
-from halbach_fe.report.magnetizations import write_magnetizations
+from halbach_fe.report.magnetizations import scores, write_magnetizations
 from halbach_fe.sampled import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.study import Study, read_study
 from halbach_fe.update import infer, write_text
@@ -48,14 +48,6 @@ def published(study: Study) -> tuple[Gaussian, dict[str, float]]:
                    "z_rms": float(np.sqrt(np.mean((error / sd["posterior_B"]) ** 2)))}
 
 
-def scores(mean: Floats, sd: Floats, truth: Floats) -> dict[str, float]:
-    """The same figures of a mean and standard deviation."""
-    error = mean - truth
-    return {"rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
-            "largest_error_A_per_m": float(np.abs(error).max()),
-            "z_rms": float(np.sqrt(np.mean((error / sd) ** 2)))}
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run both cases and print their table."""
     study = read_study(arguments.study)
@@ -71,9 +63,13 @@ def run(arguments: argparse.Namespace) -> int:
                                      say=common.say)
         write_sampled(found, folder)
         updated = with_samples(update, found)
-        results[f"{what}: prior"] = dict(scores(prior.mean, prior.sd, truth))
-        results[f"{what}: posterior"] = scores(found.mean, found.sd, truth) | sampled_summary(found)
-        write_magnetizations(updated, truth, folder, sampled_summary(found), what)
+        results[f"{what}: prior"] = dict(scores(prior, truth))
+        results[f"{what}: posterior"] = scores(
+            updated.posterior, truth) | sampled_summary(found)
+        write_magnetizations(
+            study, {"prior": prior, "posterior": updated.posterior}, truth, folder,
+            f"the magnetizations of {what}", "sampled.json, sampled.csv, chains.nc",
+            sampled_summary(found))
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     common.print_table([{"what": name} | {key: f"{row[key]:.4g}" for key in paper}

@@ -94,6 +94,22 @@ def test_infer_writes_everything(study, measured, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["parameters"] == 16
 
 
+def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
+    """Which is only predicted; its errors name its file."""
+    out, other = tmp_path / "out", tmp_path / "other.csv"
+    write_map(field_map(circle(0.02, 6), np.tile([0.55, 0.0, np.nan], (6, 1))), other)
+    arguments = ["infer", str(study), "--measurements", str(measured), "--held-out", str(other),
+                 "-o", str(out)]
+    assert main([*arguments, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["readings"], summary["held_out"]) == (32, 12)
+    assert summary["scores"][1]["part"] == "held-out map"
+    other.write_text(other.read_text().replace("0.55", "550", 1))
+    code, sentence = refused(arguments, capsys)
+    assert code == 4
+    assert str(other) in sentence
+
+
 @pytest.fixture
 def table(study, tmp_path):
     """Three blocks of every slot, 1 % too weak, and different."""

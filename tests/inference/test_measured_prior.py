@@ -19,6 +19,8 @@ import xarray as xr
 from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import blocks_of
+from halbach_fe.campaign import bodies
+from halbach_fe.campaign.lone import moment_matrix
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.exact_field import demagnetizing_tensors
 from halbach_fe.field_map import field_map
@@ -32,7 +34,6 @@ from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.report.prior import write_prior
 from halbach_fe.study import MU_0
 from halbach_fe.update import infer
-from tests.oracles import ngsolve_model as oracle
 
 VOLUME = np.pi * (0.1865**2 - 0.104**2) / 16 * 0.08
 """Of a block of the short dipole."""
@@ -155,8 +156,8 @@ def test_conversion_of_a_lone_block(short_dipole, along, across, error):
     remanence = np.array([1.06, 0.03, 0.02])
     permeability = (along, across, across)
     with ngsolve.TaskManager():
-        moment = oracle.lone_moment(oracle.Dipole(16, 0.104, 0.1865, 0.08, 1.0, 1.0), permeability,
-                                    tuple(remanence))
+        moment = moment_matrix(bodies.Sector(0.104, 0.1865, np.pi / 16, 0.08),
+                               np.diag(permeability)) @ remanence
     # the same block in all places, as seen from its own axes only in the first
     slots, rings, others = blocks_and_truth(study, np.random.default_rng(0))
     table = table_of(study, slots, others, rings)

@@ -10,7 +10,7 @@ import scipy.sparse as sparse
 from scipy import stats
 
 from halbach_fe.errors import MeasurementError
-from halbach_fe.inference.linear import update
+from halbach_fe.inference.linear import update, whitened
 from halbach_fe.inference.noise import Noise, independent
 from halbach_fe.inference.prior import Gaussian
 from halbach_fe.inference.sampling import Posterior, laplace
@@ -102,6 +102,42 @@ def test_posterior_with_correlated_noise(noise, dense, generator):
     assert found.log_evidence == pytest.approx(predictive.logpdf(readings))
     apart = update(matrix, readings, independent(noise.sd), prior).distribution
     assert np.abs(apart.mean - mean).max() > 0.1 * np.sqrt(np.diag(covariance)).max()
+
+
+def test_noise_that_others_foretell(dense, noise):
+    """Against the dense regression; what is left is independent of the seen."""
+    seen = np.arange(len(dense)) % 2 == 0
+    told, left = noise.given(~seen, seen)
+    cross = dense[np.ix_(~seen, seen)]
+    expected = cross @ np.linalg.inv(dense[np.ix_(seen, seen)])
+    np.testing.assert_allclose(told.toarray(), expected, atol=1e-12)
+    np.testing.assert_allclose(left.covariance.toarray(),
+                               dense[np.ix_(~seen, ~seen)] - expected @ cross.T, atol=1e-12)
+    assert not independent(noise.sd).given(~seen, seen)[0].nnz
+
+
+def test_prediction_of_readings_whose_noise_was_seen_in_others(generator):
+    """Two alike components of each of 20 points share most of their noise; one is held out.
+    Residuals with what the other foretells taken off are standard normal over many campaigns;
+    those taken for independent of the training noise are not.
+    """
+    matrix = np.repeat(generator.standard_normal((20, 6)), 2, axis=0)
+    matrix[1::2] += 0.3 * generator.standard_normal((20, 6))
+    prior = Gaussian(np.zeros(6), np.eye(6))
+    noise = Noise(sparse.csr_array(np.kron(np.eye(20), [[1.0, 0.9], [0.9, 1.0]])))
+    seen = np.arange(40) % 2 == 0
+    told, left = noise.given(~seen, seen)
+    right, wrong = [], []
+    for truth in prior.sample(400, generator):
+        readings = matrix @ truth + noise.sample(generator)
+        after = update(matrix[seen], readings[seen], noise.part(seen), prior).distribution
+        residual, root = readings - matrix @ after.mean, matrix @ after.root
+        right.append(whitened(residual[~seen] - told @ residual[seen], left,
+                              root[~seen] - told @ root[seen]))
+        wrong.append(whitened(residual[~seen], noise.part(~seen), root[~seen]))
+    # 8000 independent values: the rms of a standard normal is 1 +- 0.008; 5 sigma
+    assert np.sqrt(np.mean(np.square(right))) == pytest.approx(1.0, abs=0.04)
+    assert np.sqrt(np.mean(np.square(wrong))) != pytest.approx(1.0, abs=0.08)
 
 
 def test_likelihood_with_correlated_noise(noise, dense, generator):

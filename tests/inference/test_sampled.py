@@ -10,6 +10,8 @@ import pytest
 import xarray as xr
 
 from halbach_fe.blocks import blocks_of
+from halbach_fe.campaign.bodies import magnet_of
+from halbach_fe.campaign.reaction import Elements, mesh_of
 from halbach_fe.cli import main
 from halbach_fe.errors import SamplingError
 from halbach_fe.field_map import field_map, write_map
@@ -18,7 +20,7 @@ from halbach_fe.solve import Workshop
 from halbach_fe.study import parse_study
 from halbach_fe.update import infer
 from tests.conftest import DIPOLE, changed, circle
-from tests.oracles import ngsolve_nonlinear, section_of
+from tests.oracles import ngsolve_nonlinear
 
 STEEL = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "curve": {
     "kind": "froehlich_kennelly", "initial_relative_permeability": 1000.0,
@@ -69,10 +71,10 @@ def campaign(getdp, tmp_path_factory):
     nominal = np.array([block.magnetization[:2] for block in blocks_of(study)])
     truth = nominal + SPREAD * np.linalg.norm(nominal[0]) * generator.standard_normal(nominal.shape)
     points = np.vstack([circle(0.075, 30), circle(0.06, 20, start=0.1)])
-    section = replace(section_of(study), magnetizations=truth)
+    magnet = magnet_of(study).with_magnetizations(truth)
     with ngsolve.TaskManager():
         field = ngsolve_nonlinear.section_field(
-            section, ngsolve_nonlinear.disk(section, 0.02), 4, points)
+            magnet, mesh_of(magnet, points, Elements(0.02)), 4, points)
     field[:, :2] += 1e-4 * generator.standard_normal((len(points), 2))
     field[:, 2] = np.nan
     data = field_map(points, field)

@@ -12,10 +12,12 @@ import xarray as xr
 from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.exact_field import gradient_of
 from halbach_fe.field_map import field_map
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import observe
 from halbach_fe.report.inference import write_report
+from halbach_fe.report.prediction import main_line
 from halbach_fe.study import MU_0
 from halbach_fe.update import infer, write_update
 from tests.conftest import circle
@@ -50,6 +52,8 @@ def test_permeable_dipole_with_iron_is_learnt(dipole, generator, workshop):
     score = (update.posterior.mean - truth) / update.posterior.sd
     # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
     assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    line = main_line(update)
+    assert (line.what, line.axis, len(line.index)) == ("Bx", "angle in degrees", 60)
     (region,) = update.scores
     assert update.prior_conflict == pytest.approx(1.0, abs=0.45)  # 240 readings: sd 0.09
     assert region.chi2_posterior is None  # seen by the update: no test of anything
@@ -105,6 +109,11 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert training.coverage95_posterior is None
     assert update.prior_conflict < update.conflict_limit
 
+    line = main_line(update)  # one reading at each z, though every circle begins elsewhere
+    assert (line.what, line.axis, len(line.index)) == ("Bx", "z in m", 30)
+    assert (np.diff(line.place) > 0).all()
+    places = update.observation.positions[line.index]
+    assert np.ptp(np.arctan2(places[:, 1], places[:, 0])) < 2 * np.pi / 16
     write_update(update, tmp_path)
     write_report(update, tmp_path)
     with xr.open_dataset(tmp_path / "posterior.h5", engine="h5netcdf") as stored:
@@ -115,9 +124,58 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert summary["scores"][1]["readings"] == 480
     assert len((tmp_path / "prediction.csv").read_text().splitlines()) == 1 + len(update.readings)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<img alt=") == 3
+    assert page.count("<img alt=") == 6
     assert "http" not in page.split("data:image")[0]
     assert "disagree" not in page
+
+
+def test_a_second_map_is_only_predicted(short_dipole, generator, workshop, tmp_path):
+    """The same readings held out, by window or as a map of their own with noise of its own, give
+    the same posterior and scores.
+    """
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    one = infer(study, data, workshop)
+    unseen = np.unique(np.flatnonzero(one.held_out) // 3)
+    apart = short_dipole(array__recoil_permeability=1.0, noise=NOISE)
+    other = data.isel(point=unseen)
+    other["sigma_T"] = (("point", "component"), np.full((len(unseen), 3), 1e-5))
+    two = infer(apart, data.drop_isel(point=unseen), workshop, unseen=other)
+    np.testing.assert_allclose(two.posterior.mean, one.posterior.mean, rtol=1e-9)
+    assert [score.part for score in two.scores] == ["training", "held-out map"]
+    assert two.scores[1].chi2_posterior == pytest.approx(one.scores[1].chi2_posterior)
+    assert two.scores[1].rms_standardized_posterior == pytest.approx(1.0, abs=0.15)
+    write_update(two, tmp_path)
+    table = np.genfromtxt(tmp_path / "prediction.csv", delimiter=",", names=True, dtype=None,
+                          encoding="utf-8")
+    assert set(table["part"][-len(unseen):]) == {"held-out map"}
+    total = np.sqrt(table["posterior_sd_T"]**2 + table["sigma_T"]**2 + table["solver_error_T"]**2)
+    np.testing.assert_allclose(table["standardized_residual"], (
+        table["measured_T"] - table["posterior_mean_T"]) / total, rtol=1e-9)
+    for name, value in (("x_m", 0.15), ("y_m", 0.0), ("z_m", 0.04)):
+        other[name].values[0] = value
+    with pytest.raises(MeasurementError, match="reading 1 of held-out map must be at a point in"):
+        infer(apart, data, workshop, unseen=other)
+
+
+def test_held_out_components_whose_points_were_seen(short_dipole, generator, workshop):
+    """B_z is predicted from B_x and B_y, and one end from the rest; positions that are 0.2 mm off
+    correlate the noise of held-out and training components of a point. Scores hold.
+    """
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    points = np.column_stack([data[name].values for name in ("x_m", "y_m", "z_m")])
+    gradient = gradient_of(blocks_of(study), points)
+    data["B_T"].values[:] += np.einsum(
+        "ick,ik->ic", gradient, 2e-4 * generator.standard_normal(points.shape))
+    update = infer(short_dipole(
+        array__recoil_permeability=1.0, noise=NOISE | {"position_sd_m": 2e-4},
+        inference={"held_out": {"components": ["z"], "z_ranges_m": [[0.1, 1.0]]}}), data, workshop)
+    assert update.held_out.sum() == 480 + 2 * 6 * 16
+    _, unseen = update.scores
+    # sd over 80 campaigns: 0.051 (of 672 independent readings 0.055), 0.042, 0.011; 4 to 5 sigma
+    assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.22)
+    assert unseen.rms_standardized_posterior == pytest.approx(1.0, abs=0.2)
+    assert unseen.coverage95_posterior == pytest.approx(0.95, abs=0.05)
+    assert update.prior_conflict < update.conflict_limit
 
 
 def test_report_says_when_the_model_does_not_fit(short_dipole, generator, workshop, tmp_path):
@@ -182,6 +240,13 @@ def test_two_radii_with_unequal_noise(dipole, generator, workshop):
     write_update(update, workshop.folder)
     table = np.genfromtxt(workshop.folder / "prediction.csv", delimiter=",", names=True)
     assert sorted(set(table["x_m"])) == [0.05, 0.075]
+    line = main_line(update)
+    assert (line.axis, line.place.tolist()) == ("harmonic", list(range(1, 9)))
+    assert len(set(update.observation.radii[line.index])) == 1
+    write_report(update, workshop.folder)
+    page = (workshop.folder / "report.html").read_text()
+    assert "of the training readings by the prior (nothing was held out)" in page
+    assert "T, correlated" in page
 
 
 def test_uncertain_positions(short_dipole, generator, workshop):
@@ -223,6 +288,8 @@ def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, workshop):
     far = field_map(np.array([[0.0, 0, 0], [75.0, 0, 0]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match="Check the units"):
         infer(short_dipole(noise=NOISE), far, workshop)
+    with pytest.raises(MeasurementError, match="Check the units"):
+        infer(short_dipole(noise=NOISE), far.isel(point=[0]), workshop, unseen=far)
 
 
 def test_readings_that_vanish_by_symmetry(short_dipole, workshop):

@@ -1,6 +1,7 @@
 """Halbach arrays in NGSolve: another mesher, curved elements of high order, other formulations.
 
-Shares nothing with halbach_fe but numbers: the geometry is built anew from radii and angles.
+Shares nothing with halbach_fe's own model but numbers: the geometry is that of synthetic campaigns,
+built anew from radii and angles.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 
-MU_0 = 4e-7 * np.pi
+from halbach_fe.campaign.bodies import Sector
+from halbach_fe.campaign.reaction import outline_face
 
 
 @dataclass(frozen=True)
@@ -41,17 +43,10 @@ class Dipole:
 
 def _wedge(inner, outer, start, stop, z_min, z_max):
     """A sector between two angles; the arcs are true arcs."""
-    def at(radius, angle):
-        return occ.Pnt(radius * np.cos(angle), radius * np.sin(angle), z_min)
-
     middle = (start + stop) / 2
-    corners = [at(inner, start), at(outer, start), at(outer, stop), at(inner, stop)]
-    wire = occ.Wire([
-        occ.Segment(corners[0], corners[1]),
-        occ.ArcOfCircle(corners[1], at(outer, middle), corners[2]),
-        occ.Segment(corners[2], corners[3]),
-        occ.ArcOfCircle(corners[3], at(inner, middle), corners[0])])
-    return occ.Face(wire).Extrude(occ.Vec(0, 0, z_max - z_min))
+    sector = Sector(inner, outer, (stop - start) / 2, z_max - z_min)
+    centre = sector.middle * np.array([np.cos(middle), np.sin(middle)])
+    return outline_face(sector, centre, middle, z_min).Extrude(occ.Vec(0, 0, z_max - z_min))
 
 
 def eighth(
@@ -233,43 +228,3 @@ def scalar_potential_column(
         psi.vec.data += a.inner_solve * f.vec
         fields.append(np.array((-ngs.grad(psi))(mesh(*points.T))))
     return Column(space.ndof, setup, time.monotonic() - started, fields[0] - fields[1])
-
-
-def lone_moment(
-    dipole: Dipole, permeability: tuple[float, float, float], remanence: tuple[float, float, float],
-    order: int = 3, size: float = 0.02,
-) -> np.ndarray:
-    """Moment (3,) in A m^2 of one sector of the dipole on its own, its middle on the x axis, with
-    recoil permeabilities along x, y, z and a remanence in T.
-    """
-    half = np.pi / dipole.blocks
-    block = _wedge(dipole.inner, dipole.outer, -half, half, -dipole.length / 2, dipole.length / 2)
-    block.mat("block")
-    block.maxh = size
-    centre = occ.Pnt((dipole.inner + dipole.outer) / 2, 0, 0)
-    near = occ.Sphere(centre, 2 * (dipole.outer - dipole.inner)) - block
-    near.maxh = 3 * size
-    world = occ.Sphere(centre, 30 * (dipole.outer - dipole.inner))
-    for face in world.faces:
-        face.name = "far"
-    shape = occ.Glue([block, near, world - near - block])
-    mesh = ngs.Mesh(occ.OCCGeometry(shape).GenerateMesh(maxh=dipole.outer * 3, grading=0.4))
-    mesh.Curve(4)
-    space = ngs.H1(mesh, order=order, dirichlet="far")
-    u, v = space.TnT()
-    tensor = ngs.CoefficientFunction(
-        (permeability[0], 0, 0, 0, permeability[1], 0, 0, 0, permeability[2]), dims=(3, 3))
-    mu = mesh.MaterialCF({"block": tensor},
-                         default=ngs.CoefficientFunction((1, 0, 0, 0, 1, 0, 0, 0, 1), dims=(3, 3)))
-    a = ngs.BilinearForm((mu * ngs.grad(u)) * ngs.grad(v) * ngs.dx, symmetric=True)
-    source = ngs.CoefficientFunction(remanence)
-    f = ngs.LinearForm(source * ngs.grad(v) * ngs.dx("block"))
-    preconditioner = ngs.Preconditioner(a, "bddc")
-    a.Assemble()
-    f.Assemble()
-    psi = ngs.GridFunction(space)
-    psi.vec.data = ngs.solvers.CGSolver(a.mat, preconditioner, maxiter=1000, tol=1e-10) * f.vec
-    inside = mesh.Materials("block")
-    mean_h = np.array(ngs.Integrate(-ngs.grad(psi), mesh, definedon=inside, order=2 * order))
-    volume = ngs.Integrate(ngs.CoefficientFunction(1), mesh, definedon=inside, order=8)
-    return (np.array(remanence) * volume + (np.array(permeability) - 1) * mean_h) / MU_0

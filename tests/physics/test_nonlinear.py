@@ -19,6 +19,8 @@ import pytest
 from halbach_fe import condensed as engine
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of
+from halbach_fe.campaign.bodies import law_of, magnet_of
+from halbach_fe.campaign.reaction import Elements, mesh_of
 from halbach_fe.discretization import reading_errors
 from halbach_fe.errors import EXIT_CODES, GetDPError, NotConvergedError
 from halbach_fe.materials import Law
@@ -37,7 +39,7 @@ from halbach_fe.solve import (
 )
 from halbach_fe.study import Study, parse_study
 from tests.conftest import DIPOLE, changed, circle
-from tests.oracles import dipole_of, iron_of, ngsolve_model, ngsolve_nonlinear, section_of
+from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 
 MU_0 = 4e-7 * np.pi
 STEEL = {"kind": "froehlich_kennelly", "initial_relative_permeability": 2000.0,
@@ -232,13 +234,14 @@ def test_saturating_cross_section_against_ngsolve(saturated):
     """
     study, points = saturated.study, saturated.observation.points
     ours = saturated.model(saturated.model.nominal)
-    section = section_of(study)
+    magnet = magnet_of(study)
     with ngsolve.TaskManager():
-        mesh = ngsolve_nonlinear.disk(section, 0.02)
+        mesh = mesh_of(magnet, points, Elements(0.02))
         theirs, lower = (saturated.observation.apply(ngsolve_nonlinear.section_field(
-            section, mesh, order, points)) for order in (5, 4))
+            magnet, mesh, order, points)) for order in (5, 4))
         # negative control: iron that saturates 5 % earlier
-        weaker = replace(section, iron=replace(section.iron, saturation=1.9))
+        law = replace(magnet.iron.law, saturation=1.9)
+        weaker = replace(magnet, iron=replace(magnet.iron, law=law))
         other = saturated.observation.apply(
             ngsolve_nonlinear.section_field(weaker, mesh, 4, points))
     bar = saturated.model.error + np.abs(theirs - lower)
@@ -266,7 +269,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     part = finite_element_part(study, points, workshop, columns=False).nominal
     bar = reading_errors(study, observation, part, workshop)
     assert 1.6 < observed_order(history(tmp_path / "getdp-real")[0]) < 2.5
-    dipole, iron = dipole_of(study), iron_of(study.iron_ring)
+    dipole, iron = dipole_of(study), law_of(study.iron_ring)
     with ngsolve.TaskManager():
         mesh = ngsolve_model.eighth(dipole, 0.09)
         theirs, lower, never = (ngsolve_nonlinear.potential_reaction(
@@ -341,8 +344,8 @@ def test_energy_balance(dipole, workshop, ring):
         energy = np.sum(h * b, axis=2) * volume
         return energy.sum() / np.abs(energy[magnet].sum())
 
-    law = iron_of(study.iron_ring)
-    assert abs(balance(law.reluctivity(square[iron]))) < 1e-6
+    law = law_of(study.iron_ring)
+    assert abs(balance(ngsolve_nonlinear.reluctivity(law, square[iron]))) < 1e-6
     assert abs(balance(1 / 2000.0)) > 5e-3
 
 
@@ -562,15 +565,22 @@ def test_recoil_permeability_across_against_ngsolve(dipole, workshop, generator)
     observation = observation_of(study)
     built = response(study, observation, workshop)
     assert built.superposition_error < 1e-9
-    section = section_of(study)
+    magnet = magnet_of(study)
     changed_by = 0.1 * np.linalg.norm(built.nominal[:2]) * generator.standard_normal((16, 2))
-    turned = replace(section, magnetizations=section.magnetizations + changed_by)
+    nominal = built.nominal.reshape(-1, 2)
+
+    def with_permeability(along, across):
+        """With the same M."""
+        return replace(magnet, bodies=tuple(
+            replace(body, along=along, across=across)
+            for body in magnet.bodies)).with_magnetizations(nominal)
+
     with ngsolve.TaskManager():
-        mesh = ngsolve_nonlinear.disk(section, 0.012)
+        mesh = mesh_of(magnet, observation.points, Elements(0.012))
         theirs, theirs_changed, isotropic, exchanged = (
             observation.apply(ngsolve_nonlinear.section_field(one, mesh, 4, observation.points))
-            for one in (section, turned, replace(section, across=1.05),
-                        replace(section, along=1.15, across=1.05)))
+            for one in (magnet, magnet.with_magnetizations(nominal + changed_by),
+                        with_permeability(1.05, 1.05), with_permeability(1.15, 1.05)))
     ours = built.matrix @ built.nominal
     ours_changed = built.matrix @ (built.nominal + changed_by.ravel())
     assert np.abs(ours - theirs).max() < 3e-4

@@ -9,7 +9,7 @@ from halbach_fe.blocks import blocks_of
 from halbach_fe.errors import MeasurementError, StudyError
 from halbach_fe.exact_field import field_of
 from halbach_fe.field_map import field_map
-from halbach_fe.observation import held_out, observe, points_from, reading_noise
+from halbach_fe.observation import held_out, observe, points_from, reading_noise, together
 from tests.conftest import changed, circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,
@@ -206,13 +206,69 @@ def test_point_noise_propagates_to_fourier_coefficients(dipole, generator, equal
     assert found[:10, 10:].max() == 0  # circles are independent
 
 
-def test_held_out_pattern(dipole):
-    z = np.array([0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.4])
-    every_second = dipole(inference={"held_out": {"every": 2}})
-    assert held_out(every_second, z).tolist() == [False, False, True, False, True, True, False]
-    windows = dipole(inference={"held_out": {"every": 2, "window": 2}})
-    assert held_out(windows, z).tolist() == [False, False, False, True, True, True, False]
-    assert not held_out(dipole(), z).any()
+def held_out_of(study, points, measured=None):
+    points = np.asarray(points, float)
+    measured = np.ones((len(points), 3), bool) if measured is None else measured
+    return held_out(study, observe(study, points, measured))
+
+
+def test_held_out_windows(dipole):
+    points = [[0, 0, z] for z in (0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.4)]
+    one = np.array([[True, False, False]] * 7)
+    for settings, expected in (({"every": 2}, "0010110"), ({}, "0010110"),
+                               ({"every": 2, "window": 2}, "0001110"),
+                               ({"window": 2}, "0001110")):
+        study = dipole(inference={"held_out": settings})
+        assert held_out_of(study, points, one).tolist() == [n == "1" for n in expected]
+    assert not held_out_of(dipole(), points).any()
+
+
+def test_held_out_radii_components_and_ranges(dipole):
+    """Each by itself, and together their union."""
+    points = np.vstack([circle(radius, 4, z) for radius in (0.05, 0.075) for z in (0, 0.1, 0.2)])
+    radius = np.repeat([0.05, 0.075], 36)
+    z = np.tile(np.repeat([0, 0.1, 0.2], 12), 2)
+    component = np.tile(["x", "y", "z"], 24)
+    for settings, expected in (
+            ({"radii_m": [0.07502]}, radius == 0.075),  # maps are rounded
+            ({"components": ["z", "x"]}, component != "y"),
+            ({"z_ranges_m": [[0.1, 0.1]]}, z == 0.1),
+            ({"z_ranges_m": [[-1, 0.05], [0.15, 1]]}, z != 0.1),
+            ({"every": 3}, z == 0.2),
+            ({"every": 3, "radii_m": [0.05], "components": ["y"], "z_ranges_m": [[-1, 0.01]]},
+             (z != 0.1) | (radius == 0.05) | (component == "y"))):
+        study = dipole(inference={"held_out": settings})
+        np.testing.assert_array_equal(held_out_of(study, points), expected)
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    ({"radii_m": [0.06]}, r"held_out\.radii_m = 0\.06` holds some of them out; .* none"),
+    ({"radii_m": [0.05, 0.06]}, r"radii_m = 0\.06`"),
+    ({"components": ["y"]}, r"held_out\.components = y`"),
+    ({"z_ranges_m": [[0.2, 0.3]]}, r"held_out\.z_ranges_m = 0\.2, 0\.3`"),
+    ({"every": 3}, "enough z positions"),
+    ({"radii_m": [0.05, 0.075]}, "16, all held out"),
+    ({"components": ["x"], "z_ranges_m": [[0, 0.1]]}, "all held out"),
+    ({"every": 2, "z_ranges_m": [[0, 0]]}, "all held out")])
+def test_held_out_that_leaves_nothing(dipole, settings, said):
+    """Neither for the update, nor for the prediction by any of the keys."""
+    points = np.vstack([circle(radius, 4, z) for radius in (0.05, 0.075) for z in (0, 0.1)])
+    measured = np.tile([True, False, False], (16, 1))
+    with pytest.raises(MeasurementError, match=said):
+        held_out_of(dipole(inference={"held_out": settings}), points, measured)
+
+
+def test_two_maps_together(dipole, generator):
+    """Readings, and amplitudes too, of a circle that is in both."""
+    study = dipole(observation=FOURIER)
+    points = circle(0.075)
+    one = observe(study, points, np.ones((24, 3), bool))
+    both = together(one, one)
+    fields = generator.standard_normal((2, 24, 3))
+    np.testing.assert_allclose(both.apply(np.vstack(fields)),
+                               np.concatenate([one.apply(field) for field in fields]))
+    np.testing.assert_allclose(both.magnitude(np.vstack(fields)),
+                               np.concatenate([one.magnitude(field) for field in fields]))
 
 
 def test_positions_expand(dipole):

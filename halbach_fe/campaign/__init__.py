@@ -1,0 +1,1 @@
+"""Synthetic measurements: a magnet with its errors, and its field by other people's programs."""

@@ -1,0 +1,32 @@
+"""Where a campaign measures, and where it checks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from halbach_fe.campaign.bodies import Floats
+from halbach_fe.observation import points_from
+from halbach_fe.study import Positions
+
+
+def between(positions: Positions) -> Floats:
+    """Points (n, 3) in m half a step between a study's own; none if it has one only.
+
+    On circles that is half a step in the angle and along z, on lines half a step, and each of
+    single points is moved half of the way to the nearest of the others.
+    """
+    points = points_from(positions)
+    if positions.kind == "circles":
+        z = np.unique(points[:, 2])
+        between_z = (z[:-1] + z[1:]) / 2 if len(z) > 1 else z
+        angle = 2 * np.pi * (np.arange(positions.angles) + 0.5) / positions.angles
+        directions = np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.vstack([np.column_stack([
+            np.tile(radius * directions, (len(between_z), 1)), np.repeat(between_z, len(angle))])
+            for radius in positions.radius_m])
+    if positions.kind == "line" or len(points) < 2:
+        return (points[:-1] + points[1:]) / 2
+    distance = np.linalg.norm(points[:, None] - points, axis=2)
+    np.fill_diagonal(distance, np.inf)
+    middles = (points + points[distance.argmin(axis=1)]) / 2
+    return np.unique(middles, axis=0)
