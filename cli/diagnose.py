@@ -23,6 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
+    parser.add_argument("--held-out", type=Path, metavar="MAP",
+                        help="another map, which is only predicted, at positions of its own")
     parser.add_argument("--blocks", type=Path, metavar="CSV",
                         help="moments of the single blocks, in place of the study's prior")
     parser.add_argument("--effects", type=effects_of, metavar="NAME,NAME...",
@@ -56,8 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     text = arguments.study.read_text(encoding="utf-8")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    unseen = read_map(arguments.held_out) if arguments.held_out else None
     with common.workshop(arguments) as workshop:
-        found = diagnose(study, data, workshop, blocks, arguments.effects, common.say)
+        found = diagnose(study, data, workshop, blocks, arguments.effects, unseen, common.say)
         next_ones = separations(found, data, workshop, arguments.effects)
     write_summary(found, next_ones, arguments.output)
     write_report(found, next_ones, arguments.output)

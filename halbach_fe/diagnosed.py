@@ -17,7 +17,15 @@ from halbach_fe.effects.base import Parameter, Place
 from halbach_fe.next_measurement import Separation
 from halbach_fe.study import Study
 from halbach_fe.study_file import amended
-from halbach_fe.update import ALL_READINGS, COVERAGE_Z, HELD_OUT, TRAINING, Update, write_text
+from halbach_fe.update import (
+    ALL_READINGS,
+    COVERAGE_Z,
+    HELD_OUT,
+    HELD_OUT_MAP,
+    TRAINING,
+    Update,
+    write_text,
+)
 
 STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
 
@@ -54,22 +62,21 @@ class Score:
 
 
 def scores(update: Update, left_out: Floats) -> list[Score]:
-    """Of all readings, training and held-out ones apart, and of the held-out ones by region."""
-    held = update.held_out
-    found = [Score(ALL_READINGS, TRAINING, int(np.sum(~held)), update.prior_conflict,
-                   _median(update, ~held), float(np.mean(np.abs(left_out) <= COVERAGE_Z)))]
-    regions = list(dict.fromkeys(update.regions))
-    for region in [ALL_READINGS, *(regions if len(regions) > 1 else [])]:
-        chosen = held & ((np.array(update.regions) == region) | (region == ALL_READINGS))
-        if not chosen.any():
-            continue
-        prediction = update.prediction_posterior
-        off = np.abs(update.readings - prediction.mean)[chosen]
-        band = COVERAGE_Z * np.hypot(prediction.sd, update.sigma)[chosen]
-        found.append(Score(
-            region, HELD_OUT, int(chosen.sum()),
-            float(np.mean(update.whitened(prediction, chosen) ** 2)), _median(update, chosen),
-            float(np.mean(off <= band))))
+    """Of all readings of each part, and of those that the update has not seen by region."""
+    parts, regions = np.array(update.parts), np.array(update.regions)
+    training = parts == TRAINING
+    found = [Score(ALL_READINGS, TRAINING, int(training.sum()), update.prior_conflict,
+                   _median(update, training), float(np.mean(np.abs(left_out) <= COVERAGE_Z)))]
+    names = list(dict.fromkeys(update.regions))
+    for part in (HELD_OUT, HELD_OUT_MAP):
+        for region in [ALL_READINGS, *(names if len(names) > 1 else [])]:
+            chosen = (parts == part) & ((regions == region) | (region == ALL_READINGS))
+            if chosen.any():
+                found.append(Score(
+                    region, part, int(chosen.sum()),
+                    float(np.mean(update.whitened(update.prediction_posterior, chosen) ** 2)),
+                    _median(update, chosen), float(np.mean(np.abs(update.standardized(
+                        update.prediction_posterior)[chosen]) <= COVERAGE_Z))))
     return found
 
 
@@ -179,8 +186,8 @@ def summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dic
     """What a script wants to know of a diagnosis; the README says what everything is."""
     return {
         "study": diagnosis.before.study.name,
-        "readings": {TRAINING: int(np.sum(~diagnosis.before.held_out)),
-                     HELD_OUT: int(np.sum(diagnosis.before.held_out))},
+        "readings": {part: diagnosis.before.parts.count(part)
+                     for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
         "rounds": diagnosis.rounds,
         "verdict": "unknown" if diagnosis.unknown and not diagnosis.named else
         "named" if diagnosis.named else

@@ -41,6 +41,7 @@ from halbach_fe.scene import Scene
 from halbach_fe.solve import Workshop
 from halbach_fe.study import COMPONENTS, MU_0, Study
 from halbach_fe.symmetry import turn_matrix
+from halbach_fe.update import HELD_OUT_MAP
 
 ENOUGH = 5.0
 """Expected log Bayes factor from which a measurement separates."""
@@ -242,16 +243,17 @@ def present(diagnosis: Diagnosis, data: xr.Dataset) -> Campaign:
     """The map that was diagnosed, thinned to `MOST_READINGS`."""
     update = diagnosis.before
     observation = update.observation
-    places, owner = np.unique(observation.positions, axis=0, return_inverse=True)
-    owner = owner.ravel()
-    wanted = max(1, round(len(places) * min(1.0, MOST_READINGS / len(observation))))
+    own = np.array(update.parts) != HELD_OUT_MAP
+    _, owner = np.unique(observation.positions, axis=0, return_inverse=True)
+    count = len(np.unique(owner[own]))
+    wanted = max(1, round(count * min(1.0, MOST_READINGS / own.sum())))
     # steps of the golden ratio: no beat with the angles of a circle
-    order = (np.arange(wanted) * (np.sqrt(5) - 1) / 2 % 1 * len(places)).astype(int)
-    kept = np.isin(owner, np.arange(len(places)) if wanted == len(places) else order)
+    chosen = (np.arange(wanted) * (np.sqrt(5) - 1) / 2 % 1 * count).astype(int)
+    kept = own & ((wanted == count) | np.isin(owner.ravel(), np.unique(owner[own])[chosen]))
     analysis = observation.analysis[np.flatnonzero(kept)]
     used = np.unique(analysis.indices // len(COMPONENTS))
     columns = (len(COMPONENTS) * used[:, None] + np.arange(len(COMPONENTS))).ravel()
-    covariance = update.errors.part(kept).covariance * (kept.sum() / len(kept))
+    covariance = update.errors.part(kept).covariance * (kept.sum() / own.sum())
     return Campaign(
         observation.map_points[used], map_time(data)[used],
         sparse.csr_array(sparse.csc_array(analysis)[:, columns]),

@@ -45,10 +45,13 @@ def amended(text: str, steps: Iterable[tuple[Study, str]]) -> str:
     notes = []
     for study, note in steps:
         parse_study(study.model_dump(), f"changed study {study.name}")
+        before = parse_study(tomllib.loads(text))
+        if before == study:
+            continue
         notes.append(note)
         try:
             document = tomlkit.parse(text)
-            _change(document, parse_study(document.unwrap()), study, note)
+            _change(document, before, study, note)
             text = tomlkit.dumps(document)
             whole = parse_study(tomllib.loads(text)) == study
         except (TOMLKitError, tomllib.TOMLDecodeError, StudyError):
@@ -116,13 +119,12 @@ def _move_up(table: Keys, old: set[str]) -> None:
     if not isinstance(table, Table) or not old:
         return
     body = table.value.body
-    plain = [number for number, (key, item) in enumerate(body)
-             if key and not isinstance(item, Table | AoT)]
-    new = [number for number in plain if body[number][0].key not in old]
-    last = max(set(plain) - set(new), default=-1)
-    moved = [body[number] for number in new if number > last]
-    rest = [pair for number, pair in enumerate(body) if number not in new or number < last]
-    body[:] = rest[:last + 1] + moved + rest[last + 1:]
+    names = {number: key.key for number, (key, item) in enumerate(body)
+             if key and not isinstance(item, Table | AoT)}
+    last = max((number for number, name in names.items() if name in old), default=-1)
+    moved = [number for number, name in names.items() if name not in old and number > last]
+    rest = [pair for number, pair in enumerate(body) if number not in moved]
+    body[:] = [*rest[:last + 1], *(body[number] for number in moved), *rest[last + 1:]]
 
 
 def _retire(table: Keys, name: str) -> None:

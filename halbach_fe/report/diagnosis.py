@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.blocks import Floats, Ints
 from halbach_fe.diagnose import Diagnosis, Named
@@ -25,32 +28,62 @@ from halbach_fe.diagnosis.residuals import DISCOVERIES, Group
 from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND
 from halbach_fe.effects import catalogue
 from halbach_fe.next_measurement import ENOUGH, Separation
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, save, write_page
+from halbach_fe.report.prediction import places
 from halbach_fe.update import ALL_READINGS, COVERAGE_Z, Update
 
 NOTHING = "–"
 MOST_BARS = 8
-BEFORE, AFTER = PRIOR, POSTERIOR
 RESIDUAL_LIMIT = 5.0
 """Standard deviations at the end of the colour scale."""
 
 GROUP_TITLES = {"z": "along z", "angle": "by angle", "radius": "by radius", "label": "by reading"}
+UNKNOWN_ADVICE = {
+    "field": "Look for a source outside the bore, nearest to where the unexplained field is "
+             "largest; readings beyond the map's end there would show more of it.",
+    "instrument": "The same map with the probe turned by 180° shows which sensor it is: its errors "
+                  "turn with it.",
+    "either": "The same map with the probe turned by 180° tells a field from the sensors: their "
+              "errors turn with them."}
 UNKNOWN_KINDS = {
     "field": "a smooth field, as of a source that no effect of the catalogue is",
     "instrument": "a smooth error of the sensors that no field could be",
     "either": "something smooth, a field or an error of the sensors"}
 
 
+@dataclass(frozen=True)
+class State:
+    """A model in a report: the study as it was, or with what was missing."""
+
+    when: str
+    update: Update
+    groups: Sequence[Group]
+    left_out: Floats
+    colour: str
+    marker: str
+
+
+def states(diagnosis: Diagnosis) -> list[State]:
+    """Before and after; one state if nothing was added."""
+    before = State("before", diagnosis.before, diagnosis.groups_before, diagnosis.left_out_before,
+                   PRIOR, "o")
+    after = State("after", diagnosis.after, diagnosis.groups_after, diagnosis.left_out_after,
+                  POSTERIOR, "s")
+    if diagnosis.study == diagnosis.before.study:
+        return [replace(after, when="the study as it is")]
+    return [before, after]
+
+
 def verdict(diagnosis: Diagnosis) -> list[str]:
     """What was found, in sentences."""
-    effects = _catalogue_titles(diagnosis)
+    titles = _catalogue_titles(diagnosis)
     before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
     said = []
     if diagnosis.named:
         said.append("The map is explained by: " + "; ".join(
-            _named(one) for one in diagnosis.named) + ".")
-        said += [f"It does not tell {one.hypothesis.effect.title} from "
-                 f"{_either(_titles(one, effects))}." for one in diagnosis.named if rivals(one)]
+            _named(one, titles) for one in diagnosis.named) + ".")
+        said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
+                 f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
     elif unknown is None and before.prior_conflict <= before.conflict_limit:
         return [f"Nothing is missing: the map agrees with the study within noise (chi² per reading "
                 f"{before.prior_conflict:.3g})."]
@@ -60,7 +93,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             f"Something outside the catalogue {'remains' if diagnosis.named else 'is missing'}: "
             f"{UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
             f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
-            f"{unknown.log_bayes_factor:.3g}).")
+            f"{unknown.log_bayes_factor:.0f}).")
         if unknown.source_m is not None:
             x, y, z = (f"{1e3 * one:.0f}" for one in unknown.source_m)
             said.append(f"If it is a small magnetized object, then near ({x}, {y}, {z}) mm.")
@@ -69,7 +102,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 f"where {before.conflict_limit:.3g} would be rare), and no effect of the catalogue "
                 "explains it, nor anything smooth: look for outliers, and at the noise."]
     if diagnosis.named:
-        held = [next((f"; of held-out readings {one.chi2_per_reading:.3g}" for one in found[1:]), "")
+        held = ["".join(f", of held-out ones {one.chi2_per_reading:.3g}" for one in found[1:2])
                 for found in (scores(before, diagnosis.left_out_before),
                               scores(after, diagnosis.left_out_after))]
         said.append(f"With {'it' if len(diagnosis.named) == 1 else 'them'} in the model, chi² per "
@@ -91,13 +124,12 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Rows of scores before and after, as text."""
-    before = scores(diagnosis.before, diagnosis.left_out_before)
-    after = scores(diagnosis.after, diagnosis.left_out_after)
+    found = [scores(one.update, one.left_out) for one in states(diagnosis)]
     rows = []
-    for old, new in zip(before, after, strict=True):
-        region = "" if old.region == ALL_READINGS else f", {old.region}"
-        rows.append({"readings": f"{old.part}{region}", "count": str(old.readings)} | {
-            name: f"{text(getattr(old, key))} → {text(getattr(new, key))}"
+    for number, one in enumerate(found[0]):
+        region = "" if one.region == ALL_READINGS else f", {one.region}"
+        rows.append({"readings": f"{one.part}{region}", "count": str(one.readings)} | {
+            name: " → ".join(text(getattr(state[number], key)) for state in found)
             for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
                                     ("median error", "median_relative_error", _percent),
                                     ("95 % band holds", "coverage95", _fraction))})
@@ -110,18 +142,19 @@ def write_report(
     """Write diagnosis.html, self-contained, and its figures as PNG into ``folder``."""
     figures = {
         "groups": (_groups(diagnosis), "Chi² per reading of groups of readings, each foretold by "
-                   "all others, before and after; filled where chance is no explanation"),
+                   "all others; filled where chance is no explanation"),
         "residuals": (_residuals(diagnosis), "Standardized difference of each training reading "
-                      "from what all others foretell, along z and by angle, before and after"),
-        "probabilities": (_probabilities(diagnosis), "Posterior probability of each effect if at "
-                          "most one is missing, and log Bayes factors of the found effects and "
-                          "of those that would do as well; dashed: what an effect needs"),
+                      "from what all others foretell"),
+        "probabilities": (_probabilities(diagnosis), "Posterior probability of each effect of the "
+                          "catalogue if at most one is missing, and nothing else; log Bayes "
+                          "factors of what was found and of what would do as well, dashed: what "
+                          "an effect needs"),
         "profile": (_profile(diagnosis), "The readings that fitted worst, with the updated model's "
-                    "predictions before and after, and what is left; the band holds 95 % of it by "
+                    "predictions, and what is left; the band holds 95 % of it by "
                     "prediction and noise"),
         "magnetizations": (_magnetizations(diagnosis), "Inferred change of the magnetizations from "
                            "the prior by ring and slot, along and across the easy axis and along "
-                           "the magnet, before and after"),
+                           "the magnet"),
     }
     pictures = save({f"diagnosis_{name}.png": one for name, one in figures.items()}, folder)
     titles = _catalogue_titles(diagnosis)
@@ -129,25 +162,25 @@ def write_report(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, verdict=verdict(diagnosis),
         shown=dict(zip(figures, pictures, strict=True)),
-        found=[{"what": one.hypothesis.effect.title, "where": where(one.hypothesis.place) or
-                NOTHING, "how much": "; ".join(amounts(one)).replace(" ", "\u00a0"),
-                "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
-                "name": one.found.candidate.effect} for one in diagnosis.named],
-        changes=change_table(diagnosis), disagreeing=[_disagreeing(found) for found in (
-            diagnosis.groups_before, diagnosis.groups_after)],
+        found=[_entry(one, titles) for one in diagnosis.named],
+        changes=change_table(diagnosis), disagreeing="; ".join(
+            f"{one.when}: {_disagreeing(one.groups)}" for one in states(diagnosis)),
+        states=[one.when for one in states(diagnosis)],
         classes=[_class(one, titles) for one in diagnosis.named if rivals(one)],
         structure=_structure(diagnosis),
         further=[_next(one, separations, titles) for one in diagnosis.named if rivals(one)],
         ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
                 "discoveries": DISCOVERIES},
+        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
-def _named(one: Named) -> str:
-    """An effect in words, with its amplitude."""
-    place = where(one.hypothesis.place)
-    what = one.hypothesis.effect.title + (f", {place}" if place else "")
-    return what if one.hypothesis.effect.certain else f"{what} ({'; '.join(amounts(one))})"
+def _named(one: Named, titles: dict[str, str]) -> str:
+    """An effect in words, with its place and amplitude."""
+    effect = one.hypothesis.effect
+    parts = [_title(effect.name, titles), where(one.hypothesis.place),
+             "" if effect.certain else "; ".join(amounts(one))]
+    return ", ".join(part for part in parts if part)
 
 
 def _catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
@@ -181,8 +214,16 @@ def _class(one: Named, titles: dict[str, str]) -> str:
     """What cannot be told apart, in words."""
     found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
              for title, (candidate, factor) in zip(_titles(one, titles), rivals(one), strict=True)]
-    return (f"What is called {one.hypothesis.effect.title} here (log Bayes factor "
+    return (f"What is called {_title(one.hypothesis.effect.name, titles)} here (log Bayes factor "
             f"{one.found.log_bayes_factor:.1f}) could as well be: {'; '.join(found)}.")
+
+
+def _entry(one: Named, titles: dict[str, str]) -> dict[str, str]:
+    """Row of the page's table of effects."""
+    effect = one.hypothesis.effect
+    return {"what": _title(effect.name, titles), "where": where(one.hypothesis.place) or NOTHING,
+            "how much": "; ".join(text.replace(" ", "\u00a0") for text in amounts(one)),
+            "log Bayes factor": f"{one.found.log_bayes_factor:.1f}", "kind": effect.kind}
 
 
 def _either(parts: Sequence[str]) -> str:
@@ -196,7 +237,7 @@ def _next(
     own = [one for one in separations if one.named == named.hypothesis]
     choices = dict.fromkeys(name for one in own for name in one.gains)
     return {
-        "what": named.hypothesis.effect.title,
+        "what": _title(named.hypothesis.effect.name, titles),
         "advice": [(_title(one.rival.effect.name, titles),
                     one.recommended.title if one.recommended else "") for one in own],
         "rows": [{"expected gain of": name.replace("_", " ")} | {
@@ -234,27 +275,30 @@ def _groups(diagnosis: Diagnosis) -> Figure:
     if others:
         axes += right[0].subplots(len(others), 1, sharex=True, squeeze=False, gridspec_kw={
             "height_ratios": [sizes[kind] + 0.5 for kind in others]})[:, 0].tolist()
-    everything = [one.chi2_per_reading
-                  for one in (*diagnosis.groups_before, *diagnosis.groups_after)]
-    least, largest = min(0.9, *everything), max(1.1, *everything)
+    shown = states(diagnosis)
+    everything = [one.chi2_per_reading for state in shown for one in state.groups]
+    limits = max(0.1, 0.9 * min(0.9, *everything)), 1.1 * max(1.1, *everything)
     for axis, kind in zip(axes, [first, *others], strict=True):
         names = [one.name for one in diagnosis.groups_before if one.kind == kind]
         axis.axvline(1.0, color=PUBLISHED, lw=0.8)
-        for found, colour, marker, label in (
-                (diagnosis.groups_before, BEFORE, "o", "before"),
-                (diagnosis.groups_after, AFTER, "s", "after")):
-            for one in found:
+        for state in shown:
+            for one in state.groups:
                 if one.kind == kind and one.name in names:
-                    axis.plot(one.chi2_per_reading, names.index(one.name), marker, color=colour,
-                              ms=6, mfc=colour if one.disagrees else "white")
-            axis.plot([], [], marker, color=colour, label=label)
+                    axis.plot(max(one.chi2_per_reading, limits[0]), names.index(one.name),
+                              state.marker, ms=6, color=state.colour, clip_on=False,
+                              mfc=state.colour if one.disagrees else "white")
+            axis.plot([], [], state.marker, color=state.colour, label=state.when)
         axis.set_yticks(range(len(names)), names, fontsize="small")
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.set_title(GROUP_TITLES.get(kind, kind), fontsize="medium", loc="left")
         axis.grid(alpha=0.3, axis="x")
-        if largest > 5:
+        if limits[1] > 5:
             axis.set_xscale("log")
-        axis.set_xlim(0.9 * least, 1.05 * largest)
+            axis.xaxis.set_major_locator(LogLocator(
+                subs=(1, 2, 5) if limits[1] < 100 * limits[0] else (1,)))
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.set_xlim(*limits)
     axes[0].legend(fontsize="small")
     for axis in (axes[0], axes[-1]):
         axis.set_xlabel("chi² per reading (1 expected)")
@@ -272,22 +316,23 @@ def _residuals(diagnosis: Diagnosis) -> Figure:
     apart = len(rows) <= MOST_BARS
     if not apart:
         rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
+    shown = states(diagnosis)
     figure = Figure(figsize=(9, 1.2 + 1.15 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+    axes = figure.subplots(len(rows), len(shown), sharex=True, sharey="row", squeeze=False)
     coloured = False
-    for (label, r), pair in zip(rows, axes, strict=True):
+    for (label, r), row in zip(rows, axes, strict=True):
         mine = np.flatnonzero((labels == label) & ((radius == r) | (not apart)))
-        for axis, values in zip(pair, (diagnosis.left_out_before, diagnosis.left_out_after),
-                                strict=True):
+        for axis, state in zip(row, shown, strict=True):
             coloured |= _residual_map(axis, diagnosis.before, np.flatnonzero(chosen)[mine],
-                                      values[mine])
-        pair[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
-                           + "\n" + pair[0].get_ylabel())
-        pair[1].set_ylabel("")
-    for axis, when in zip(axes[0], ("before", "after"), strict=True):
-        axis.set_title(when)
-    for axis in axes[-1]:
-        axis.set_xlabel("z in m")
+                                      state.left_out[mine])
+        row[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
+                          + "\n" + row[0].get_ylabel())
+        for axis in row[1:]:
+            axis.set_ylabel("")
+    for axis, state in zip(axes[0], shown, strict=True):
+        axis.set_title(state.when)
+    for axis in axes[:-1].ravel():
+        axis.set_xlabel("")
     if coloured:
         figure.colorbar(_colours(RESIDUAL_LIMIT), ax=list(axes.ravel()), extend="both", aspect=40,
                         shrink=0.8, label="standardized residual")
@@ -295,7 +340,7 @@ def _residuals(diagnosis: Diagnosis) -> Figure:
 
 
 def _residual_map(axis: Axes, update: Update, readings: Ints, values: Floats) -> bool:
-    """Residuals over z and angle, or over z alone where there is but one line; tells which."""
+    """Residuals over z and angle, or along a line or circle where there is no more; tells which."""
     x, y, z = update.observation.positions[readings].T
     numbers = ["".join(c for c in update.observation.labels[one] if c.isdigit())
                for one in readings]
@@ -303,14 +348,16 @@ def _residual_map(axis: Axes, update: Update, readings: Ints, values: Floats) ->
     name = "angle in °"
     if all(numbers):
         up, name = np.array(numbers, float), "order"
-    if len(np.unique(np.round(up))) < 3:
+    axis.set_xlabel("z in m")
+    if np.ptp(z) == 0 or len(np.unique(np.round(up))) < 3:
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.3, lw=0)
-        axis.plot(z, values, ".", color=MEASURED, ms=3)
+        axis.plot(up if np.ptp(z) == 0 else z, values, ".", color=MEASURED, ms=4)
+        axis.set_xlabel(name if np.ptp(z) == 0 else "z in m")
         axis.set_ylabel("residual")
         return False
     columns, column = np.unique(np.round(z, 6), return_inverse=True)
     rows, row = np.unique(np.round(up, 3), return_inverse=True)
-    limits = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
+    limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
     if len(columns) * len(rows) <= 4 * len(values) and len(columns) > 1:
         grid = np.full((len(rows), len(columns)), np.nan)
         order = np.argsort(np.abs(values))  # the largest of a cell shows
@@ -335,12 +382,14 @@ def _probabilities(diagnosis: Diagnosis) -> Figure:
     top = sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])[:MOST_BARS]
     bars = []
     for one in diagnosis.named:
-        bars.append((one.found.candidate.name, one.found.log_bayes_factor, AFTER))
+        bars.append((one.found.candidate.name, one.found.log_bayes_factor, POSTERIOR))
         bars += [(f"or {candidate.name}", factor, PUBLISHED) for candidate, factor in rivals(one)]
+    if diagnosis.unknown is not None:
+        bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MOST_BARS]
     figure = Figure(figsize=(9, 1.4 + 0.3 * max(len(top), len(bars))), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.barh([name for name, _ in top], [100 * value for _, value in top], color=AFTER)
+    left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
         left.text(100 * value + 1, height, said, va="center", fontsize="small")
@@ -362,22 +411,22 @@ def _probabilities(diagnosis: Diagnosis) -> Figure:
 
 
 def _profile(diagnosis: Diagnosis) -> Figure:
-    before, after = diagnosis.before, diagnosis.after
+    shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name = _line(before, diagnosis.left_out_before)
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
-    for update, colour, when in ((before, BEFORE, "predicted, before"),
-                                 (after, AFTER, "predicted, after")):
-        top.plot(along, update.prediction_posterior.mean[index], color=colour, lw=1.2, label=when)
-        residual = 1e3 * (update.readings - update.prediction_posterior.mean)[index]
+    for state in shown:
+        mean, colour = state.update.prediction_posterior.mean, state.colour
+        top.plot(along, mean[index], color=colour, lw=1.2, label=f"predicted, {state.when}")
+        residual = 1e3 * (state.update.readings - mean)[index]
         bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
         bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
     top.plot(along[~held], measured[~held], ".", color=MEASURED, ms=4, label="measured, training")
     top.plot(along[held], measured[held], "o", mfc="none", color=MEASURED, ms=4,
              label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
-    bottom.fill_between(along, -band, band, color=AFTER, alpha=0.2, lw=0)
+    bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
     x, y, _ = 1e3 * before.observation.positions[index[0]]
     top.set_title(f"{label} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
@@ -391,27 +440,26 @@ def _profile(diagnosis: Diagnosis) -> Figure:
 
 
 def _line(update: Update, left_out: Floats) -> tuple[str, Ints, Floats, str]:
-    """The readings of a profile: the line along z, or circle, of one component that fitted worst.
+    """The readings of a profile: the line along z, circle, or coefficients of one kind that fitted
+    worst.
 
     ``left_out`` are the standardized residuals of the training readings.
     """
     worst = np.full(len(update.readings), np.nan)
     worst[~update.held_out] = left_out**2
-    labels, positions = np.array(update.observation.labels), update.observation.positions
-    along_z = float(np.ptp(positions[:, 2])) > 0
-    where_to = np.round(positions[:, :2] if along_z else update.observation.radii[:, None], 6)
-    groups = [np.flatnonzero((labels == label) & (where_to == one).all(axis=1))
-              for label in dict.fromkeys(update.observation.labels)
-              for one in np.unique(where_to, axis=0)]
+    along, name = places(update)
+    labels = np.array([label[0] if name == "harmonic" else label
+                       for label in update.observation.labels])
+    apart = np.round(update.observation.positions[:, :2] if name.startswith("z")
+                     else update.observation.radii[:, None], 6)
+    groups = [np.flatnonzero((labels == label) & (apart == one).all(axis=1))
+              for label in dict.fromkeys(labels.tolist()) for one in np.unique(apart, axis=0)]
     longest = max(len(group) for group in groups)
     index = max((group for group in groups if 2 * len(group) >= longest
                  and not np.isnan(worst[group]).all()),
                 key=lambda group: float(np.nanmean(worst[group])))
-    x, y, z = positions[index].T
-    along = z if along_z else np.degrees(np.arctan2(y, x)) % 360
-    order = np.argsort(along, kind="stable")
-    return (str(labels[index[0]]), index[order], along[order],
-            "z in m" if along_z else "angle in °")
+    order = np.argsort(along[index], kind="stable")
+    return str(labels[index[0]]), index[order], along[index][order], name
 
 
 def _parts(update: Update, vectors: Floats) -> dict[str, Floats]:
@@ -441,35 +489,36 @@ def _deviations(update: Update) -> dict[str, Floats]:
 
 
 def _magnetizations(diagnosis: Diagnosis) -> Figure:
-    before, after = _deviations(diagnosis.before), _deviations(diagnosis.after)
+    shown = states(diagnosis)
+    found = [_deviations(state.update) for state in shown]
     array = diagnosis.before.study.array
-    figure = Figure(figsize=(9, 1.0 + len(before) * (1.0 + 0.14 * array.rings)),
+    figure = Figure(figsize=(9, 1.0 + len(found[0]) * (1.0 + 0.14 * array.rings)),
                     layout="constrained")
-    axes = figure.subplots(len(before), 2, sharex=True, sharey=True, squeeze=False)
-    for pair, (name, old) in zip(axes, before.items(), strict=True):
-        limit = float(max(np.abs(old).max(), np.abs(after[name]).max())) or 1.0
-        for axis, values in zip(pair, (old, after[name]), strict=True):
-            axis.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
+    axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
+    for row, name in zip(axes, found[0], strict=True):
+        limit = max(float(np.abs(one[name]).max()) for one in found) or 1.0
+        for axis, one in zip(row, found, strict=True):
+            axis.imshow(one[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
                         origin="lower",
                         extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
             axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 6)))
-        figure.colorbar(_colours(limit), ax=list(pair), label=name.replace(" in", "\nin"))
-        pair[0].set_ylabel("ring")
-    for axis, when in zip(axes[0], ("before", "after"), strict=True):
-        axis.set_title(when)
+        figure.colorbar(_colours(limit), ax=list(row), label=name.replace(" in", "\nin"))
+        row[0].set_ylabel("ring")
+    for axis, state in zip(axes[0], shown, strict=True):
+        axis.set_title(state.when)
     for axis in axes[-1]:
         axis.set_xlabel("slot")
     return figure
 
 
 def _structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Rms changes of the magnetizations, before and after, and what the prior allows."""
-    before, after = _deviations(diagnosis.before), _deviations(diagnosis.after)
+    """Rms changes of the magnetizations, and what the prior allows."""
+    found = [(state.when, _deviations(state.update)) for state in states(diagnosis)]
     prior = _parts(diagnosis.before, diagnosis.before.prior.root)
     return [{"rms change of the magnetizations": name,
-             "prior sd": f"{np.sqrt(np.mean(np.sum(prior[name]**2, axis=1))):.3g}"} | {
-        when: f"{np.sqrt(np.mean(one[name]**2)):.3g}"
-        for when, one in (("before", before), ("after", after))} for name in before]
+             "prior sd": f"{np.sqrt(np.mean(np.sum(values**2, axis=1))):.3g}"} | {
+        when: f"{np.sqrt(np.mean(one[name]**2)):.3g}" for when, one in found}
+        for name, values in prior.items()]
 
 
 def _empty(text: str) -> Figure:
