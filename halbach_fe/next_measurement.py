@@ -121,14 +121,17 @@ class Separation:
     Attributes
     ----------
     named, rival : Hypothesis
+    options : tuple of Option
+        The cheapest first.
     gains : dict
-        Expected gain in the log Bayes factor, by name of the option, cheapest first.
+        Expected gain in the log Bayes factor, by name of the option.
     recommended : Option or None
         The cheapest that gains enough.
     """
 
     named: Hypothesis
     rival: Hypothesis
+    options: tuple[Option, ...]
     gains: dict[str, float]
     recommended: Option | None
 
@@ -193,8 +196,8 @@ def separations(
         then = Marginal.of(np.vstack([old.blocks, new.blocks]))
         for pair, gains, already in zip(pairs, found, before, strict=True):
             gains[choice.name] = _distance(diagnosis, then, [old, new], *pair) - already
-    return [Separation(one.hypothesis, rival, gains, next(
-        (choice for choice in choices if gains.get(choice.name, 0.0) > ENOUGH), None))
+    return [Separation(one.hypothesis, rival, tuple(choices), gains, next(
+        (choice for choice in choices if gains[choice.name] > ENOUGH), None))
         for (one, rival), gains in zip(pairs, found, strict=True)]
 
 

@@ -235,18 +235,18 @@ def _next(
 ) -> dict[str, object]:
     """What would separate an effect from its rivals, in words and numbers."""
     own = [one for one in separations if one.named == named.hypothesis]
-    choices = dict.fromkeys(name for one in own for name in one.gains)
+    choices = {choice.name: choice.title for one in own for choice in one.options}
     return {
         "what": _title(named.hypothesis.effect.name, titles),
         "advice": [(_title(one.rival.effect.name, titles),
                     one.recommended.title if one.recommended else "") for one in own],
-        "rows": [{"expected gain of": name.replace("_", " ")} | {
-            f"over {one.rival.effect.name}": _gain(one.gains.get(name)) for one in own}
-            for name in choices]}
+        "rows": [{"measurement": title} | {
+            f"against {one.rival.effect.name}": _gain(one.gains[name]) for one in own}
+            for name, title in choices.items()]}
 
 
-def _gain(value: float | None) -> str:
-    return NOTHING if value is None else f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
+def _gain(value: float) -> str:
+    return f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
 
 
 def _percent(value: float | None) -> str:

@@ -67,8 +67,8 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     write_report(found, further, tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "It does not tell" in page
-    assert "<strong>Measure the same map with the probe turned by 180° about z.</strong>" in page
-    assert "over offset_x" in page or "over background" in page
+    assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page
+    assert "against offset_x" in page or "against background" in page
     assert [row["count"] for row in change_table(found)] == ["41"]
     (row,) = found_table(found)
     assert row["it could be"] == ", ".join(dict.fromkeys(
