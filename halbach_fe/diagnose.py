@@ -228,7 +228,8 @@ def look(
         """All readings (..., readings) to training ones (rows, ...)."""
         return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
 
-    marginal = Marginal.of(noise.whiten(update.response.matrix[rows] @ update.prior.root))
+    response = noise.whiten(update.response.matrix[rows])
+    marginal = Marginal.of(response @ update.prior.root)
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
@@ -239,9 +240,14 @@ def look(
     candidates: list[Candidate] = []
     columns: list[Floats] = []
     width = 0
+    kept = marginal.remove(response)
+    information, score = response.T @ kept, kept.T @ training
     for effect in effects:
         scale = np.array([parameter.sd for parameter in effect.parameters])
-        for place in effect.places(study):
+        places = dict.fromkeys((
+            *effect.shortlist(study, update.prior.mean, information, score),
+            *(place for name, place in (*signatures, *there) if name == effect.name)))
+        for place in places:
             key = effect.name, place
             present = there.get(key)
             if present is not None and not effect.discrete:
