@@ -98,7 +98,7 @@ def simulate(
     nominal_places = np.vstack([points, others])
     offsets = real_places(study, nominal_places, noise) - nominal_places
     recorded, readings = measured(
-        magnet, instrument, points, others, offsets, elements, faults, progress)
+        magnet, instrument, points, others, elements, faults, progress, offsets)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "effects": [one.plain() for one in hidden],
@@ -120,14 +120,17 @@ def simulate(
 
 
 def measured(
-    magnet: Magnet, instrument: Instrument, points: Floats, others: Floats, offsets: Floats,
+    magnet: Magnet, instrument: Instrument, points: Floats, others: Floats,
     elements: Elements | None, generator: np.random.Generator, progress: Progress,
+    offsets: Floats | None = None,
 ) -> tuple[Floats, Floats]:
     """What is written down: points and readings without noise, both (n, 3), of the map and the
     held-out points, one after the other; the probe was ``offsets`` (n, 3) in m from there.
     """
     nominal = np.vstack([points, others])
-    places = instrument.places(nominal, generator) + offsets[:, None]
+    places = instrument.places(nominal, generator)
+    if offsets is not None:
+        places = places + offsets  # of all sensors
     # mostly the three sensors are in one place
     distinct, inverse = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
     check_air(magnet, distinct)
