@@ -36,6 +36,7 @@ from halbach_fe.observation import (
     held_out,
     noise_regions,
     observe,
+    predicted_as,
     reading_noise,
     together,
 )
@@ -236,7 +237,7 @@ def infer(
     linearized_only : bool
         Do not solve the updated magnet to see whether linearizing its iron was good enough.
     unseen : Dataset, optional
-        Another map, which is only predicted.
+        Another map, which is only predicted; see `halbach_fe.observation.predicted_as`.
 
     Raises
     ------
@@ -249,7 +250,7 @@ def infer(
     parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
     if unseen is not None:
         try:
-            other, its_noise, its_readings = _measured(study, unseen)
+            other, its_noise, its_readings = _measured(predicted_as(study, unseen), unseen)
         except MeasurementError as error:
             raise MeasurementError(
                 str(error).replace(" of map must", " of held-out map must")) from None
