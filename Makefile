@@ -28,7 +28,7 @@ study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
 
 test: setup-test
-	.venv/bin/python -m pytest
+	.venv/bin/python -m pytest -n auto --dist loadfile
 
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test

@@ -34,7 +34,7 @@ from halbach_fe.diagnosis.selection import (
     with_candidates,
 )
 from halbach_fe.effects import catalogue
-from halbach_fe.effects.base import Effect, Place
+from halbach_fe.effects.base import Effect, Parameter, Place
 from halbach_fe.instrument import map_time
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
@@ -47,6 +47,7 @@ SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
 Say = Callable[[str], None]
+Solver = Callable[[Study, Floats], Floats]
 Signatures = dict[tuple[str, Place], Floats]
 """Whitened training readings (rows, k) per unit of each parameter, by effect and place."""
 
@@ -67,7 +68,8 @@ class Named:
     ----------
     hypothesis : Hypothesis
     values, sd : ndarray, shape (k,)
-        Its amplitudes, in the units of its parameters.
+        Its amplitudes, in the units of its parameters, and of its refinements once it is in the
+        model.
     found : Found
         Odds, and what could be meant instead.
     """
@@ -76,6 +78,12 @@ class Named:
     values: Floats
     sd: Floats
     found: Found
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What the amplitudes are."""
+        effect = self.hypothesis.effect
+        return (*effect.parameters, *effect.refinements)[:len(self.values)]
 
 
 @dataclass(frozen=True)
@@ -182,6 +190,7 @@ def diagnose(
     effects = catalogue() if effects is None else effects
     named: tuple[Named, ...] = ()
     signatures: Signatures = {}
+    solver = _remembering(_room(workshop, "signatures"))
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
     for number in range(MOST_ROUNDS):
@@ -190,7 +199,7 @@ def diagnose(
         now = applied(study, named)
         update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks,
                        unseen=unseen)
-        search = look(study, update, times, workshop, effects, named, signatures)
+        search = look(study, update, times, solver, effects, named, signatures)
         first = first or (update, search)
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
@@ -218,7 +227,7 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 
 def look(
-    study: Study, update: Update, times: Floats, workshop: Workshop,
+    study: Study, update: Update, times: Floats, solver: Solver,
     effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
@@ -238,8 +247,7 @@ def look(
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
-    scene = _scene_of(update.study, update, times, workshop)
-    bare = _scene_of(study, update, times, workshop)
+    scene, bare = (_scene_of(one, update, times, solver) for one in (update.study, study))
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     hypotheses: list[Hypothesis] = []
     candidates: list[Candidate] = []
@@ -248,26 +256,36 @@ def look(
     kept = marginal.remove(response)
     information, score = response.T @ kept, kept.T @ training
     for effect in effects:
-        scale = np.array([parameter.sd for parameter in effect.parameters])
+        possible = bool(effect.places(study))  # or only with a named one, as saturation
         places = dict.fromkeys((
-            *effect.shortlist(study, update.prior.mean, information, score),
+            *effect.shortlist(update.study, update.prior.mean, information, score),
             *(place for name, place in (*signatures, *there) if name == effect.name)))
         for place in places:
             key = effect.name, place
             present = there.get(key)
-            if present is not None and not effect.discrete:
-                signatures.pop(key)
-            if key not in signatures:
-                seen = effect.signature(bare if present is None else scene, place)
-                signatures[key] = whitened(update.observation.read(seen))
-            if present is not None:
-                amount = np.ones(1) if effect.discrete else present.values
-                residual = residual + signatures[key] @ amount
-            columns.append(signatures[key] * scale)
+            if present is None:
+                seen = signatures.get(key)
+                if seen is None:
+                    seen = whitened(update.observation.read(
+                        effect.signature(bare if possible else scene, place)))
+                    if possible:
+                        signatures[key] = seen
+            elif effect.discrete:
+                others = applied(study, [one for one in named if one is not present])
+                amounts = np.pad(present.values, (0, len(_scale(effect)) - len(present.values)))
+                amounts[0] = 1.0
+                seen = whitened(update.observation.read(_whole(
+                    present.hypothesis, amounts, _scene_of(others, update, times, solver))))
+                residual = residual + seen @ amounts
+            else:
+                seen = whitened(update.observation.read(effect.signature(scene, place)))
+                residual = residual + seen @ present.values
+            columns.append(seen * _scale(effect)[:seen.shape[1]])
             hypotheses.append(Hypothesis(effect, place))
-            candidates.append(Candidate(effect.name, place.name, tuple(
-                range(width, width + len(scale))), effect.certain))
-            width += len(scale)
+            candidates.append(Candidate(
+                effect.name, place.name, tuple(range(width, width + seen.shape[1])),
+                effect.certain or seen.shape[1] > len(effect.parameters)))
+            width += seen.shape[1]
     stacked = np.hstack(columns)
     return Search(tuple(hypotheses), tuple(candidates), marginal.evidence(stacked, residual),
                   stacked, residual, marginal, training)
@@ -315,10 +333,33 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
                    tuple(points[int(np.argmax(size))].tolist()), source)
 
 
-def _scene_of(study: Study, update: Update, times: Floats, workshop: Workshop) -> Scene:
+def _whole(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:
+    """Signatures (k, n, 3) of an effect that is there as a whole, in a scene without it: what it
+    does at these amounts, less what its refinements do of that, and these.
+    """
+    effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
+    if not effect.refinements:
+        return effect.signature(scene, place)
+    refined = effect.refine(scene, place, values)
+    there = scene.solve(effect.apply(scene.study, place, values)) - scene.solved
+    return np.concatenate([(there - np.tensordot(amounts[1:], refined, 1))[None], refined])
+
+
+def _scene_of(study: Study, update: Update, times: Floats, solver: Solver) -> Scene:
     points = update.observation.map_points
-    return Scene(study, points, times,
-                 lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
+    return Scene(study, points, times, lambda other: solver(other, points))
+
+
+def _remembering(workshop: Workshop) -> Solver:
+    """Solve for nominal magnets, each once."""
+    known: dict[str, Floats] = {}
+
+    def solve(study: Study, points: Floats) -> Floats:
+        key = study.model_dump_json()
+        if key not in known:
+            known[key] = solve_nominal(study, points, workshop)
+        return known[key]
+    return solve
 
 
 def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
@@ -327,28 +368,39 @@ def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
     for one in found:
         if one.candidate.certain:
             evidence = evidence.shifted(one.candidate.columns[0])
-    free = [one for one in found if not one.candidate.certain]
-    fit = evidence.fit([column for one in free for column in one.candidate.columns])
+    fit = evidence.fit([column for one in found for column in one.candidate.free])
     deviation = np.sqrt(np.diag(fit.covariance))
     named, first = [], 0
     for one in found:
         hypothesis = search.hypotheses[search.candidates.index(one.candidate)]
-        scale = np.array([parameter.sd for parameter in hypothesis.effect.parameters])
-        if one.candidate.certain:
-            named.append(Named(hypothesis, np.ones(1), np.zeros(1), one))
-            continue
-        part = slice(first, first + len(scale))
-        named.append(Named(hypothesis, scale * fit.mean[part], scale * deviation[part], one))
-        first += len(scale)
+        free, fixed = len(one.candidate.free), int(one.candidate.certain)
+        scale = _scale(hypothesis.effect)[fixed:fixed + free]
+        part = slice(first, first + free)
+        named.append(Named(
+            hypothesis, np.concatenate([np.ones(fixed), scale * fit.mean[part]]),
+            np.concatenate([np.zeros(fixed), scale * deviation[part]]), one))
+        first += free
     return tuple(named)
+
+
+def _scale(effect: Effect) -> Floats:
+    """Prior standard deviations of all amplitudes, refinements too."""
+    return np.array([parameter.sd for parameter in (*effect.parameters, *effect.refinements)])
 
 
 def _settled(old: Sequence[Named], new: Sequence[Named]) -> bool:
     """Tell whether a round changed nothing."""
     if [one.found.candidate for one in old] != [one.found.candidate for one in new]:
         return False
-    return all((np.abs(one.values - other.values) <= SETTLED * other.sd).all()
-               or one.hypothesis.effect.discrete for one, other in zip(old, new, strict=True))
+    return all(_alike(one, other) for one, other in zip(old, new, strict=True))
+
+
+def _alike(one: Named, other: Named) -> bool:
+    """Tell whether amplitudes are the same; what is there or not is, its strength does not count."""
+    if len(one.values) != len(other.values):
+        return False
+    close = np.abs(one.values - other.values) <= SETTLED * other.sd
+    return bool(close[one.hypothesis.effect.discrete:].all())
 
 
 def _groups(update: Update, marginal: Marginal, residual: Floats) -> list[Group]:

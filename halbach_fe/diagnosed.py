@@ -118,28 +118,28 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
 
 def note(named: Named) -> str:
     """A line about an effect, in the units of the study."""
-    amounts = "there" if named.hypothesis.effect.certain else ", ".join(
-        f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
-        for parameter, value, sd in zip(named.hypothesis.effect.parameters, named.values.tolist(),
-                                        named.sd.tolist(), strict=True))
+    told = ", ".join(f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
+                     for parameter, value, sd in _uncertain(named))
     candidate = named.found.candidate
-    return f"{candidate.name}: {amounts}, log Bayes factor {named.found.log_bayes_factor:.1f}"
+    return f"{candidate.name}: {told or 'there'}, log Bayes factor {named.found.log_bayes_factor:.1f}"
 
 
 def amounts(named: Named) -> list[str]:
     """Amplitudes with their standard deviations, in units for people."""
-    if named.hypothesis.effect.certain:
-        return ["there"]
-    found = []
-    parameters = named.hypothesis.effect.parameters
-    for parameter, value, sd in zip(parameters, named.values.tolist(), named.sd.tolist(),
-                                    strict=True):
+    found, told = [], _uncertain(named)
+    for parameter, value, sd in told:
         unit, factor = human_unit(parameter)
-        alone = len(parameters) == 1 and parameter.name in named.hypothesis.effect.title
+        alone = len(told) == 1 and parameter.name in named.hypothesis.effect.title
         name = "" if alone else f"{parameter.name} "
         text = _rounded(factor * value, factor * sd).replace("-", "−")
         found.append(f"{name}{text}{_spaced(unit)}")
-    return found
+    return found or ["there"]
+
+
+def _uncertain(named: Named) -> list[tuple[Parameter, float, float]]:
+    """Amplitudes that are no yes or no."""
+    return [(parameter, value, sd) for parameter, value, sd in zip(
+        named.parameters, named.values.tolist(), named.sd.tolist(), strict=True) if sd > 0]
 
 
 def human_unit(parameter: Parameter) -> tuple[str, float]:
@@ -215,7 +215,7 @@ def _entry(named: Named) -> dict[str, object]:
         "place": named.hypothesis.place.name,
         "parameters": [
             {"name": parameter.name, "unit": parameter.unit, "value": value, "sd": sd}
-            for parameter, value, sd in zip(effect.parameters, named.values.tolist(),
+            for parameter, value, sd in zip(named.parameters, named.values.tolist(),
                                             named.sd.tolist(), strict=True)],
         "log_bayes_factor": found.log_bayes_factor, "log_odds": found.log_odds,
         "alternatives": [

@@ -45,8 +45,18 @@ CONJUGATE_GRADIENTS = (
     "-ksp_type", "cg", "-pc_type", "sor", "-pc_sor_symmetric", "-ksp_rtol", "1e-10",
     "-ksp_max_it", "5000",
 )
-"""For the scalar potential of second order in 3D, whose factorization takes minutes. Incomplete
-Cholesky is faster where it works, but loses definiteness on fine meshes."""
+"""For large scalar potentials of second order in 3D. Incomplete Cholesky is faster where it works,
+but loses definiteness on fine meshes."""
+
+NEWTON_STEPS = (
+    "-petsc_prealloc", "400",
+    "-ksp_type", "cg", "-pc_type", "gamg", "-mg_levels_ksp_type", "richardson",
+    "-mg_levels_pc_type", "sor", "-mg_levels_pc_sor_symmetric", "-ksp_rtol", "1e-4",
+    "-ksp_max_it", "5000",
+)
+"""For large scalar potentials again: a step of Newton's method need not be exact, and convergence is
+judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a quarter
+of what `CONJUGATE_GRADIENTS` take."""
 
 _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
 """Open MPI, which Debian's GetDP is built with, otherwise starts a daemon for every run; it can

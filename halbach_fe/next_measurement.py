@@ -396,8 +396,9 @@ def _rivals(
     for candidate, _ in named.found.alternatives:
         if candidate.effect not in (named.found.candidate.effect, *found):
             effect = known[candidate.effect]
-            found[candidate.effect] = Hypothesis(effect, next(
-                place for place in effect.places(study) if place.name == candidate.place))
+            for place in effect.places(study):  # not all that was looked at is listed
+                if place.name == candidate.place:
+                    found[candidate.effect] = Hypothesis(effect, place)
     return list(found.values())[:MOST_RIVALS]
 
 

@@ -37,13 +37,18 @@ class Candidate:
     columns : tuple of int
         Of the evidence.
     certain : bool
-        Whether its amplitude is 1 if it is there, as of a missing block.
+        Whether the amplitude of the first is 1 if it is there, as of a missing block.
     """
 
     effect: str
     place: str
     columns: tuple[int, ...]
     certain: bool = False
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Columns whose amplitudes are not known."""
+        return self.columns[1:] if self.certain else self.columns
 
     @property
     def name(self) -> str:
@@ -92,8 +97,7 @@ def gains(evidence: Evidence, candidates: Sequence[Candidate]) -> Floats:
     found[free] = evidence.log_evidences([candidates[number].columns for number in free])
     for number, one in enumerate(candidates):
         if one.certain:
-            (column,) = one.columns
-            found[number] = evidence.score[column] - evidence.information[column, column] / 2
+            found[number] = log_evidence(evidence, [one])
     return found
 
 
@@ -102,8 +106,7 @@ def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evid
     for one in candidates:
         if one.certain:
             evidence = evidence.shifted(one.columns[0])
-    return evidence.given([column for one in candidates if not one.certain
-                           for column in one.columns])
+    return evidence.given([column for one in candidates for column in one.free])
 
 
 def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
@@ -111,11 +114,11 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
     total = 0.0
     for one in candidates:
         if one.certain:
-            (column,) = one.columns
+            column = one.columns[0]
             total += float(evidence.score[column] - evidence.information[column, column] / 2)
             evidence = evidence.shifted(column)
-    return total + evidence.fit([column for one in candidates if not one.certain
-                                 for column in one.columns]).log_evidence
+    return total + evidence.fit(
+        [column for one in candidates for column in one.free]).log_evidence
 
 
 def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -> list[Found]:

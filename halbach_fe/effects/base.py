@@ -58,6 +58,8 @@ class Effect(ABC):
     kind : str
         ``field``: the magnet or what is around it; ``instrument``: the mapper.
     parameters : tuple of Parameter
+    refinements : tuple of Parameter
+        More of them, that are looked for once the effect is in the model.
     certain : bool
         Whether it is there with amplitude 1 or not at all, as a block upside down.
     discrete : bool
@@ -68,6 +70,7 @@ class Effect(ABC):
     title: ClassVar[str]
     kind: ClassVar[Literal["field", "instrument"]]
     parameters: tuple[Parameter, ...]
+    refinements: ClassVar[tuple[Parameter, ...]] = ()
     certain: ClassVar[bool] = False
     discrete: ClassVar[bool] = False
 
@@ -92,6 +95,12 @@ class Effect(ABC):
     @abstractmethod
     def signature(self, scene: Scene, place: Place) -> Floats:
         """Change of the readings of a map, (k, n, 3) in T per unit of each parameter."""
+
+    def refine(self, scene: Scene, place: Place, values: Sequence[float]) -> Floats:
+        """Change of the readings of a map, (r, n, 3) in T per unit of each refinement, at values of
+        all parameters, in a scene without the effect.
+        """
+        return np.empty((0, *scene.points.shape))
 
     @abstractmethod
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -106,7 +106,8 @@ def test_the_page_of_what_is_unknown(flat, tmp_path):
 def test_numbers_for_people(flat):
     found, _ = flat
     one = found.named[0]
-    certain = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["block_missing"]))
+    certain = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["block_missing"]),
+                      values=np.ones(1), sd=np.zeros(1))
     assert amounts(certain) == ["there"]
     sag = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["arm_sag"]),
                   found=replace(one.found, candidate=Candidate("arm_sag", "", (0,)),
