@@ -7,6 +7,7 @@ from the blocks listed here.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -213,7 +214,7 @@ def blocks_of(study: Study) -> tuple[MagnetBlock, ...]:
     """
     array = study.array
     outlines = [_outline(array, slot) for slot in range(1, array.blocks_per_ring + 1)]
-    _check_overlaps(outlines)
+    _check_overlaps(tuple(outlines))
     return tuple(
         _block(array, ring, slot, outline, limits)
         for ring, limits in enumerate(ring_limits(study), start=1)
@@ -454,7 +455,8 @@ def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
                  for i in range(len(points)))
 
 
-def _check_overlaps(outlines: list[Outline]) -> None:
+@functools.lru_cache(maxsize=32)  # a diagnosis asks for the same blocks hundreds of times
+def _check_overlaps(outlines: tuple[Outline, ...]) -> None:
     """Refuse outlines that overlap: one holds a point of another, or their edges cross.
 
     Shared faces are allowed; outlines are drawn in by 1e-6 so that rounding decides nothing.

@@ -176,7 +176,7 @@ class Diagnosis:
 def diagnose(
     study: Study, data: xr.Dataset, workshop: Workshop, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, unseen: xr.Dataset | None = None,
-    say: Say = lambda text: None,
+    say: Say = lambda text: None, solver: Solver | None = None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain a map.
 
@@ -186,11 +186,13 @@ def diagnose(
         To choose from; default the whole catalogue.
     unseen : Dataset, optional
         Another map, which is only predicted.
+    solver : callable, optional
+        Of nominal magnets, see `remembering`; default one of its own.
     """
     effects = catalogue() if effects is None else effects
     named: tuple[Named, ...] = ()
     signatures: Signatures = {}
-    solver = _remembering(_room(workshop, "signatures"))
+    solver = solver or remembering(_room(workshop, "signatures"))
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
     for number in range(MOST_ROUNDS):
@@ -350,12 +352,12 @@ def _scene_of(study: Study, update: Update, times: Floats, solver: Solver) -> Sc
     return Scene(study, points, times, lambda other: solver(other, points))
 
 
-def _remembering(workshop: Workshop) -> Solver:
-    """Solve for nominal magnets, each once."""
-    known: dict[str, Floats] = {}
+def remembering(workshop: Workshop) -> Solver:
+    """Solve for the fields (n, 3) in T of nominal magnets at points (n, 3) in m, each once."""
+    known: dict[tuple[str, bytes], Floats] = {}
 
     def solve(study: Study, points: Floats) -> Floats:
-        key = study.model_dump_json()
+        key = study.model_dump_json(), points.tobytes()
         if key not in known:
             known[key] = solve_nominal(study, points, workshop)
         return known[key]
@@ -396,7 +398,7 @@ def _settled(old: Sequence[Named], new: Sequence[Named]) -> bool:
 
 
 def _alike(one: Named, other: Named) -> bool:
-    """Tell whether amplitudes are the same; what is there or not is, its strength does not count."""
+    """Tell whether amplitudes are the same; of what is there or not the strength does not count."""
     if len(one.values) != len(other.values):
         return False
     close = np.abs(one.values - other.values) <= SETTLED * other.sd

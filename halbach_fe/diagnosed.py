@@ -121,7 +121,8 @@ def note(named: Named) -> str:
     told = ", ".join(f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
                      for parameter, value, sd in _uncertain(named))
     candidate = named.found.candidate
-    return f"{candidate.name}: {told or 'there'}, log Bayes factor {named.found.log_bayes_factor:.1f}"
+    factor = f"log Bayes factor {named.found.log_bayes_factor:.1f}"
+    return f"{candidate.name}: {told or 'there'}, {factor}"
 
 
 def amounts(named: Named) -> list[str]:

@@ -54,8 +54,8 @@ NEWTON_STEPS = (
     "-mg_levels_pc_type", "sor", "-mg_levels_pc_sor_symmetric", "-ksp_rtol", "1e-4",
     "-ksp_max_it", "5000",
 )
-"""For large scalar potentials again: a step of Newton's method need not be exact, and convergence is
-judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a quarter
+"""For large scalar potentials again: a step of Newton's method need not be exact, its convergence
+is judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a quarter
 of what `CONJUGATE_GRADIENTS` take."""
 
 _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}

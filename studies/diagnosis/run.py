@@ -20,7 +20,7 @@ from halbach_fe.campaign.effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.campaign.extras import needed
 from halbach_fe.campaign.simulate import simulate
 from halbach_fe.cli import common
-from halbach_fe.diagnose import Diagnosis, diagnose
+from halbach_fe.diagnose import Diagnosis, Solver, diagnose, remembering
 from halbach_fe.effects import catalogue
 from halbach_fe.field_map import points_of
 from halbach_fe.solve import Workshop
@@ -89,7 +89,9 @@ def quadrupole(points: np.ndarray, generator: np.random.Generator) -> np.ndarray
 OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
 
 
-def run_case(study: Study, case: Case, workshop: Workshop) -> dict[str, object]:
+def run_case(
+    study: Study, case: Case, workshop: Workshop, solver: Solver
+) -> dict[str, object]:
     """Simulate, diagnose, and compare with what is sealed."""
     campaign = simulate(study, case.seed, hide=[(CAN_BE_HIDDEN[name], None)
                                                 for name in case.hidden])
@@ -97,7 +99,7 @@ def run_case(study: Study, case: Case, workshop: Workshop) -> dict[str, object]:
     if case.outside:
         added = OUTSIDE[case.outside](points_of(readings), np.random.default_rng(case.seed))
         readings = readings.assign(B_T=readings["B_T"] + added)
-    found = diagnose(study, readings, workshop, campaign.blocks)
+    found = diagnose(study, readings, workshop, campaign.blocks, solver=solver)
     return {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
             "truth": campaign.truth["effects"], **outcome(found)}
 
@@ -153,17 +155,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Run all cases and print the rates."""
     study, results = read_study(arguments.study), []
     chosen = cases(study, arguments.singles, arguments.clean, arguments.pairs, arguments.outside)
-    for number, case in enumerate(chosen, start=1):
-        path = arguments.output / "cases" / f"{case.name}.json"
-        if not path.exists():
-            with common.workshop(arguments) as workshop:
-                there = replace(workshop, folder=arguments.output / "work")
-                result = run_case(study, case, there)
-            write_text(path, json.dumps(result, indent=1) + "\n")
-        results.append(json.loads(path.read_text()))
-        one = results[-1]
-        common.say(f"{number}/{len(chosen)} {case.name}: {one['named']} {one['unknown'] or ''} "
-                   f"chi2 {one['chi2_before']:.2f} -> {one['chi2_after']:.2f}")
+    with common.workshop(arguments) as workshop:
+        there = replace(workshop, folder=arguments.output / "work")
+        solver = remembering(there)
+        for number, case in enumerate(chosen, start=1):
+            path = arguments.output / "cases" / f"{case.name}.json"
+            if not path.exists():
+                write_text(path, json.dumps(run_case(study, case, there, solver), indent=1) + "\n")
+            results.append(json.loads(path.read_text()))
+            one = results[-1]
+            common.say(f"{number}/{len(chosen)} {case.name}: {one['named']} "
+                       f"{one['unknown'] or ''} chi2 {one['chi2_before']:.2f} -> "
+                       f"{one['chi2_after']:.2f}")
     rates = summary(results)
     write_text(arguments.output / "summary.json", json.dumps(rates, indent=1) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
