@@ -7,10 +7,9 @@ from the blocks listed here.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -455,7 +454,7 @@ def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
                  for i in range(len(points)))
 
 
-@functools.lru_cache(maxsize=32)  # a diagnosis asks for the same blocks hundreds of times
+@lru_cache(maxsize=32)  # a diagnosis asks for the same blocks hundreds of times
 def _check_overlaps(outlines: tuple[Outline, ...]) -> None:
     """Refuse outlines that overlap: one holds a point of another, or their edges cross.
 

@@ -55,8 +55,8 @@ NEWTON_STEPS = (
     "-ksp_max_it", "5000",
 )
 """For large scalar potentials again: a step of Newton's method need not be exact, its convergence
-is judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a quarter
-of what `CONJUGATE_GRADIENTS` take."""
+is judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a
+quarter of what `CONJUGATE_GRADIENTS` take."""
 
 _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
 """Open MPI, which Debian's GetDP is built with, otherwise starts a daemon for every run; it can
