@@ -451,9 +451,10 @@ def _newton_task(
                     (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
         iterated = not gateaux and job.unknowns > case.formulation.factorized_for_newton
+        if iterated:
+            job = replace(job, options=runner.NEWTON_STEPS, linear_residual=runner.NEWTON_RESIDUAL)
         return replace(
-            job, options=runner.NEWTON_STEPS if iterated else job.options,
-            resolution="Newton", solves=max(columns, 1),
+            job, resolution="Newton", solves=max(columns, 1),
             outputs=(*outputs, _saved(case)), solutions=SOLUTIONS_FILE if gateaux else None,
             numbers={**job.numbers, "TOLERANCE": tolerance, "COLD": cold, "GATEAUX": gateaux})
 
