@@ -1,8 +1,9 @@
 """What a mapper does to the field between magnet and map.
 
-`halbach_fe.study.Instrument` says what each number means. What is linear in B (where the sensors
-were, how they were turned, their gains and crosstalk) belongs to the model of a reading; the rest
-(offset, drift, non-linearity) is taken out of the map.
+`halbach_fe.study.Instrument` says what each number means. Units and axes are put right as the map
+is read. What is linear in B (where the sensors were, how they were turned, their gains and
+crosstalk) belongs to the model of a reading; the rest (offset, drift, non-linearity) is taken out
+of the map.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, turn_of
 from halbach_fe.errors import MeasurementError, must_be
-from halbach_fe.study import COMPONENTS, Instrument
+from halbach_fe.field_map import POSITION_COLUMNS, check_magnitudes, points_of
+from halbach_fe.study import COMPONENTS, Axes, Instrument
 
 ROUNDS = 50
 CONVERGED_T = 1e-12
@@ -37,6 +39,36 @@ class Probe:
 
     points: Floats
     operator: sparse.csr_array
+
+
+def as_read(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
+    """A map in m and T along the magnet's axes, as the study says that it is to be read.
+
+    Raises
+    ------
+    MeasurementError
+        If its numbers are still those of another unit.
+    """
+    points = along_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
+    unit = instrument.flux_density_unit_T
+    field = along_axes(instrument.field_axes, data["B_T"].values) * unit
+    read = data.assign_coords({name: data[name].copy(data=points[:, axis])
+                               for axis, name in enumerate(POSITION_COLUMNS)})
+    read = read.assign(B_T=data["B_T"].copy(data=field))
+    if "sigma_T" in data:
+        sigma = np.abs(along_axes(instrument.field_axes, data["sigma_T"].values)) * unit
+        read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
+    check_magnitudes(read)
+    return read
+
+
+def along_axes(axes: Axes, columns: Floats) -> Floats:
+    """Vectors (n, 3) along the magnet's axes, of which ``axes`` are those of the columns (n, 3)."""
+    found = np.empty(columns.shape)
+    for column, axis in enumerate(axes):
+        sign = -1.0 if axis.startswith("-") else 1.0
+        found[:, COMPONENTS.index(axis[-1])] = sign * columns[:, column]
+    return found
 
 
 def probe(instrument: Instrument, points: Floats) -> Probe:

@@ -286,6 +286,24 @@ def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
                             shape=covariance.shape)
 
 
+def excluded(study: Study, count: int) -> NDArray[np.bool_]:
+    """Tell which components (count, 3) of a map of so many rows the study leaves out.
+
+    Raises
+    ------
+    MeasurementError
+        If the map has no such row.
+    """
+    found = np.zeros((count, len(COMPONENTS)), bool)
+    for one in study.inference.excluded_readings:
+        if one.row > count:
+            raise MeasurementError(must_be(
+                "rows", "map", f"at least the {one.row} that inference.excluded_readings names",
+                f"{count}", "Is it another map?"))
+        found[one.row - 1, [COMPONENTS.index(name) for name in one.components]] = True
+    return found
+
+
 def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:
     """Tell which readings the study keeps from the update, (readings,).
 
