@@ -1,0 +1,569 @@
+"""Gross errors: a map in other units, along other axes, or of another magnet than the study's.
+
+They are no small effects, about which a model could be linearized, and they must be gone before
+anything is inferred. The map is compared with the field of the nominal blocks in vacuum, at some of
+its points: as it stands, and with every error in question put right, single errors first. A common
+factor near 1 is free, for iron and temperature. What other blocks and effects of usual size leave
+is known; a gross error is named only if the misfit is far larger, and if it explains nearly all of
+it. What the symmetry of the magnet makes the same, as z reversed and Bz of the wrong sign where
+both ends are alike, is named together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import permutations, product
+
+import numpy as np
+import xarray as xr
+from pydantic import ValidationError
+from scipy.optimize import least_squares, minimize_scalar
+
+from halbach_fe.blocks import Floats, MagnetBlock, blocks_of, turn_of
+from halbach_fe.errors import HalbachError
+from halbach_fe.exact_field import unit_fields
+from halbach_fe.external import external_field
+from halbach_fe.field_map import points_of
+from halbach_fe.instrument import along_axes, probe_positions, sensor_matrix
+from halbach_fe.study import COMPONENTS, Axes, Component, Instrument, Study
+
+POINTS = 160
+"""Of the map, that are compared."""
+
+PANEL = 0.2
+"""Of the inner radius: panels of the exact field, good to 1e-3 at that distance."""
+
+BLOCK_SD = 0.02
+"""Of the magnetization, along each axis: blocks may be off by this much, and twice."""
+
+USUAL = 0.003
+"""Of the main field: what effects of usual size add to a reading."""
+
+SCALE = 0.1
+"""Iron, permeability and temperature may change the whole field by this fraction."""
+
+FAR = 2.0
+"""Misfit, over what blocks and usual effects make, from which an error is looked for. Blocks of 1 %
+and 1 deg leave 0.5, with an effect of three standard deviations up to 1; a block upside down in an
+array of 64 leaves 4 to 6, which no error explains."""
+
+DECISIVE = 3.0
+"""By how much an error must reduce the misfit. The best wrong one reduces that of an upside-down or
+missing block, or of sensors 6 mm off, to no less than half."""
+
+CLOSE = 0.05
+"""Of the map's rms: what it may leave."""
+
+ALIKE = 1.2
+"""Ratio of misfits of errors that the map does not tell apart."""
+
+MOST = 3
+"""Errors at a time, of which no single one explains anything."""
+
+SEVERAL = 0.15
+OTHER_UNIT = 0.5
+"""Misfits over the map's rms that several errors together, or another unit, make at least."""
+
+LEAST_RADIUS = 0.03
+LEAST_SHIFT_M = 0.006
+"""Less is a small effect: six standard deviations of those in the catalogue."""
+
+RADII = tuple(float(one) for one in np.geomspace(0.4, 2.5, 17) if abs(one - 1) > 0.01)
+LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
+FLUX_DENSITIES = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
+RINGS = 4
+"""More or less than the study has, at most."""
+
+ALL_AXES: tuple[Axes, ...] = tuple(
+    tuple(sign + name for sign, name in zip(signs, names, strict=True))  # type: ignore[misc]
+    for names in permutations(COMPONENTS) for signs in product(("", "-"), repeat=3))
+SAME: Axes = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """Another magnet than the study's: the name of the error, in words, and the right study.
+
+    ``turn_rad`` is by how much the magnetization of each block is turned, if that is all.
+    """
+
+    name: str
+    title: str
+    change: Callable[[Study], Study] = field(compare=False)
+    turn_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a map is to be read, and of what magnet: gross errors put right.
+
+    Attributes
+    ----------
+    length_unit, flux_density_unit : float
+        In m and T.
+    positions, fields : tuple of str
+        Axes of the columns, see `halbach_fe.study.Instrument`.
+    magnet : Magnet or None
+    radius : float
+        Factor of the distances from the axis.
+    shift_m : tuple of float
+        Of the points.
+    """
+
+    length_unit: float = 1.0
+    flux_density_unit: float = 1.0
+    positions: Axes = SAME
+    fields: Axes = SAME
+    magnet: Magnet | None = None
+    radius: float = 1.0
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def errors(self) -> tuple[tuple[str, str], ...]:
+        """Standard names of the errors, and what each is in words."""
+        found = []
+        if self.length_unit != 1:
+            name = LENGTHS[self.length_unit]
+            found.append((name, f"coordinates in {name}"))
+        if self.flux_density_unit != 1:
+            name = FLUX_DENSITIES[self.flux_density_unit]
+            found.append((name, f"flux densities in {name}"))
+        found += _axis_errors(self.positions, self.fields)
+        if self.magnet:
+            found.append((self.magnet.name, self.magnet.title))
+        if self.radius != 1:
+            found.append(("wrong_radius", f"{self.radius:.3g} times the map's radius"))
+        if any(self.shift_m):
+            shift = ", ".join(f"{1e3 * one:.1f}" for one in self.shift_m)
+            found.append(("wrong_line", f"points that are off by ({shift}) mm"))
+        return tuple(found)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Standard names of the errors."""
+        return tuple(name for name, _ in self.errors)
+
+    def apply(self, study: Study) -> Study:
+        """The study that reads the map right.
+
+        Raises
+        ------
+        ValidationError
+            If there is no such study.
+        """
+        if self.magnet:
+            study = Study.model_validate(self.magnet.change(study).model_dump())
+        old = study.instrument
+        changes = {
+            "length_unit_m": old.length_unit_m * self.length_unit,
+            "flux_density_unit_T": old.flux_density_unit_T * self.flux_density_unit,
+            "position_axes": _then(old.position_axes, self.positions),
+            "field_axes": _then(old.field_axes, self.fields),
+            "radius_scale": (1 + old.radius_scale) * self.radius - 1,
+            "translation_m": tuple(np.add(old.translation_m, self.shift_m).tolist())}
+        return study.model_copy(
+            update={"instrument": Instrument.model_validate(old.model_dump() | changes)})
+
+
+@dataclass(frozen=True)
+class Gross:
+    """Gross errors that a map has together.
+
+    Attributes
+    ----------
+    reading : Reading
+    alternatives : tuple of Reading
+        Others that explain the map as well.
+    misfit_before, misfit_after : float
+        From the nominal magnet, rms over the rms of the map.
+    """
+
+    reading: Reading
+    alternatives: tuple[Reading, ...]
+    misfit_before: float
+    misfit_after: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Standard names of the errors."""
+        return self.reading.names
+
+    @property
+    def text(self) -> str:
+        """The errors in words."""
+        return " and ".join(text for _, text in self.reading.errors)
+
+    def apply(self, study: Study) -> Study:
+        """The study that reads the map right."""
+        return self.reading.apply(study)
+
+
+@dataclass(frozen=True)
+class _Misfit:
+    """``standard`` is over what blocks and usual effects make, ``relative`` over the map's rms."""
+
+    standard: float
+    relative: float
+
+
+NOWHERE = _Misfit(np.inf, np.inf)
+
+
+def find_gross(study: Study, data: xr.Dataset) -> tuple[Gross, ...]:
+    """Find gross errors of a map, in the order in which they are to be put right."""
+    found: list[Gross] = []
+    rows = np.unique(np.linspace(0, data.sizes["point"] - 1, POINTS).round().astype(int))
+    some = data.isel(point=rows)
+    while len(found) < MOST:
+        one = _Search(study, points_of(some), np.asarray(some["B_T"].values, float)).find()
+        if one is None:
+            break
+        found.append(one)
+        study = one.apply(study)
+    return tuple(found)
+
+
+class _Search:
+    """The search for one gross error, or several that explain nothing by themselves.
+
+    ``points`` (n, 3) and ``values`` (n, 3) are the map's, as its file has them.
+    """
+
+    def __init__(self, study: Study, points: Floats, values: Floats) -> None:
+        self.study, self.points, self.values = study, points, values
+        others = magnets(study)
+        self.turned = tuple(one for one in others if one.turn_rad is not None)
+        self.other = tuple(one for one in others if one.turn_rad is None)
+        self.observed = np.array([name in _observed(study) for name in COMPONENTS])
+        self.present = int((~np.isnan(values) & self.observed).sum())
+        self.blocks: dict[Magnet | None, tuple[MagnetBlock, ...]] = {}
+        self.lengths, self.flux_densities = (1.0, *LENGTHS), (1.0, *FLUX_DENSITIES)
+        self.computed: dict[Reading, _Nominal | None] = {}
+
+    def find(self) -> Gross | None:
+        """The simplest, and of those the likeliest."""
+        before = self.misfit(Reading())
+        if before.standard <= FAR or not self.present:
+            return None
+        if before.relative < OTHER_UNIT:
+            self.lengths = self.flux_densities = (1.0,)
+        for level in range(1, MOST + 1 if before.relative > SEVERAL else 2):
+            for readings in (self.readings(level), self.elsewhere(level)):
+                tried = [(self.misfit(one), one) for one in readings]
+                good = [one for one in tried if self.explains(before, *one)]
+                if good:
+                    break
+            if good:
+                least = min(misfit.standard for misfit, _ in good)
+                alike = [one for one in good if one[0].standard <= ALIKE * least]
+                (after, reading), *others = sorted(alike, key=lambda one: _rank(one[1]))
+                return Gross(reading, tuple(one for _, one in others), before.relative,
+                             after.relative)
+        return None
+
+    def explains(self, before: _Misfit, after: _Misfit, reading: Reading) -> bool:
+        """Whether it leaves next to nothing of what was there, and is no small effect."""
+        if not (after.standard <= before.standard / DECISIVE and after.relative <= CLOSE):
+            return False
+        if 0 < abs(reading.radius - 1) < LEAST_RADIUS or (
+                0 < float(np.linalg.norm(reading.shift_m)) < LEAST_SHIFT_M):
+            return False
+        try:
+            reading.apply(self.study)
+        except ValidationError:
+            return False
+        return True
+
+    def readings(self, level: int) -> Iterator[Reading]:
+        """All with that many errors, of units, axes and magnet."""
+        flat = self.study.dimension == 2
+        singles = [
+            *(Reading(positions=one) for one in ALL_AXES if not (flat and one[2] != "z")
+              and 0 < len(_axis_errors(one, SAME)) <= min(level, 2)),
+            *(Reading(magnet=one) for one in self.other)]
+        for unit in self.lengths:
+            yield from self.of_source(Reading(length_unit=unit), level)
+            for one in singles:
+                if unit == 1 or len(one.errors) < level:
+                    yield from self.of_source(replace(one, length_unit=unit), level)
+
+    def of_source(self, source: Reading, level: int) -> Iterator[Reading]:
+        """All with that many errors, of points and a magnet that are given."""
+        left = level - len(replace(source, positions=SAME).errors)
+        for unit in self.flux_densities:
+            for magnet in (source.magnet,) if source.magnet else (None, *self.turned):
+                more = (unit != 1) + (magnet is not source.magnet)
+                for fields in _AXES_BY_ERRORS[source.positions].get(left - more, ()):
+                    yield replace(source, fields=fields, flux_density_unit=unit, magnet=magnet)
+
+    def elsewhere(self, level: int) -> Iterator[Reading]:
+        """The best with points at other radii, or shifted, and as many errors in all."""
+        for unit in self.lengths if level > 1 else (1.0,):
+            starts = [Reading(length_unit=unit, radius=one) for one in RADII]
+            tried = [one for start in starts for one in self.of_source(start, level)]
+            best = min(tried, key=lambda one: self.misfit(one).standard, default=None)
+            if best and np.hypot(self.points[:, 0], self.points[:, 1]).any():
+                yield self.refined(best)
+        if level == 1:
+            yield from self.shifted()
+
+    def refined(self, best: Reading) -> Reading:
+        """The same with the best radius."""
+        step = RADII[1] / RADII[0]
+        found = minimize_scalar(
+            lambda radius: min(self.misfit(replace(best, radius=float(radius))).standard, 1e9),
+            bounds=(best.radius / step, best.radius * step), method="bounded",
+            options={"xatol": 1e-3})
+        return replace(best, radius=float(found.x))
+
+    def shifted(self) -> Iterator[Reading]:
+        """The best with points that are all elsewhere by the same.
+
+        None if the opposite shift is as good, as from the axis of a magnet that is symmetric.
+        """
+        size = self.study.array.inner_radius_m
+        starts = [np.zeros(3)] + [
+            size * part * np.array([np.cos(angle), np.sin(angle), 0.0])
+            for part in (0.2, 0.5) for angle in np.pi / 4 * np.arange(8)]
+        if self.study.dimension == 3:
+            starts += [np.array([0.0, 0.0, sign * part * size])
+                       for part in (0.25, 0.5, 1.0) for sign in (-1, 1)]
+
+        def reading(shift: Floats) -> Reading:
+            x, y, z = shift.tolist()
+            return Reading(shift_m=(x, y, z))
+
+        def residual(shift: Floats) -> Floats:
+            own = self.residual(reading(shift))
+            return np.full(self.present, 1e3) if own is None else own[0]
+
+        best = min(starts, key=lambda one: self.misfit(reading(one)).standard)
+        found = least_squares(residual, best, x_scale=size, diff_step=1e-4, max_nfev=8).x
+        opposite = self.misfit(reading(-found)).standard
+        if opposite > ALIKE * self.misfit(reading(found)).standard:
+            yield reading(found)
+
+    def misfit(self, reading: Reading) -> _Misfit:
+        """How far the map so read is from the nominal magnet."""
+        found = self.residual(reading)
+        if found is None:
+            return NOWHERE
+        residual, relative = found
+        return _Misfit(float(np.sqrt(np.mean(residual**2))), relative)
+
+    def residual(self, reading: Reading) -> tuple[Floats, float] | None:
+        """Standardized residuals (values,) and their rms over that of the map; None of readings
+        inside of material, or of none that the study observes.
+        """
+        nominal = self.nominal(replace(
+            reading, fields=SAME, flux_density_unit=1.0,
+            magnet=None if reading.magnet in self.turned else reading.magnet))
+        if nominal is None:
+            return None
+        old = self.study.instrument
+        shown = along_axes(_then(old.field_axes, reading.fields), self.values) * (
+            old.flux_density_unit_T * reading.flux_density_unit)
+        used = ~np.isnan(shown) & self.observed
+        if not used.any() or 2 * used.sum() < self.present:
+            return None
+        turn = reading.magnet.turn_rad if reading.magnet in self.turned and reading.magnet else 0.0
+        field = nominal.field(turn or 0.0)[used]
+        whole = max(_size(shown), 1e-300)
+        shown = shown[used]
+        main = max(whole, _size(nominal.field(0.0)))
+        sd = np.sqrt(nominal.variance[used] + (USUAL * main) ** 2)
+        weighted = field / sd
+        scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
+                        1 - SCALE, 1 + SCALE)
+        difference = shown - scale * field
+        return difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole)
+
+    def nominal(self, source: Reading) -> _Nominal | None:
+        """The nominal magnet's field where the points then are; None inside of material."""
+        if source not in self.computed:
+            try:
+                study = source.apply(self.study)
+                if source.magnet not in self.blocks:
+                    self.blocks[source.magnet] = blocks_of(study)
+                self.computed[source] = _Nominal.of(
+                    study, self.blocks[source.magnet], self.points)
+            except (ValidationError, HalbachError):
+                self.computed[source] = None
+        return self.computed[source]
+
+
+@dataclass(frozen=True)
+class _Nominal:
+    """Field (n, 3) in T of the nominal blocks in vacuum as the sensors see it, the same with their
+    magnetization turned by a right angle, what else there is, and the variance (n, 3) in T^2 that
+    other blocks make.
+    """
+
+    blocks: Floats
+    across: Floats
+    external: Floats
+    variance: Floats
+
+    @classmethod
+    def of(
+        cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats
+    ) -> _Nominal | None:
+        """At the points (n, 3) that a map shows; None if one is inside of material."""
+        instrument = study.instrument
+        read = along_axes(instrument.position_axes, shown) * instrument.length_unit_m
+        points = probe_positions(instrument, read).mean(axis=1)
+        if any(block.contains(points).any() for block in blocks):
+            return None
+        field, across, variance = (np.zeros_like(points) for _ in range(3))
+        for block, unit in zip(blocks, unit_fields(
+                blocks, points, 4, PANEL * study.array.inner_radius_m), strict=True):
+            x, y, _ = block.easy_axis
+            field += unit @ (np.array(block.easy_axis) * block.remanence)
+            across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
+            variance += np.sum((BLOCK_SD * block.remanence * unit) ** 2, axis=2)
+        sensors = sensor_matrix(instrument).T
+        return cls(field @ sensors, across @ sensors,
+                   external_field(study, points) @ sensors, variance)
+
+    def field(self, turn: float) -> Floats:
+        """B (n, 3) in T with the magnetization of all blocks turned by an angle in rad."""
+        return np.cos(turn) * self.blocks + np.sin(turn) * self.across + self.external
+
+
+def magnets(study: Study) -> tuple[Magnet, ...]:
+    """Magnets that may be another than the study's by mistake."""
+    array = study.array
+    pitch = 360.0 / array.blocks_per_ring
+    found = []
+    for blocks in range(1 - array.blocks_per_ring // 2, array.blocks_per_ring // 2 + 1):
+        if blocks:
+            angle = blocks * pitch
+            found.append(Magnet(
+                "rotated_by_one_block", f"the map turned by {_count(blocks, 'block')}",
+                partial(turned, angle_deg=-angle),
+                # in its places, an array that is turned differs in its magnetization only
+                turn_rad=float(np.radians(array.multipole_order * angle))))
+    turns = {round(pitch * k, 9) for k in range(1, array.blocks_per_ring)} | {
+        45.0 * k for k in range(1, 8)}
+    for angle in sorted(turns, key=lambda one: (one % 90 != 0, one)):
+        found.append(Magnet(
+            "wrong_magnetization_direction", f"all magnetizations turned by {angle:g} deg",
+            partial(_with_array, first_magnetization_angle_deg=_wrapped(
+                array.first_magnetization_angle_deg + angle)),
+            turn_rad=float(np.radians(angle))))
+    if study.dimension == 3:
+        for rings in range(max(1, array.rings - RINGS), array.rings + RINGS + 1):
+            if rings != array.rings:
+                found.append(Magnet(
+                    "wrong_ring_count", f"a magnet of {_count(rings, 'ring')}",
+                    partial(_with_array, rings=rings)))
+    for order in range(1, 5):
+        if order != array.multipole_order:
+            found.append(Magnet(
+                "wrong_multipole_order", f"a magnet of multipole order {order}",
+                partial(_with_array, multipole_order=order)))
+    return tuple(found)
+
+
+def turned(study: Study, angle_deg: float) -> Study:
+    """The same magnet, turned about its axis with all that is around it."""
+    turn = turn_of((0.0, 0.0, float(np.radians(angle_deg))))
+
+    def around(vector: tuple[float, float, float]) -> tuple[float, ...]:
+        return tuple((turn @ vector).tolist())
+
+    array, external = study.array, study.external
+    exceptions = tuple(one.model_copy(update={
+        "shift_m": around(one.shift_m),
+        "magnetization_angle_deg": None if one.magnetization_angle_deg is None
+        else _wrapped(one.magnetization_angle_deg + angle_deg)}) for one in array.exceptions)
+    dipoles = tuple(one.model_copy(update={
+        "position_m": around(one.position_m), "moment_A_m2": around(one.moment_A_m2)})
+        for one in external.dipoles)
+    return _with_array(
+        study, exceptions=exceptions,
+        first_block_angle_deg=_wrapped(array.first_block_angle_deg + angle_deg),
+        first_magnetization_angle_deg=_wrapped(array.first_magnetization_angle_deg + angle_deg),
+    ).model_copy(update={"external": external.model_copy(update={
+        "background_T": around(external.background_T), "dipoles": dipoles})})
+
+
+def _with_array(study: Study, **keys: object) -> Study:
+    return study.model_copy(update={"array": study.array.model_copy(update=keys)})
+
+
+def _wrapped(angle_deg: float) -> float:
+    return round(angle_deg % 360.0, 9)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if abs(number) != 1 else ''}"
+
+
+def _observed(study: Study) -> tuple[Component, ...]:
+    one = study.observation
+    return one.components if one.quantity == "flux_density" else ("x", "y")
+
+
+def _size(vectors: Floats) -> float:
+    """Rms magnitude of vectors (n, 3), of their components that are known."""
+    return float(np.sqrt(np.nansum(vectors**2) / len(vectors)))
+
+
+def _matrix(axes: Axes) -> Floats:
+    """From columns (n, 3), by product from the right, to components."""
+    return along_axes(axes, np.eye(3))
+
+
+def _then(first: Axes, second: Axes) -> Axes:
+    """Axes that put the columns right that were put along the first ones wrongly."""
+    rows = _matrix(first) @ _matrix(second)
+    x, y, z = (("-" if row.sum() < 0 else "") + COMPONENTS[int(np.argmax(np.abs(row)))]
+               for row in rows)
+    return x, y, z  # type: ignore[return-value]
+
+
+def _axis_errors(positions: Axes, fields: Axes) -> tuple[tuple[str, str], ...]:
+    """Columns exchanged, then of the wrong sign: in coordinates, in B, or alike in both."""
+    found = []
+    order, field_order = (tuple(axis[-1] for axis in axes) for axes in (positions, fields))
+    both = order == field_order
+    for what, one in (("x, y, z and Bx, By, Bz", order),) if both else (
+            ("x, y, z", order), ("Bx, By, Bz", field_order)):
+        if one != SAME:
+            found.append(("swapped_axes", f"columns {what} that are along {', '.join(one)}"))
+    for name in COMPONENTS:
+        signs = f"-{name}" in positions, f"-{name}" in fields
+        if any(signs):
+            what = {(True, False): name, (False, True): f"B{name}",
+                    (True, True): f"{name} and B{name}"}[signs]
+            reverse = name == "z" and signs[0]
+            found.append(("reversed_z" if reverse else "sign_flipped_axis",
+                          f"{what} with the wrong sign"))
+    return tuple(found)
+
+
+def _by_errors() -> dict[Axes, dict[int, list[Axes]]]:
+    """For axes of the coordinates, those of B by the number of errors of both."""
+    found: dict[Axes, dict[int, list[Axes]]] = {}
+    for positions, fields in product(ALL_AXES, repeat=2):
+        count = len(_axis_errors(positions, fields))
+        found.setdefault(positions, {}).setdefault(count, []).append(fields)
+    return found
+
+
+_AXES_BY_ERRORS = _by_errors()
+
+PLAUSIBLE = (
+    *LENGTHS.values(), *FLUX_DENSITIES.values(), "reversed_z", "sign_flipped_axis", "swapped_axes",
+    "rotated_by_one_block", "wrong_magnetization_direction", "wrong_ring_count",
+    "wrong_multipole_order", "wrong_radius", "wrong_line")
+"""Of errors that a map does not tell apart, the first is put right."""
+
+
+def _rank(reading: Reading) -> tuple[int, ...]:
+    """Order of readings that explain a map equally."""
+    turn = reading.magnet.turn_rad if reading.magnet and reading.magnet.turn_rad else 0.0
+    return (*(PLAUSIBLE.index(name) for name in reading.names), round(1e3 * abs(turn)))
