@@ -8,6 +8,7 @@ from importlib import metadata
 
 from halbach_fe.cli import (
     common,
+    diagnose,
     doctor,
     infer,
     plan,
@@ -19,8 +20,9 @@ from halbach_fe.cli import (
 )
 from halbach_fe.errors import EXIT_CODES
 
-VERBS = {"solve": solve, "infer": infer, "verify": verify, "plan": plan, "prior": prior,
-         "simulate-measurement": simulate_measurement, "doctor": doctor, "schema": schema}
+VERBS = {"solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify, "plan": plan,
+         "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
+         "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -11,6 +11,7 @@ import argparse
 
 import numpy as np
 
+from halbach_fe.campaign.effects import EFFECTS, Wanted, signature, wanted
 from halbach_fe.campaign.reaction import Elements
 from halbach_fe.campaign.simulate import COIL_SD, simulate, write_campaign
 from halbach_fe.cli import common
@@ -19,11 +20,20 @@ from halbach_fe.study import read_study
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    parser.epilog = "effects to hide:\n" + "\n".join(
+        f"  {name}" + (f"={signature(effect)}" if effect.parameters else "")
+        for name, effect in EFFECTS.items())
     common.add_study_and_output(parser)
     parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
                         help="of all random numbers (default: %(default)s)")
     parser.add_argument("--coil-sd", type=common.positive_number, default=COIL_SD, metavar="F",
                         help="noise of a block's measured moment, relative (default: %(default)g)")
+    parser.add_argument("--hide", type=_effect, action="append", default=[],
+                        metavar="NAME[=VALUE,...]",
+                        help="an effect that the truth has and the study does not, of a random "
+                        "size unless its values are given; again for several")
+    parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
+                        help="hide K effects of the field or the instrument, drawn at random")
     parser.add_argument("--element-size", type=common.positive_number, metavar="M",
                         help="largest element of NGSolve in m (default: a third of the blocks' "
                         "thickness, in 2D half of that)")
@@ -32,12 +42,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_json_argument(parser)
 
 
+def _effect(text: str) -> Wanted:
+    try:
+        return wanted(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write everything, print what was written."""
     study = read_study(arguments.study)
     elements = Elements(arguments.element_size, arguments.order)
     with common.progress_bar("magpylib") as show:
-        campaign = simulate(study, arguments.seed, arguments.coil_sd, elements, show)
+        campaign = simulate(study, arguments.seed, arguments.coil_sd, arguments.hide,
+                            arguments.hide_random, elements, show)
     written = write_campaign(campaign, arguments.output)
     summary = {
         "study": study.name, "points": campaign.readings.sizes["point"],

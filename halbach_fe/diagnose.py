@@ -26,6 +26,7 @@ from halbach_fe.diagnosis.selection import (
     FOUND,
     Candidate,
     Found,
+    best_factors,
     gains,
     log_evidence,
     probabilities,
@@ -137,6 +138,8 @@ class Diagnosis:
         What they leave unexplained, if anything.
     probabilities : dict
         Of each effect, and of none, if at most one is missing.
+    best_factors : dict
+        Largest log Bayes factor of each effect at any place, over nothing.
     groups_before, groups_after : list of Group
         Where readings disagree.
     left_out_before, left_out_after : ndarray, shape (n,)
@@ -149,6 +152,7 @@ class Diagnosis:
     named: tuple[Named, ...]
     unknown: Unknown | None
     probabilities: dict[str, float]
+    best_factors: dict[str, float]
     groups_before: list[Group]
     groups_after: list[Group]
     left_out_before: Floats
@@ -199,6 +203,7 @@ def diagnose(
     return Diagnosis(
         before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
+        best_factors=best_factors(first[1].evidence, first[1].candidates),
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),
@@ -228,7 +233,8 @@ def look(
         """All readings (..., readings) to training ones (rows, ...)."""
         return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
 
-    marginal = Marginal.of(noise.whiten(update.response.matrix[rows] @ update.prior.root))
+    response = noise.whiten(update.response.matrix[rows])
+    marginal = Marginal.of(response @ update.prior.root)
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
@@ -239,9 +245,14 @@ def look(
     candidates: list[Candidate] = []
     columns: list[Floats] = []
     width = 0
+    kept = marginal.remove(response)
+    information, score = response.T @ kept, kept.T @ training
     for effect in effects:
         scale = np.array([parameter.sd for parameter in effect.parameters])
-        for place in effect.places(study):
+        places = dict.fromkeys((
+            *effect.shortlist(study, update.prior.mean, information, score),
+            *(place for name, place in (*signatures, *there) if name == effect.name)))
+        for place in places:
             key = effect.name, place
             present = there.get(key)
             if present is not None and not effect.discrete:

@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -136,13 +136,16 @@ class Update:
         """Standard deviations (readings,) of `errors`, in T."""
         return self.errors.sd
 
-    @property
+    @cached_property
     def scores(self) -> tuple[RegionScore, ...]:
         """Scores by region, and by part."""
         noise = self.study.noise
         names = [region.name for region in noise.regions] if noise else []
+        predictions = {"prior": self.prediction_prior, "posterior": self.prediction_posterior}
+        known = {name: (one, self.relative_error(one), self.standardized(one))
+                 for name, one in predictions.items()}
         return tuple(
-            self._score(region, part, chosen)
+            self._score(region, part, chosen, known)
             for region in dict.fromkeys(names or [ALL_READINGS])
             for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)
             if (chosen := self.chosen(region, part)).any())
@@ -169,7 +172,7 @@ class Update:
         another component of the same point, with what the latter foretell taken off.
         """
         result = (self.readings - prediction.mean) / np.hypot(prediction.sd, self.sigma)
-        if not self.errors.independent and self.held_out.any():
+        if self.errors.covariance[self.held_out][:, ~self.held_out].nnz:
             residual, noise, root = self._unseen(prediction, self.held_out)
             result[self.held_out] = residual / np.hypot(noise.sd, np.linalg.norm(root, axis=1))
         return result
@@ -195,21 +198,22 @@ class Update:
             root = root - told @ prediction.root(seen)
         return residual[chosen] - told @ residual[seen], noise, root
 
-    def _score(self, region: str, part: str, chosen: NDArray[np.bool_]) -> RegionScore:
+    def _score(
+        self, region: str, part: str, chosen: NDArray[np.bool_],
+        known: Mapping[str, tuple[Prediction, Floats, Floats]],
+    ) -> RegionScore:
+        """Score of some readings, from each prediction's relative and standardized errors."""
         figures: dict[str, Any] = {}
-        for name, prediction in (("prior", self.prediction_prior),
-                                 ("posterior", self.prediction_posterior)):
-            errors = self.relative_error(prediction)[chosen]
-            errors = errors[~np.isnan(errors)]
-            figures[f"median_relative_error_{name}"] = (
-                float(np.median(errors)) if len(errors) else None)
+        for name, (prediction, relative, standardized) in known.items():
+            errors = relative[chosen & ~np.isnan(relative)]
+            residuals = np.abs(standardized[chosen])
             unseen = part != TRAINING
-            residuals = np.abs(self.standardized(prediction)[chosen])
-            figures[f"rms_standardized_{name}"] = float(np.sqrt(np.mean(residuals**2)))
-            figures[f"coverage95_{name}"] = float(
-                np.mean(residuals <= COVERAGE_Z)) if unseen else None
-            figures[f"chi2_{name}"] = float(
-                np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None
+            figures |= {
+                f"median_relative_error_{name}": float(np.median(errors)) if len(errors) else None,
+                f"rms_standardized_{name}": float(np.sqrt(np.mean(residuals**2))),
+                f"coverage95_{name}": float(np.mean(residuals <= COVERAGE_Z)) if unseen else None,
+                f"chi2_{name}": float(
+                    np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None}
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
 
 

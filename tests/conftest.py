@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from halbach_fe.getdp import GetDP, find_getdp
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study, parse_study
 
 ROOT = Path(__file__).parent.parent
+
+settings.register_profile("patient", deadline=None)  # on a busy machine time says nothing
+settings.load_profile("patient")
 
 # A dipole of FASER's cross-section; sizes coarse enough for tests.
 DIPOLE: dict[str, Any] = {

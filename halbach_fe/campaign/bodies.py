@@ -118,7 +118,7 @@ Shape = Sector | Prism
 @dataclass(frozen=True)
 class Part:
     """A part of a body, between fractions of its thickness and half width, whose magnetization is
-    ``factor`` times the body's. Parts of one body do not overlap.
+    ``factor`` times the body's. Where parts of one body overlap, their deviations add up.
     """
 
     u: tuple[float, float]
@@ -225,18 +225,36 @@ Law = float | Froehlich | Table
 
 @dataclass(frozen=True)
 class Tube:
-    """An iron tube about the z axis, from -half_length to half_length."""
+    """An iron tube about the z axis, ``half_length`` to both sides of ``middle``."""
 
     inner: float
     outer: float
     half_length: float
     law: Law
+    middle: float = 0.0
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m are inside or on the surface."""
         radius = np.hypot(points[:, 0], points[:, 1])
         return ((radius >= self.inner) & (radius <= self.outer)
-                & (np.abs(points[:, 2]) <= self.half_length))
+                & (np.abs(points[:, 2] - self.middle) <= self.half_length))
+
+
+@dataclass(frozen=True)
+class Copy:
+    """The same magnet once more, elsewhere on its axis, ``shift`` in m along z."""
+
+    shift: float
+
+
+@dataclass(frozen=True)
+class SoftSphere:
+    """A small sphere of soft iron of a volume in m^3: the field B where it is gives it the moment
+    3 V B / mu_0.
+    """
+
+    place: Vector
+    volume: float
 
 
 @dataclass(frozen=True)
@@ -249,13 +267,32 @@ class Magnet:
         Ring by ring, slot by slot.
     iron : Tube, optional
     background : tuple, in T
-        A uniform field.
+        A uniform field, which iron and magnets leave as it is.
+    copies, objects : tuple
+        What else is near.
     """
 
     dimension: int
     bodies: tuple[Body, ...]
     iron: Tube | None = None
     background: Vector = NOWHERE
+    copies: tuple[Copy, ...] = ()
+    objects: tuple[SoftSphere, ...] = ()
+
+    @property
+    def all_bodies(self) -> tuple[Body, ...]:
+        """Those of the copies too."""
+        return self.bodies + tuple(
+            replace(body, centre=vector(np.add(body.centre, (0, 0, copy.shift))))
+            for copy in self.copies for body in self.bodies)
+
+    @property
+    def all_iron(self) -> tuple[Tube, ...]:
+        """That of the copies too."""
+        if self.iron is None:
+            return ()
+        iron = self.iron
+        return (iron, *(replace(iron, middle=iron.middle + copy.shift) for copy in self.copies))
 
     @property
     def is_vacuum(self) -> bool:
@@ -273,9 +310,11 @@ class Magnet:
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m are inside of some material."""
         inside = np.zeros(len(points), bool)
-        for body in self.bodies:
+        for body in self.all_bodies:
             inside |= body.holds(points)
-        return inside if self.iron is None else inside | self.iron.holds(points)
+        for tube in self.all_iron:
+            inside |= tube.holds(points)
+        return inside
 
 
 def vector(values: Floats | tuple[float, ...]) -> Vector:

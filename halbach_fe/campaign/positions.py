@@ -20,10 +20,9 @@ def between(positions: Positions) -> Floats:
         z = np.unique(points[:, 2])
         between_z = (z[:-1] + z[1:]) / 2 if len(z) > 1 else z
         angle = 2 * np.pi * (np.arange(positions.angles) + 0.5) / positions.angles
-        directions = np.column_stack([np.cos(angle), np.sin(angle)])
-        return np.vstack([np.column_stack([
-            np.tile(radius * directions, (len(between_z), 1)), np.repeat(between_z, len(angle))])
-            for radius in positions.radius_m])
+        circle = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        return np.vstack([radius * circle + [0, 0, height]
+                          for radius in positions.radius_m for height in between_z])
     if positions.kind == "line" or len(points) < 2:
         return (points[:-1] + points[1:]) / 2
     distance = np.linalg.norm(points[:, None] - points, axis=2)

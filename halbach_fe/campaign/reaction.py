@@ -28,6 +28,7 @@ from halbach_fe.campaign.bodies import (
     Sector,
     Shape,
     Table,
+    Tube,
 )
 from halbach_fe.campaign.extras import needed
 from halbach_fe.errors import CheckFailedError
@@ -94,7 +95,7 @@ def _response(magnet: Magnet, mesh: Any, potential: Any) -> tuple[Floats, Floats
     kind = ngs.TRIG if size == 2 else ngs.TET
     rule = ngs.IntegrationRule(kind, 2 * (potential.space.globalorder - 1))
     responding = mesh.Materials("|".join(["iron", *(
-        f"block{number}" for number, body in enumerate(magnet.bodies)
+        f"block{number}" for number, body in enumerate(magnet.all_bodies)
         if not body.along == body.across == 1.0)]))
     where = mesh.MapToAllElements({kind: rule}, responding)
     places = np.array(ngs.CF((ngs.x, ngs.y, ngs.z)[:size])(where))
@@ -137,11 +138,11 @@ def mesh_of(magnet: Magnet, points: Floats, elements: Elements) -> Any:
     flat = magnet.dimension == 2
     size = elements.size or _thickness(magnet.bodies[0].shape) / (6 if flat else 3)
     parts = []
-    for number, body in enumerate(magnet.bodies):
+    for number, body in enumerate(magnet.all_bodies):
         parts.append(_solid(body, flat))
         _name(parts[-1], f"block{number}", flat)
-    if magnet.iron is not None:
-        parts.append(_tube(magnet, flat))
+    for iron in magnet.all_iron:
+        parts.append(_tube(iron, flat))
         _name(parts[-1], "iron", flat)
     for part in parts:
         (part.faces if flat else part).maxh = size
@@ -210,12 +211,11 @@ def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
         occ.ArcOfCircle(corner(inner, half), corner(inner, 0), corner(inner, -half))]))
 
 
-def _tube(magnet: Magnet, flat: bool) -> Any:
-    occ, iron = needed("netgen.occ"), magnet.iron
-    assert iron is not None
+def _tube(iron: Tube, flat: bool) -> Any:
+    occ = needed("netgen.occ")
     if flat:
         return occ.Circle((0, 0), iron.outer).Face() - occ.Circle((0, 0), iron.inner).Face()
-    axis = occ.Axes((0, 0, -iron.half_length), occ.Z)
+    axis = occ.Axes((0, 0, iron.middle - iron.half_length), occ.Z)
     return (occ.Cylinder(axis, iron.outer, 2 * iron.half_length)
             - occ.Cylinder(axis, iron.inner, 2 * iron.half_length))
 
@@ -268,7 +268,7 @@ def _recoil(magnet: Magnet, mesh: Any) -> Any:
     """Relative permeability (d, d) of the bodies, and of vacuum elsewhere, iron included."""
     size = magnet.dimension
     tensors = {f"block{number}": tuple(_region(body)[1][:size, :size].ravel())
-               for number, body in enumerate(magnet.bodies)}
+               for number, body in enumerate(magnet.all_bodies)}
     return needed("ngsolve").CF(mesh.MaterialCF(tensors, default=tuple(np.eye(size).ravel())),
                                 dims=(size, size))
 
@@ -280,7 +280,7 @@ def solve_potential(magnet: Magnet, mesh: Any, order: int) -> Any:
     u, v = space.TnT()
     size = magnet.dimension
     source = mesh.MaterialCF({f"block{number}": tuple(_region(body)[0][:size])
-                              for number, body in enumerate(magnet.bodies)},
+                              for number, body in enumerate(magnet.all_bodies)},
                              default=(0.0,) * size)
     form = ngs.BilinearForm(space, condense=True)
     form += _recoil(magnet, mesh) * ngs.grad(u) * ngs.grad(v) * ngs.dx("block.*|air")

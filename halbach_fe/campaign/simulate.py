@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +18,12 @@ import xarray as xr
 from halbach_fe.block_table import BlockTable, write_blocks
 from halbach_fe.campaign.blocks import coil_table, draw, magnetizations
 from halbach_fe.campaign.bodies import Floats, Magnet, magnet_of
+from halbach_fe.campaign.effects import Wanted, chosen, instrument_with, with_effects
+from halbach_fe.campaign.effects.kinds import site_of
 from halbach_fe.campaign.extras import version_of
+from halbach_fe.campaign.instrument import Instrument
 from halbach_fe.campaign.positions import between
-from halbach_fe.campaign.reaction import Elements, reaction_field
+from halbach_fe.campaign.reaction import Elements, dipole_field, reaction_field
 from halbach_fe.campaign.vacuum import Progress, silent, vacuum_field
 from halbach_fe.errors import StudyError, must_be
 from halbach_fe.field_map import atomic, field_map, write_map
@@ -34,10 +37,11 @@ DIGITS = 12
 """Fields are kept to 1e-12 T: the same seed gives the same files, whatever the order in which two
 processors sum."""
 
+SECONDS = 1.0
+"""Between two readings; held-out points are measured after the map."""
+
 LARGEST_CSV = 5e6 / 20
 """Numbers in a map, of some 20 characters each, beyond which it is HDF5."""
-
-Field = Callable[[Magnet, Floats], Floats]
 
 
 @dataclass(frozen=True)
@@ -60,52 +64,96 @@ class Campaign:
 
 
 def simulate(
-    study: Study, seed: int, coil_sd: float = COIL_SD, elements: Elements | None = None,
-    progress: Progress = silent,
+    study: Study, seed: int, coil_sd: float = COIL_SD, hide: Sequence[Wanted] = (),
+    hide_random: int = 0, elements: Elements | None = None, progress: Progress = silent,
 ) -> Campaign:
     """Build, measure and describe one magnet.
+
+    Parameters
+    ----------
+    hide : sequence of pairs
+        Effects, and their values unless those are to be drawn; they are applied in this order.
+    hide_random : int
+        How many more effects are drawn.
 
     Raises
     ------
     StudyError
-        If the study does not say how noisy its readings are, or measures inside of material.
+        If the study does not say how noisy its readings are, measures inside of material, or cannot
+        have an effect.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
     """
     points, others = points_from(study.observation.positions), between(study.observation.positions)
-    sigma, other_sigma = point_noise(study, points), point_noise(study, others)
-    blocks, coil, noise, other_noise = (np.random.default_rng(part) for part in
-                                        np.random.SeedSequence(seed).spawn(4))
+    sigma = point_noise(study, np.vstack([points, others]))
+    blocks, coil, noise, effects, faults = (  # what one draws does not change the others
+        np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5))
     nominal = magnet_of(study)
+    site = site_of(study, nominal)
+    hidden = chosen(site, hide, hide_random, effects)
     drawn = draw(study, nominal, blocks)
-    table, calibration = coil_table(study, nominal, drawn.single, coil_sd, coil)
-    magnet = drawn.mounted
-    check_air(study, magnet, np.vstack([points, others]))
-    places = [real_places(study, one, generator)
-              for one, generator in ((points, noise), (others, other_noise))]
-    field = field_of(magnet, np.vstack(places), elements, progress).round(DIGITS)
+    table, calibration = coil_table(study, nominal, with_effects(
+        drawn.single, site, hidden, single=True), coil_sd, coil)
+    magnet, instrument = with_effects(drawn.mounted, site, hidden), instrument_with(site, hidden)
+    nominal_places = np.vstack([points, others])
+    offsets = real_places(study, nominal_places, noise) - nominal_places
+    recorded, readings = measured(
+        magnet, instrument, points, others, elements, faults, progress, offsets)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
+        "effects": [one.plain() for one in hidden],
         "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
-        "effects": [], "blocks": magnetizations(magnet),
-        "noise_free": {"largest_T": float(np.linalg.norm(field, axis=1).max()),
-                       "rms_T": np.sqrt(np.mean(field**2, axis=0)).round(DIGITS).tolist()},
+        "noise_free": {"largest_T": float(np.linalg.norm(readings, axis=1).max()),
+                       "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
+        "blocks": magnetizations(drawn.mounted),
     }
+    if magnet.bodies != drawn.mounted.bodies:
+        truth["blocks_with_effects"] = magnetizations(magnet)
     seal = {"source": "synthetic", "study": study.name, "halbach_fe": version_of("halbach-fe"),
             "truth_sha256": hashlib.sha256(truth_text(truth).encode()).hexdigest()}
-    at, other = field[:len(points)], field[len(points):]
-    return Campaign(
-        _measured(study, points, at, sigma, noise, seal),
-        _measured(study, others, other, other_sigma, other_noise, seal) if len(others) else None,
-        table, truth)
+    unit = instrument.field_unit
+    readings += unit * np.nan_to_num(sigma) * noise.standard_normal(readings.shape)
+    maps = [_map(study, recorded[part], readings[part], unit * sigma[part], seal)
+            .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
+            for part in (slice(len(points)), slice(len(points), None))]
+    return Campaign(maps[0], maps[1] if len(others) else None, table, truth)
+
+
+def measured(
+    magnet: Magnet, instrument: Instrument, points: Floats, others: Floats,
+    elements: Elements | None, generator: np.random.Generator, progress: Progress,
+    offsets: Floats | None = None,
+) -> tuple[Floats, Floats]:
+    """What is written down: points and readings without noise, both (n, 3), of the map and the
+    held-out points, one after the other; the probe was ``offsets`` (n, 3) in m from there.
+    """
+    nominal = np.vstack([points, others])
+    places = instrument.places(nominal, generator)
+    if offsets is not None:
+        places = places + offsets  # of all sensors
+    # mostly the three sensors are in one place
+    distinct, inverse = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
+    check_air(magnet, distinct)
+    fields = field_of(magnet, distinct, elements, progress)[inverse].reshape(places.shape)
+    time = np.arange(len(nominal)) / max(1, len(points) - 1)
+    recorded, readings = instrument.record(
+        nominal, instrument.readings(fields, time, generator))
+    return recorded, readings.round(DIGITS)
 
 
 def field_of(
     magnet: Magnet, points: Floats, elements: Elements | None = None, progress: Progress = silent
 ) -> Floats:
     """B (n, 3) in T of a magnet at points (n, 3) in m in air."""
-    return (vacuum_field(magnet.bodies, points, progress)
-            + reaction_field(magnet, points, elements) + magnet.background)
+    spheres = np.array([one.place for one in magnet.objects]).reshape(-1, 3)
+    everywhere = np.vstack([points, spheres])
+    field = (vacuum_field(magnet.all_bodies, everywhere, progress)
+             + reaction_field(magnet, everywhere, elements) + magnet.background)
+    result = field[:len(points)]
+    for sphere, own in zip(magnet.objects, field[len(points):], strict=True):
+        result = result + dipole_field(np.array([sphere.place]), 3 * sphere.volume * own[None],
+                                       points)
+    return result
 
 
 def model_of(magnet: Magnet) -> dict[str, str]:
@@ -117,29 +165,31 @@ def model_of(magnet: Magnet) -> dict[str, str]:
 
 
 def point_noise(study: Study, points: Floats) -> Floats:
-    """Standard deviation (n, 3) in T of the components at points (n, 3) in m.
+    """Standard deviations (n, 3) in T of the components at points (n, 3) in m; NaN of those that
+    the study does not observe.
 
     Fourier coefficients of n points have 2/n of the points' variance, and the study's sigma is
     theirs.
     """
     if study.noise is None or not study.noise.regions:
-        raise StudyError(must_be("`noise.regions`", f"study {study.name}",
+        raise StudyError(must_be("`noise`", f"study {study.name}",
                                  "given for a simulated measurement", "nothing",
                                  "Add [[noise.regions]]."))
     sigma = np.array([region.sigma_T for region in study.noise.regions])
-    fourier = study.observation.quantity == "fourier_coefficients"
-    names = ["" if fourier or name not in observed(study) else name for name in COMPONENTS]
-    chosen = sigma[noise_regions(study.noise, np.repeat(points[:, 2], 3), names * len(points))]
+    result = np.full((len(points), 3), np.nan)
+    for number, name in enumerate(COMPONENTS):
+        if name in observed_components(study):
+            result[:, number] = sigma[noise_regions(study.noise, points[:, 2],
+                                                    (name,) * len(points))]
     if study.observation.quantity == "fourier_coefficients":
-        chosen = chosen * np.sqrt(study.observation.positions.angles / 2)
-    return chosen.reshape(-1, 3)
+        result *= np.sqrt(study.observation.positions.angles / 2)
+    return result
 
 
-def observed(study: Study) -> tuple[str, ...]:
-    """Components that the study's map holds."""
-    if study.observation.quantity == "fourier_coefficients":
-        return "x", "y"
-    return study.observation.components
+def observed_components(study: Study) -> tuple[str, ...]:
+    """Which components of B a study's readings are made of."""
+    observed = study.observation
+    return ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components
 
 
 def real_places(study: Study, points: Floats, generator: np.random.Generator) -> Floats:
@@ -150,26 +200,25 @@ def real_places(study: Study, points: Floats, generator: np.random.Generator) ->
     return np.asarray(points + sd * generator.standard_normal(points.shape))
 
 
-def check_air(study: Study, magnet: Magnet, points: Floats) -> None:
+def check_air(magnet: Magnet, points: Floats) -> None:
     """Refuse points inside of material."""
     inside = magnet.holds(points)
     if inside.any():
         x, y, z = points[int(np.argmax(inside))]
         raise StudyError(must_be(
-            "`observation.positions`", f"study {study.name}", "in air, as those half a step between"
-            " them", f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron"))
+            "`observation.positions`", "the study", "in air, as those half a step between them and "
+            "where hidden effects take the probe", f"({x:g}, {y:g}, {z:g}) m, inside magnet or "
+            "iron"))
 
 
-def _measured(
-    study: Study, points: Floats, field: Floats, sigma: Floats, generator: np.random.Generator,
-    seal: dict[str, str],
+def _map(
+    study: Study, points: Floats, readings: Floats, sigma: Floats, seal: dict[str, str]
 ) -> xr.Dataset:
-    """A map with noise, of the components that the study observes."""
-    noise = sigma * generator.standard_normal(field.shape)
-    readings = np.where([name in observed(study) for name in COMPONENTS], field + noise, np.nan)
+    """A map of the components that the study observes."""
     # the study tells the noise of flux densities itself
     known = None if study.observation.quantity == "flux_density" else sigma
-    return field_map(points, readings.round(DIGITS), known, seal)
+    shown = np.where([name in observed_components(study) for name in COMPONENTS], readings, np.nan)
+    return field_map(points, shown.round(DIGITS), known, seal)
 
 
 def truth_text(truth: dict[str, object]) -> str:

@@ -82,7 +82,7 @@ class Evidence:
         precision = self.information[np.ix_(index, index)] + np.eye(len(index))
         cross = linalg.cho_solve(linalg.cho_factor(precision), self.information[index])
         weights = cross.T @ self.score[index]
-        fit = self.fit(index)
+        fit = self.fit(chosen)
         return Evidence(
             self.information - self.information[index].T @ cross, self.score - weights,
             self.chi2 - float(self.score[index] @ fit.mean), self.readings)

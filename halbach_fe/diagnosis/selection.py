@@ -178,3 +178,11 @@ def probabilities(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[s
     for candidate, weight in zip(candidates, weights, strict=True):
         found[candidate.effect] = found.get(candidate.effect, 0.0) + float(weight) / total
     return found
+
+
+def best_factors(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[str, float]:
+    """Largest log Bayes factor of each effect at any place, over nothing."""
+    found: dict[str, float] = {}
+    for candidate, factor in zip(candidates, gains(evidence, candidates), strict=True):
+        found[candidate.effect] = max(found.get(candidate.effect, -np.inf), float(factor))
+    return found

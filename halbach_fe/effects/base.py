@@ -25,11 +25,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Place:
-    """Where an effect may be: a ring, a slot of it (0 is all), or coordinates or lengths in m."""
+    """Where an effect may be: a ring, a slot of it (0 is all), coordinates or lengths in m;
+    ``other`` is the ring and slot of a second block.
+    """
 
     ring: int = 0
     slot: int = 0
     at_m: tuple[float, ...] = ()
+    other: tuple[int, int] = (0, 0)
 
     @property
     def name(self) -> str:
@@ -38,6 +41,8 @@ class Place:
                       for letter, number in (("r", self.ring), ("s", self.slot)))
         if self.at_m:
             return f"at {', '.join(f'{one:.4g}' for one in self.at_m)} m"
+        if self.other[0]:
+            return f"{ring}{slot}, r{self.other[0]:02d}s{self.other[1]:02d}"
         return ring + slot
 
 
@@ -69,6 +74,20 @@ class Effect(ABC):
     def places(self, study: Study) -> Sequence[Place]:
         """Where in a study it may be; none if the study rules it out."""
         return [Place()]
+
+    def shortlist(
+        self, study: Study, mean: Floats, information: Floats, score: Floats
+    ) -> Sequence[Place]:
+        """The places worth a look, where there are too many for a signature of each.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (m,), in A/m
+            Of the prior of the magnetizations.
+        information, score : ndarray, shape (m, m) and (m,)
+            H' S^-1 H and H' S^-1 r, see `halbach_fe.diagnosis.evidence`.
+        """
+        return self.places(study)
 
     @abstractmethod
     def signature(self, scene: Scene, place: Place) -> Floats:

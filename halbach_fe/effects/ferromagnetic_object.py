@@ -47,7 +47,7 @@ class FerromagneticObject(Effect):
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         x, y, z = map(float, values)
-        dipole = PointDipole(position_m=place.at_m, moment_A_m2=(x, y, z))  # type: ignore[arg-type]
+        dipole = PointDipole(position_m=place.at_m, moment_A_m2=(x, y, z))
         return study.model_copy(update={"external": study.external.model_copy(update={
             "dipoles": (*study.external.dipoles, dipole)})})
 

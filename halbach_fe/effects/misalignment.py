@@ -25,7 +25,7 @@ class Misalignment(InstrumentEffect):
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
-        seen = scene.field[:, COMPONENTS.index(self.seen)]  # type: ignore[arg-type]
+        seen = scene.field[:, COMPONENTS.index(self.seen)]
         return np.asarray(seen[:, None] * along(self.seer, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:

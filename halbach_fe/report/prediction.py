@@ -22,6 +22,9 @@ MARKERS: dict[str, dict[str, Any]] = {
 FAR = 12.0
 """Standard deviations beyond which an axis of residuals becomes logarithmic."""
 
+CROWD = 3000
+"""Readings beyond which markers would hide each other."""
+
 DRAWN_QUANTILES = 2000
 
 
@@ -153,13 +156,15 @@ def residuals(update: Update) -> Figure:
     for axis, (name, prediction, colour) in zip(axes, _predictions(update), strict=True):
         scores = update.standardized(prediction)
         for part, mask in _parts(update, np.arange(len(scores))):
-            axis.plot(place[mask], scores[mask], ls="none", label=part, **MARKERS[part],
+            style = {"marker": ".", "ms": 1.5} if len(scores) > CROWD else MARKERS[part]
+            axis.plot(place[mask], scores[mask], ls="none", label=part, **style,
                       color=MEASURED if part == TRAINING else colour,
-                      zorder=2 if part == TRAINING else 3, alpha=0.5 if part == TRAINING else 1)
+                      alpha=0.5 if part == TRAINING or len(scores) > CROWD else 1)
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.2, lw=0)
         axis.set_ylabel(f"residual / sd\n{name}")
         _scale(axis, scores)
-    axes[0].legend(ncols=3, fontsize="small", loc="upper right")
+    axes[0].legend(ncols=3, fontsize="small", loc="upper right",
+                   markerscale=5 if len(update.readings) > CROWD else 1)
     axes[1].set_xlabel(label)
     return figure
 

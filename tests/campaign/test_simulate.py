@@ -15,14 +15,15 @@ from halbach_fe.campaign.blocks import coil_table, draw
 from halbach_fe.campaign.bodies import magnet_of
 from halbach_fe.campaign.lone import moment_matrix
 from halbach_fe.campaign.positions import between
-from halbach_fe.campaign.simulate import simulate, write_campaign
+from halbach_fe.campaign.simulate import real_places, simulate, write_campaign
 from halbach_fe.cli import main
 from halbach_fe.errors import EXIT_CODES, StudyError
-from halbach_fe.exact_field import demagnetizing_tensors
+from halbach_fe.exact_field import demagnetizing_tensors, gradient_of
 from halbach_fe.field_map import points_of, read_map
 from halbach_fe.measured_prior import prior_from_blocks
-from halbach_fe.observation import fourier_of, observe, points_from, standard_deviations
-from halbach_fe.study import MU_0, read_study
+from halbach_fe.observation import fourier_analysis, observe, points_from, reading_noise
+from halbach_fe.study import MU_0, parse_study, read_study
+from tests.conftest import DIPOLE, changed
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -263,6 +264,17 @@ def test_noise_and_components(short_dipole):
                                   points_from(study.observation.positions))
 
 
+def test_noise_by_component(short_dipole):
+    """Of the first region that fits; 80 values, 4 sigma."""
+    regions = [{"name": "z", "components": ["z"], "sigma_T": 1e-3}, *NOISE["regions"]]
+    campaign, quiet = (simulate(short_dipole(**RINGS | {"noise": {"regions": some}}), 1)
+                       for some in (regions, [regions[1] | {"sigma_T": 1e-9}]))
+    noise = (campaign.readings["B_T"] - quiet.readings["B_T"]).values
+    assert noise.std(axis=0) == pytest.approx([1e-4, 1e-4, 1e-3], rel=0.32)
+    with pytest.raises(StudyError, match="given for a simulated measurement"):
+        simulate(short_dipole(**RINGS | {"noise": {"position_sd_m": 1e-4}}), 1)
+
+
 def test_noise_of_fourier_coefficients(dipole):
     """The map's sigma gives every coefficient the region's; the readings have it."""
     study = dipole(array__recoil_permeability=1.0, noise=NOISE, observation={
@@ -270,14 +282,14 @@ def test_noise_of_fourier_coefficients(dipole):
         "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}})
     data = simulate(study, 1).readings
     observation = observe(study, points_of(data), ~np.isnan(data["B_T"].values))
-    np.testing.assert_allclose(standard_deviations(study, observation, data), 1e-4)
+    np.testing.assert_allclose(reading_noise(study, observation, data).sd, 1e-4)
     quiet = simulate(study.model_copy(update={"noise": study.noise.model_copy(update={
         "regions": (study.noise.regions[0].model_copy(update={"sigma_T": 1e-9}),)})}), 1).readings
     noise = (data["B_T"] - quiet["B_T"]).values
     assert np.isnan(noise[:, 2]).all()
     assert np.std(noise[:, :2]) == pytest.approx(1e-4 * np.sqrt(12), rel=0.41)  # 48, 4 sigma
-    operator = fourier_of(points_of(data), study.observation)
-    assert operator.apply(np.nan_to_num(noise)).std() == pytest.approx(1e-4, rel=0.9)  # 10
+    matrix, *_ = fourier_analysis(points_of(data), study.observation)
+    assert (matrix @ np.nan_to_num(noise).ravel()).std() == pytest.approx(1e-4, rel=0.9)  # 10
 
 
 def test_held_out_points_are_between(short_dipole):
@@ -287,6 +299,11 @@ def test_held_out_points_are_between(short_dipole):
     distance = np.linalg.norm(points[:, None] - others, axis=2)
     nearest = np.hypot(2 * 0.075 * np.sin(np.pi / 32), 0.025)
     assert distance.min() == pytest.approx(nearest)
+    two = short_dipole(observation__positions=RINGS["observation__positions"] | {
+        "radius_m": [0.05, 0.075]})
+    both = between(two.observation.positions)
+    np.testing.assert_array_equal(both[len(others):], others)
+    assert np.hypot(*both[:len(others), :2].T) == pytest.approx(0.05)
     one = short_dipole(observation__positions={"kind": "points", "points_m": [[0, 0, 0]]})
     assert not len(between(one.observation.positions))
     line = short_dipole(observation__positions={
@@ -332,3 +349,18 @@ def test_a_study_can_be_read_and_simulated(campaigns):
     truth = json.loads((folder / "truth" / "truth.json").read_text())
     assert truth["study"] == read_study(study).name
     assert 0.5 < truth["noise_free"]["largest_T"] < 0.65
+
+
+def test_uncertain_positions_move_the_probe():
+    """Two campaigns of one seed differ by the gradient times the displacements of one."""
+    study = parse_study(changed(DIPOLE, noise={"regions": [{"name": "all", "sigma_T": 1e-9}]}))
+    loose = study.model_copy(update={"noise": study.noise.model_copy(
+        update={"position_sd_m": (1e-4, 1e-4, 1e-4)})})
+    points = points_from(study.observation.positions)
+    moved = real_places(loose, points, np.random.default_rng(1)) - points
+    assert np.std(moved) == pytest.approx(1e-4, rel=0.3)  # 72 draws
+    assert real_places(study, points, np.random.default_rng(1)) is points
+    one, other = (simulate(each, 2).readings["B_T"].values for each in (study, loose))
+    gradient = gradient_of(blocks_of(study), points)
+    spread = np.sqrt(np.mean((gradient[:, :2] ** 2).sum(axis=2))) * 1e-4
+    assert np.sqrt(np.nanmean((one - other)[:, :2] ** 2)) == pytest.approx(spread, rel=0.3)

@@ -6,10 +6,14 @@ import itertools
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from halbach_fe.errors import StudyError
 from halbach_fe.inference.design import greedy, information
+from halbach_fe.inference.prior import block_prior
+from halbach_fe.observation import observe, points_from, reading_noise
 from halbach_fe.planning import plan, spread
+from halbach_fe.response import response
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 
@@ -65,6 +69,32 @@ def test_plan_in_a_cross_section(dipole, workshop):
     assert (wider.planned_sd < wider.baseline_sd).all()
     # the sd's are those of a posterior: not above the prior's, and the plan's gain is its volume
     assert (wider.planned_sd <= wider.prior_sd).all()
+
+
+def test_plan_with_correlated_noise(dipole, workshop):
+    """All points together tell what the dense covariance says; its diagonal says something else.
+
+    (In a plane, where curl and divergence vanish, equal errors along x and y do not correlate.)
+    """
+    study = dipole(array__recoil_permeability=1.0, observation__components=["x", "y"],
+                   noise=NOISE | {"position_sd_m": [3e-3, 0.0, 0.0]})
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool))
+    covariance = reading_noise(study, observation, xr.Dataset()).covariance.toarray()
+    model = response(study, observation, workshop)
+    prior = block_prior(model.nominal, 2, study.prior.magnitude_sd, study.prior.direction_sd_deg)
+    spread = model.matrix @ prior.covariance @ model.matrix.T
+
+    def told(noise):
+        return np.linalg.slogdet(np.eye(len(noise)) + np.linalg.solve(noise, spread))[1] / 2
+
+    found = plan(study, workshop, count=24)
+    assert found.gain[-1] == pytest.approx(told(covariance), rel=1e-9)
+    assert found.baseline_gain[-1] == pytest.approx(told(covariance), rel=1e-9)
+    assert told(np.diag(np.diag(covariance))) != pytest.approx(told(covariance), rel=1e-2)
+    after = np.linalg.inv(np.linalg.inv(prior.covariance)
+                          + model.matrix.T @ np.linalg.solve(covariance, model.matrix))
+    np.testing.assert_allclose(found.planned_sd, np.sqrt(np.diag(after)), rtol=1e-6)
 
 
 def test_even_spread():

@@ -1,0 +1,76 @@
+"""Find which effects a study lacks to explain a measured field map, and add them.
+
+Writes diagnosis.html and its figures, diagnosis.json, and study.diagnosed.toml: the study's own
+file with what was missing, which `solve` and `infer` run as it stands.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+from pathlib import Path
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.cli import common
+from halbach_fe.effects import catalogue
+from halbach_fe.effects.base import Effect
+from halbach_fe.field_map import read_map
+from halbach_fe.study import read_study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
+                        help="measured field map (CSV or HDF5)")
+    parser.add_argument("--held-out", type=Path, metavar="MAP",
+                        help="another map, which is only predicted, at positions of its own")
+    parser.add_argument("--blocks", type=Path, metavar="CSV",
+                        help="moments of the single blocks, in place of the study's prior")
+    parser.add_argument("--effects", type=effects_of, metavar="NAME,NAME...",
+                        help="effects to choose from (default: the whole catalogue)")
+
+
+def effects_of(text: str) -> list[Effect]:
+    """Parse names of effects."""
+    known = {effect.name: effect for effect in catalogue()}
+    for name in text.split(","):
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1, 0.5)
+            raise argparse.ArgumentTypeError(
+                f"no effect is called '{name}'"
+                + (f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"))
+    return [known[name] for name in dict.fromkeys(text.split(","))]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose, write everything, print what was found."""
+    from halbach_fe.diagnose import diagnose
+    from halbach_fe.diagnosed import summary, write_study, write_summary
+    from halbach_fe.next_measurement import separations
+    from halbach_fe.report.diagnosis import (  # matplotlib loads only when needed
+        change_table,
+        found_table,
+        verdict,
+        write_report,
+    )
+
+    study, data = read_study(arguments.study), read_map(arguments.measurements)
+    text = arguments.study.read_text(encoding="utf-8")
+    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    unseen = read_map(arguments.held_out) if arguments.held_out else None
+    with common.workshop(arguments) as workshop:
+        found = diagnose(study, data, workshop, blocks, arguments.effects, unseen, common.say)
+        next_ones = separations(found, data, workshop, arguments.effects)
+    write_summary(found, next_ones, arguments.output)
+    write_report(found, next_ones, arguments.output)
+    write_study(text, study, found, arguments.output)
+    if arguments.json:
+        common.print_json(summary(found, next_ones))
+        return 0
+    common.say(" ".join(verdict(found)))
+    if found.named:
+        common.print_table(found_table(found), "What the study lacks")
+    common.print_table(change_table(found), "The model before and after")
+    common.say(f"Report: {arguments.output / 'diagnosis.html'}")
+    return 0

@@ -1,0 +1,112 @@
+"""Gross errors: of what was measured where, and of how it was written down."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.campaign.bodies import Body, Magnet, vector
+from halbach_fe.campaign.effects.kinds import Effect, Parameter, Site, signed
+from halbach_fe.campaign.instrument import Instrument
+
+NOTHING: tuple[float, ...] = ()
+
+
+def wrong_radius(instrument: Instrument, site: Site, more: float) -> Instrument:
+    """The probe goes round on another radius; a line on the axis is one beside it."""
+    return replace(instrument, radius_error=instrument.radius_error + more)
+
+
+def swapped_axes(instrument: Instrument, site: Site, first: float, second: float) -> Instrument:
+    """Two components are exchanged, counted from 1."""
+    order = list(instrument.order)
+    i, j = int(first) - 1, int(second) - 1
+    order[i], order[j] = order[j], order[i]
+    return replace(instrument, order=(order[0], order[1], order[2]))
+
+
+def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    first, second = sorted(generator.choice(3 if site.dimension == 3 else 2, 2, replace=False))
+    return float(first + 1), float(second + 1)
+
+
+def sign_flipped_axis(instrument: Instrument, site: Site, axis: float) -> Instrument:
+    """A component, counted from 1, has the wrong sign."""
+    signs = np.array(instrument.signs)
+    signs[int(axis) - 1] *= -1
+    return replace(instrument, signs=vector(signs))
+
+
+def _draw_axis(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    return (float(1 + "xyz".index(generator.choice(site.components))),)
+
+
+def millimetres(instrument: Instrument, site: Site) -> Instrument:
+    """Positions are written down in mm."""
+    return replace(instrument, length_unit=1000.0)
+
+
+def millitesla(instrument: Instrument, site: Site) -> Instrument:
+    """Fields are written down in mT."""
+    return replace(instrument, field_unit=1000.0)
+
+
+def reversed_z(instrument: Instrument, site: Site) -> Instrument:
+    """The magnet was measured from its other end, with the axes of the probe as they should be."""
+    return replace(instrument, reversed_z=not instrument.reversed_z)
+
+
+def rotated_by_one_block(magnet: Magnet, site: Site, blocks: float) -> Magnet:
+    """The magnet is turned about its axis by one pitch, or several."""
+    angle = blocks * 2 * np.pi / site.slots
+    turn = Rotation.from_euler("z", angle)
+
+    def turned(body: Body) -> Body:
+        """Its nominal place too: the mesh of what responds goes along."""
+        return replace(body, angle=body.angle + angle, centre=vector(turn.apply(body.centre)),
+                       displacement=vector(turn.apply(body.displacement)),
+                       rotation=vector(turn.apply(body.rotation)))
+
+    return replace(magnet, bodies=tuple(turned(body) for body in magnet.bodies))
+
+
+def wrong_ring_count(magnet: Magnet, site: Site, more: float) -> Magnet:
+    """The magnet has rings more, like its last, or fewer, and stands with its middle at z = 0."""
+    last = [body for body in magnet.bodies if body.ring == site.rings]
+    first = next(body for body in magnet.bodies if body.ring == 1)
+    length = first.shape.length
+    pitch = (last[0].centre[2] - first.centre[2]) / (site.rings - 1) if site.rings > 1 else length
+    bodies = [body for body in magnet.bodies if body.ring <= site.rings + more]
+    for number in range(1, int(more) + 1):
+        bodies += [replace(body, ring=site.rings + number,
+                           centre=vector(np.add(body.centre, (0, 0, number * pitch))))
+                   for body in last]
+    iron = magnet.iron and replace(magnet.iron,
+                                   half_length=magnet.iron.half_length + more * pitch / 2)
+    return replace(magnet, iron=iron, bodies=tuple(
+        replace(body, centre=vector(np.add(body.centre, (0, 0, -more * pitch / 2))))
+        for body in bodies))
+
+
+EFFECTS = (
+    Effect("wrong_radius", "gross", (Parameter("change", "m"),),
+           lambda site, generator: (signed(generator, 0.05, 0.2) * (
+               site.radius if site.radius > 0 else site.inner),), instrument=wrong_radius),
+    Effect("swapped_axes", "gross", (Parameter("first"), Parameter("second")), _draw_swap,
+           instrument=swapped_axes),
+    Effect("sign_flipped_axis", "gross", (Parameter("axis"),), _draw_axis,
+           instrument=sign_flipped_axis),
+    Effect("millimetres", "gross", (), lambda site, generator: NOTHING, instrument=millimetres),
+    Effect("millitesla", "gross", (), lambda site, generator: NOTHING, instrument=millitesla),
+    Effect("reversed_z", "gross", (), lambda site, generator: NOTHING, instrument=reversed_z,
+           needs=("3d",)),
+    Effect("rotated_by_one_block", "gross", (Parameter("blocks"),),
+           lambda site, generator: (float(generator.choice([-1.0, 1.0])),),
+           rotated_by_one_block),
+    Effect("wrong_ring_count", "gross", (Parameter("more"),),
+           lambda site, generator: (float(generator.choice([-1.0, 1.0]))
+                                    if site.rings > 1 else 1.0,), wrong_ring_count,
+           needs=("3d",)),
+)

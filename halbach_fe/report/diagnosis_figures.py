@@ -1,0 +1,323 @@
+"""Figures of a diagnosis, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from halbach_fe.blocks import Floats, Ints
+from halbach_fe.diagnose import Diagnosis
+from halbach_fe.diagnosed import rivals
+from halbach_fe.diagnosis.residuals import Group
+from halbach_fe.diagnosis.selection import FOUND
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
+from halbach_fe.report.prediction import places
+from halbach_fe.update import COVERAGE_Z, Update
+
+MOST_BARS = 8
+RESIDUAL_LIMIT = 5.0
+"""Standard deviations at the end of the colour scale."""
+
+GROUP_TITLES = {"z": "along z", "angle": "by angle", "radius": "by radius", "label": "by reading"}
+
+
+@dataclass(frozen=True)
+class State:
+    """A model in a report: the study as it was, or with what was missing."""
+
+    when: str
+    update: Update
+    groups: Sequence[Group]
+    left_out: Floats
+    colour: str
+    marker: str
+
+
+def states(diagnosis: Diagnosis) -> list[State]:
+    """Before and after; one state if nothing was added."""
+    before = State("before", diagnosis.before, diagnosis.groups_before, diagnosis.left_out_before,
+                   PRIOR, "o")
+    after = State("after", diagnosis.after, diagnosis.groups_after, diagnosis.left_out_after,
+                  POSTERIOR, "s")
+    if diagnosis.study == diagnosis.before.study:
+        return [replace(after, when="the study as it is")]
+    return [before, after]
+
+
+def groups(diagnosis: Diagnosis) -> Figure:
+    """Chi-squared of groups of readings; the kind with most of them on the left."""
+    kinds = [one.kind for one in diagnosis.groups_before]
+    sizes = {kind: kinds.count(kind) for kind in kinds}
+    if not sizes:
+        return _empty("too few readings to group them")
+    first, *others = sorted(sizes, key=lambda kind: -sizes[kind])
+    tallest = max(sizes[first], sum(sizes[kind] + 1.5 for kind in others))
+    figure = Figure(figsize=(9, 1.1 + 0.21 * tallest), layout="constrained")
+    left, *right = figure.subfigures(1, 2 if others else 1, squeeze=False)[0]
+    axes = [left.subplots()]
+    if others:
+        axes += right[0].subplots(len(others), 1, sharex=True, squeeze=False, gridspec_kw={
+            "height_ratios": [sizes[kind] + 0.5 for kind in others]})[:, 0].tolist()
+    shown = states(diagnosis)
+    everything = [one.chi2_per_reading for state in shown for one in state.groups]
+    limits = max(0.1, 0.9 * min(0.9, *everything)), 1.1 * max(1.1, *everything)
+    for axis, kind in zip(axes, [first, *others], strict=True):
+        names = [one.name for one in diagnosis.groups_before if one.kind == kind]
+        axis.axvline(1.0, color=PUBLISHED, lw=0.8)
+        for state in shown:
+            for one in state.groups:
+                if one.kind == kind and one.name in names:
+                    axis.plot(max(one.chi2_per_reading, limits[0]), names.index(one.name),
+                              state.marker, ms=6, color=state.colour, clip_on=False,
+                              mfc=state.colour if one.disagrees else "white")
+            axis.plot([], [], state.marker, color=state.colour, label=state.when)
+        axis.set_yticks(range(len(names)), names, fontsize="small")
+        axis.set_ylim(len(names) - 0.4, -0.6)
+        axis.set_title(GROUP_TITLES.get(kind, kind), fontsize="medium", loc="left")
+        axis.grid(alpha=0.3, axis="x")
+        if limits[1] > 5:
+            axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(
+                subs=(1, 2, 5) if limits[1] < 100 * limits[0] else (1,)))
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.set_xlim(*limits)
+    axes[0].legend(fontsize="small")
+    for axis in (axes[0], axes[-1]):
+        axis.set_xlabel("chi² per reading (1 expected)")
+    return figure
+
+
+def residuals(diagnosis: Diagnosis) -> Figure:
+    """Standardized residuals, in a row for each component (or kind of coefficient) and radius."""
+    observation = diagnosis.before.observation
+    chosen = ~diagnosis.before.held_out
+    labels = np.array(["".join(c for c in label if not c.isdigit())
+                       for label in observation.labels])[chosen]
+    radius = np.round(observation.radii[chosen], 5)
+    rows = [(label, r) for label in dict.fromkeys(labels.tolist()) for r in np.unique(radius)]
+    apart = len(rows) <= MOST_BARS
+    if not apart:
+        rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
+    shown = states(diagnosis)
+    figure = Figure(figsize=(9, 1.2 + 1.15 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), len(shown), sharex=True, sharey="row", squeeze=False)
+    coloured = False
+    for (label, r), row in zip(rows, axes, strict=True):
+        mine = np.flatnonzero((labels == label) & ((radius == r) | (not apart)))
+        for axis, state in zip(row, shown, strict=True):
+            coloured |= _residual_map(axis, diagnosis.before, np.flatnonzero(chosen)[mine],
+                                      state.left_out[mine])
+        row[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
+                          + "\n" + row[0].get_ylabel())
+        for axis in row[1:]:
+            axis.set_ylabel("")
+    for axis, state in zip(axes[0], shown, strict=True):
+        axis.set_title(state.when)
+    for axis in axes[:-1].ravel():
+        axis.set_xlabel("")
+    if coloured:
+        figure.colorbar(_colours(RESIDUAL_LIMIT), ax=list(axes.ravel()), extend="both", aspect=40,
+                        shrink=0.8, label="standardized residual")
+    return figure
+
+
+def _residual_map(axis: Axes, update: Update, readings: Ints, values: Floats) -> bool:
+    """Residuals over z and angle, or along a line or circle where there is no more; tells which."""
+    x, y, z = update.observation.positions[readings].T
+    numbers = ["".join(c for c in update.observation.labels[one] if c.isdigit())
+               for one in readings]
+    up = np.degrees(np.arctan2(y, x)) % 360
+    name = "angle in °"
+    if all(numbers):
+        up, name = np.array(numbers, float), "order"
+    axis.set_xlabel("z in m")
+    if np.ptp(z) == 0 or len(np.unique(np.round(up))) < 3:
+        axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.3, lw=0)
+        axis.plot(up if np.ptp(z) == 0 else z, values, ".", color=MEASURED, ms=4)
+        axis.set_xlabel(name if np.ptp(z) == 0 else "z in m")
+        axis.set_ylabel("residual")
+        return False
+    columns, column = np.unique(np.round(z, 6), return_inverse=True)
+    rows, row = np.unique(np.round(up, 3), return_inverse=True)
+    limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
+    if len(columns) * len(rows) <= 4 * len(values) and len(columns) > 1:
+        grid = np.full((len(rows), len(columns)), np.nan)
+        order = np.argsort(np.abs(values))  # the largest of a cell shows
+        grid[row[order], column[order]] = values[order]
+        axis.pcolormesh(columns, rows, grid, shading="nearest", rasterized=True, **limits)
+    else:
+        axis.scatter(z, up, c=values, s=9, **limits)
+    if name == "order":
+        axis.set_yticks(rows)
+    else:
+        axis.set_yticks([0, 120, 240])
+    axis.set_facecolor("#eeeeee")
+    axis.set_ylabel(name)
+    return True
+
+
+def _colours(limit: float) -> ScalarMappable:
+    return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
+
+
+def probabilities(diagnosis: Diagnosis) -> Figure:
+    """Probability of each effect; Bayes factors of what was found and of its rivals."""
+    top = sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])[:MOST_BARS]
+    bars = []
+    for one in diagnosis.named:
+        bars.append((one.found.candidate.name, one.found.log_bayes_factor, POSTERIOR))
+        bars += [(f"or {candidate.name}", factor, PUBLISHED) for candidate, factor in rivals(one)]
+    if diagnosis.unknown is not None:
+        bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
+    bars = bars[:2 * MOST_BARS]
+    figure = Figure(figsize=(9, 1.4 + 0.3 * max(len(top), len(bars))), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
+    for height, (_, value) in enumerate(top):
+        said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
+        left.text(100 * value + 1, height, said, va="center", fontsize="small")
+    left.set_xlim(0, 130)
+    left.set_xticks(range(0, 101, 20))
+    left.set_xlabel("probability in %, if at most one is missing")
+    if bars:
+        right.barh(range(len(bars)), [value for _, value, _ in bars],
+                   color=[colour for *_, colour in bars])
+        right.set_yticks(range(len(bars)), [name for name, *_ in bars])
+        right.axvline(FOUND, color=MEASURED, lw=0.8, ls="--")
+        right.set_xlabel("log Bayes factor")
+    else:
+        right.text(0.5, 0.5, "no effect was found", ha="center", transform=right.transAxes)
+        right.set_axis_off()
+    for axis in (left, right):
+        axis.set_ylim(max(len(top), len(bars)) - 0.4, -0.6)
+    return figure
+
+
+def profile(diagnosis: Diagnosis) -> Figure:
+    """The readings that fitted worst, their predictions, and what is left."""
+    shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
+    label, index, along, name = _line(before, diagnosis.left_out_before)
+    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
+    held, measured = before.held_out[index], before.readings[index]
+    for state in shown:
+        mean, colour = state.update.prediction_posterior.mean, state.colour
+        top.plot(along, mean[index], color=colour, lw=1.2, label=f"predicted, {state.when}")
+        residual = 1e3 * (state.update.readings - mean)[index]
+        bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
+        bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
+    top.plot(along[~held], measured[~held], ".", color=MEASURED, ms=4, label="measured, training")
+    top.plot(along[held], measured[held], "o", mfc="none", color=MEASURED, ms=4,
+             label="measured, held out")
+    band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
+    bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
+    x, y, _ = 1e3 * before.observation.positions[index[0]]
+    top.set_title(f"{label} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
+                  else f"{label} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
+    top.set_ylabel(f"{label} in T")
+    top.legend(fontsize="small")
+    bottom.set_ylabel("measured − predicted\nin mT")
+    bottom.set_xlabel(name)
+    for axis in (top, bottom):
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def _line(update: Update, left_out: Floats) -> tuple[str, Ints, Floats, str]:
+    """The readings of a profile: the line along z, circle, or coefficients of one kind that fitted
+    worst.
+
+    ``left_out`` are the standardized residuals of the training readings.
+    """
+    worst = np.full(len(update.readings), np.nan)
+    worst[~update.held_out] = left_out**2
+    along, name = places(update)
+    labels = np.array([label[0] if name == "harmonic" else label
+                       for label in update.observation.labels])
+    apart = np.round(update.observation.positions[:, :2] if name.startswith("z")
+                     else update.observation.radii[:, None], 6)
+    groups = [np.flatnonzero((labels == label) & (apart == one).all(axis=1))
+              for label in dict.fromkeys(labels.tolist()) for one in np.unique(apart, axis=0)]
+    longest = max(len(group) for group in groups)
+    index = max((group for group in groups if 2 * len(group) >= longest
+                 and not np.isnan(worst[group]).all()),
+                key=lambda group: float(np.nanmean(worst[group])))
+    order = np.argsort(along[index], kind="stable")
+    return str(labels[index[0]]), index[order], along[index][order], name
+
+
+def _parts(update: Update, vectors: Floats) -> dict[str, Floats]:
+    """Magnetizations (parameters, ...) in A/m by block, (blocks, ...): along and across the easy
+    axis and along z, in % and mrad of the nominal one.
+    """
+    dimension = update.study.dimension
+    nominal = update.response.nominal.reshape(-1, dimension)
+    length = np.linalg.norm(nominal, axis=1)
+    length[length == 0] = np.inf  # a block that is missing
+    axis = nominal / length[:, None]
+    across = np.zeros_like(axis)
+    across[:, 0], across[:, 1] = -axis[:, 1], axis[:, 0]
+    relative = vectors.reshape(len(nominal), dimension, -1) / length[:, None, None]
+    found = {"along the easy axis in %": 100 * np.einsum("bck,bc->bk", relative, axis),
+             "across it in mrad": 1e3 * np.einsum("bck,bc->bk", relative, across)}
+    if dimension == 3:
+        found["along z in mrad"] = 1e3 * relative[:, 2]
+    return found
+
+
+def _deviations(update: Update) -> dict[str, Floats]:
+    """Posterior less prior mean by component, (rings, slots)."""
+    array = update.study.array
+    return {name: values.reshape(array.rings, array.blocks_per_ring) for name, values in
+            _parts(update, update.posterior.mean - update.prior.mean).items()}
+
+
+def magnetizations(diagnosis: Diagnosis) -> Figure:
+    """Posterior less prior mean of every block, by ring and slot."""
+    shown = states(diagnosis)
+    found = [_deviations(state.update) for state in shown]
+    array = diagnosis.before.study.array
+    figure = Figure(figsize=(9, 1.0 + len(found[0]) * (1.0 + 0.14 * array.rings)),
+                    layout="constrained")
+    axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
+    for row, name in zip(axes, found[0], strict=True):
+        limit = max(float(np.abs(one[name]).max()) for one in found) or 1.0
+        for axis, one in zip(row, found, strict=True):
+            axis.imshow(one[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
+                        origin="lower",
+                        extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
+            axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 6)))
+        figure.colorbar(_colours(limit), ax=list(row), label=name.replace(" in", "\nin"))
+        row[0].set_ylabel("ring")
+    for axis, state in zip(axes[0], shown, strict=True):
+        axis.set_title(state.when)
+    for axis in axes[-1]:
+        axis.set_xlabel("slot")
+    return figure
+
+
+def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Rms changes of the magnetizations, and what the prior allows."""
+    found = [(state.when, _deviations(state.update)) for state in states(diagnosis)]
+    prior = _parts(diagnosis.before, diagnosis.before.prior.root)
+    return [{"rms change of the magnetizations": name,
+             "prior sd": f"{np.sqrt(np.mean(np.sum(values**2, axis=1))):.3g}"} | {
+        when: f"{np.sqrt(np.mean(one[name]**2)):.3g}" for when, one in found}
+        for name, values in prior.items()]
+
+
+def _empty(text: str) -> Figure:
+    figure = Figure(figsize=(8, 1), layout="constrained")
+    axis = figure.subplots()
+    axis.text(0.5, 0.5, text, ha="center", transform=axis.transAxes)
+    axis.set_axis_off()
+    return figure

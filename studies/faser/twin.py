@@ -1,0 +1,93 @@
+"""The FASER campaign's synthetic twin: from block moments and a map at 75 mm to the axis.
+
+What the paper did with its unpublished map, where the truth is known (make_twin.py)::
+
+    python studies/faser/twin.py -o results/faser-twin
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.blocks import Floats
+from halbach_fe.cli import common
+from halbach_fe.field_map import points_of, read_map
+from halbach_fe.inference.linear import predict
+from halbach_fe.inference.prior import Gaussian
+from halbach_fe.observation import observe
+from halbach_fe.report.inference import write_report
+from halbach_fe.report.magnetizations import scores, write_magnetizations
+from halbach_fe.response import response
+from halbach_fe.study import FluxDensity, PointPositions, read_study
+from halbach_fe.update import infer, write_text, write_update
+
+HERE = Path(__file__).parent
+HOMOGENEOUS_M = (-0.43, 0.42)
+REGIONS = ("homogeneous", "fringe")
+
+
+def medians(z: Floats, errors: Floats) -> dict[str, float]:
+    """Median relative error by region."""
+    inside = (z >= HOMOGENEOUS_M[0]) & (z <= HOMOGENEOUS_M[1])
+    return {name: float(np.median(errors[mask]))
+            for name, mask in zip(REGIONS, (inside, ~inside), strict=True)}
+
+
+def published() -> dict[str, dict[str, float]]:
+    """The paper's errors on the axis, of its prior and of its posterior from q_F."""
+    index, prior, posterior, _ = np.loadtxt(
+        HERE / "fig4_faser_on_axis.csv", delimiter=",", skiprows=1).T
+    z = 0.01 * (index - (len(index) + 1) / 2)
+    return {"prior": medians(z, prior), "posterior": medians(z, posterior)}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the twin and print its table."""
+    study, axis = read_study(arguments.study), read_map(HERE / "twin" / "axis.csv")
+    with common.workshop(arguments) as workshop:
+        update = infer(study, read_map(HERE / "twin" / "map.csv"), workshop,
+                       read_blocks(HERE / "twin" / "blocks.csv"))
+        points = points_of(axis)
+        line = study.model_copy(update={"observation": FluxDensity(
+            quantity="flux_density", components=("x",), positions=PointPositions(
+                kind="points", points_m=tuple(map(tuple, points.tolist()))))})
+        seen = observe(line, points, ~np.isnan(axis["B_T"].values))
+        on_axis = response(line, seen, replace(workshop, folder=arguments.output / "axis"))
+    write_update(update, arguments.output)
+    write_report(update, arguments.output)
+    measured = seen.apply(np.nan_to_num(axis["B_T"].values))
+    blocks = json.loads((HERE / "twin" / "truth" / "truth.json").read_text())["blocks"]
+    truth = np.array([one["magnetization_A_per_m"] for one in blocks]).ravel()
+    known = {"prior": update.prior, "posterior": update.posterior}
+
+    def errors(one: Gaussian) -> dict[str, float]:
+        mean, _ = predict(on_axis.matrix, one)
+        return medians(points[:, 2], np.abs(measured - mean) / np.abs(measured))
+
+    results = {"paper": published(), "here": {
+        name: errors(one) | scores(one, truth) for name, one in known.items()}}
+    write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
+               + "\n")
+    write_magnetizations(
+        study, known, truth, arguments.output, "the magnetizations of FASER's twin",
+        "results.json, posterior.h5", ring=5)
+    common.print_table(
+        [{"region": region, "model": name} | {
+            whose: f"{results[whose][name][region]:.2g}" for whose in results}
+         for region in REGIONS for name in known],
+        "Median relative error of B_x on the axis, by a model updated at 75 mm")
+    z = results["here"]["posterior"]["z_rms"]
+    common.say(f"Error of all {len(truth)} magnetizations over standard deviation: {z:.2f} rms.\n"
+               f"Report: {arguments.output / 'report.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(common.run_study(__doc__ or "", HERE / "twin.toml", "faser-twin", run))

@@ -1,0 +1,276 @@
+"""halbach-fe diagnose as a user meets it: what it prints, what it writes, what it refuses."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+import re
+import tomllib
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import magpylib
+import numpy as np
+import pytest
+
+from halbach_fe.blocks import blocks_of, position_angle_deg
+from halbach_fe.cli import main
+from halbach_fe.diagnosed import summary
+from halbach_fe.effects import catalogue
+from halbach_fe.field_map import field_map, write_map
+from halbach_fe.study import parse_study
+from tests.conftest import ROOT, circle
+
+STUDY = """# of the workshop's drawing
+name = "small"
+dimension = 3
+
+[array]
+blocks_per_ring = 8
+rings = 2
+inner_radius_m = 0.05   # measured
+outer_radius_m = 0.09
+ring_length_m = 0.06
+remanence_T = 1.0
+
+[array.block]
+shape = "sector"
+
+[mesh]
+block_size_m = 0.03
+
+[observation]
+quantity = "flux_density"
+
+[observation.positions]   # of the mapper
+kind = "circles"
+radius_m = 0.035
+angles = 8
+z_min_m = -0.12
+z_max_m = 0.12
+count = 25
+
+[[noise.regions]]
+name = "bore"
+z_min_m = -0.06
+z_max_m = 0.06
+sigma_T = 3e-5
+
+[[noise.regions]]
+name = "fringe"
+sigma_T = 3e-5
+
+[inference.held_out]
+every = 4
+"""
+POINTS = np.vstack([circle(0.035, 8, z) for z in np.linspace(-0.12, 0.12, 25)])
+SAG_M = 4e-4
+CHOICE = "arm_sag,offset_x,background,gain_x,mapper_translation,block_demagnetized"
+
+
+@functools.cache
+def fields(sag):
+    """A map by magpylib, of blocks that are not quite nominal; the arm sags towards -y."""
+    generator = np.random.default_rng(7)
+    study = parse_study({"name": "truth", "array": {
+        "blocks_per_ring": 8, "rings": 2, "inner_radius_m": 0.05, "outer_radius_m": 0.09,
+        "ring_length_m": 0.06, "remanence_T": 1.0, "block": {"shape": "sector"}},
+        "mesh": {"block_size_m": 0.03}, "observation": {
+            "quantity": "flux_density", "positions": {
+                "kind": "circles", "radius_m": 0.035, "angles": 8}}})
+    along = (POINTS[:, 2] - POINTS[:, 2].min()) / np.ptp(POINTS[:, 2])
+    there = POINTS - np.outer(sag * along**2, [0, 1, 0])
+    total = 3e-5 * generator.standard_normal(POINTS.shape)
+    for block in blocks_of(study):
+        middle = position_angle_deg(study.array, block.slot)
+        polarization = np.array(block.easy_axis) + 0.01 * generator.standard_normal(3)
+        total += magpylib.magnet.CylinderSegment(
+            dimension=(0.05, 0.09, 0.06, middle - 22.5, middle + 22.5),
+            position=(0, 0, (block.z_min + block.z_max) / 2), polarization=polarization,
+        ).getB(there)
+    return total
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+def measured(folder, sag):
+    path = folder / "map.csv"
+    write_map(field_map(POINTS, fields(sag)), path)
+    return path
+
+
+class Page(HTMLParser):
+    """Headings, pictures with their texts, and other addresses of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.headings, self.pictures, self.outside, self.inside = [], [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.inside = tag
+        if tag == "img":
+            kind, _, data = named["src"].partition(",")
+            self.pictures.append((kind, base64.b64decode(data), named["alt"]))
+        self.outside += [value for key, value in attributes
+                         if key in ("href", "src") and not value.startswith("data:")]
+
+    def handle_data(self, data):
+        if self.inside in ("h1", "h2") and data.strip():
+            self.headings.append(data)
+        self.inside = ""
+
+
+def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
+    out, data = tmp_path / "out", measured(tmp_path, SAG_M)
+    arguments = ["diagnose", str(study), "--measurements", str(data), "-o", str(out),
+                 "--effects", CHOICE]
+    assert main(arguments) == 0
+    shown = capsys.readouterr()
+    assert "arm_sag" in shown.out
+    assert re.search(r"0\.\d+ ± 0\.\d+ mm", shown.out)
+    assert "held out, fringe" in shown.out
+    assert "The map is explained by: sag of the mapper's arm" in shown.err
+    lines = [line for line in shown.err.splitlines() if line.startswith("round ")]
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert len(lines) == found["rounds"]
+
+    assert found["verdict"] == "named"
+    (effect,) = found["effects"]
+    assert (effect["effect"], effect["place"], effect["kind"]) == ("arm_sag", "", "instrument")
+    (sag,) = effect["parameters"]
+    assert sag["unit"] == "m"
+    assert abs(sag["value"] - SAG_M) < 4 * sag["sd"]  # one draw
+    assert sag["sd"] < 0.1 * SAG_M
+    before, after = ({(one["part"], one["region"]): one for one in found["scores"][when]}
+                     for when in ("before", "after"))
+    assert set(before) == {("training", "all"), *(("held out", name) for name in (
+        "all", "bore", "fringe"))}
+    for key in (("training", "all"), ("held out", "all")):
+        # 456 and 144 readings: sd of chi2 per reading 0.07 and 0.12
+        assert after[key]["chi2_per_reading"] == pytest.approx(1.0, abs=0.4)
+        assert before[key]["chi2_per_reading"] > 2 * after[key]["chi2_per_reading"]
+        assert after[key]["coverage95"] == pytest.approx(0.95, abs=0.06)
+    assert any(one["p"] < 1e-6 for one in found["groups"]["before"])
+    assert all(one["p"] > 1e-4 for one in found["groups"]["after"])
+    assert sum(found["probabilities"].values()) == pytest.approx(1)
+
+    page = Page((out / "diagnosis.html").read_text())
+    assert page.headings == [
+        "small: what the model lacks", "Where model and map disagree", "What is missing",
+        "How sure that is", "What else it could be", "What changed",
+        "Structure in the magnetizations", "What to measure next",
+        "The study with what was missing"]
+    assert len(page.pictures) == 5
+    assert all(kind == "data:image/png;base64" and picture.startswith(b"\x89PNG") and text
+               for kind, picture, text in page.pictures)
+    assert page.outside == []
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+
+    # the study that it wrote is the one it solved, and others run it as it stands
+    text = (out / "study.diagnosed.toml").read_text()
+    (line,) = [line for line in text.splitlines() if line.startswith("arm_sag_m")]
+    assert f"{sag['value']!r}" in line
+    assert re.search(r"# arm_sag: sag .* m, log Bayes factor [\d.]+$", line)
+    assert text.startswith(STUDY.rstrip("\n"))
+    again = [str(out / "study.diagnosed.toml"), "-o", str(tmp_path / "again"), "--json"]
+    assert main(["solve", *again]) == 0
+    capsys.readouterr()
+    assert main(["infer", *again, "--measurements", str(data)]) == 0
+    conflict = json.loads(capsys.readouterr().out)["prior_conflict"]
+    assert conflict == pytest.approx(after["training", "all"]["chi2_per_reading"], rel=1e-9)
+
+
+def test_nothing_is_missing(study, tmp_path, capsys):
+    """Negative control: the same without sag."""
+    out, data = tmp_path / "out", measured(tmp_path, 0.0)
+    assert main(["diagnose", str(study), "--measurements", str(data), "-o", str(out), "--json",
+                 "--effects", CHOICE, "--held-out", str(data)]) == 0
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
+    assert found == json.loads((out / "diagnosis.json").read_text())
+    assert (found["verdict"], found["effects"], found["next"]) == ("nothing", [], [])
+    assert found["readings"] == {"training": 456, "held out": 144, "held-out map": 600}
+    assert max(found["probabilities"], key=found["probabilities"].get) == "none"
+    assert (out / "study.diagnosed.toml").read_text() == STUDY
+    page = (out / "diagnosis.html").read_text()
+    assert "<strong>Nothing is missing:" in page
+    assert "before" not in page.split("<h2>How sure")[0]
+
+
+@pytest.mark.parametrize(("change", "code", "said"), [
+    ({"study": "inner_radius_m = 50"}, 3, "millimetres"),
+    ({"map": "x_m,y_m,z_m,Bx_T\n0,0,0,many\n"}, 4, "must be a finite number"),
+    ({"map": "x_m,y_m,z_m,Bx_T\n0.07,0,0,0.1\n"}, 4, "inside magnet or iron"),
+    ({"blocks": "serial,type\n"}, 4, "blocks.csv"),
+    ({"held-out": None}, 4, "readable file")])
+def test_bad_input(study, tmp_path, capsys, change, code, said):
+    data, out, extra = measured(tmp_path, 0.0), tmp_path / "out", []
+    for key, value in change.items():
+        if key == "study":
+            study.write_text(STUDY.replace("inner_radius_m = 0.05", value))
+        elif key == "map":
+            data.write_text(value)
+        else:
+            extra = [f"--{key}", str(tmp_path / f"{key}.csv")]
+            if value is not None:
+                (tmp_path / f"{key}.csv").write_text(value)
+    found = main(["diagnose", str(study), "--measurements", str(data), "-o", str(out), *extra])
+    shown = capsys.readouterr()
+    assert found == code
+    errors = [line for line in shown.err.splitlines() if not line.startswith("round")]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: ")
+    assert said in errors[0]
+    assert not list(tmp_path.rglob("diagnosis*"))
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    ("arm_sagg", "did you mean arm_sag?"), ("", "there are arm_sag, azimuthal_gap"),
+    ("arm_sag,,gain_x", "no effect is called ''")])
+def test_unknown_effects_are_a_wrong_command_line(study, tmp_path, capsys, names, said):
+    with pytest.raises(SystemExit) as stopped:
+        main(["diagnose", str(study), "--measurements", "map.csv", "-o", str(tmp_path / "out"),
+              "--effects", names])
+    assert stopped.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
+    study, tmp_path, capsys, monkeypatch
+):
+    """Were a gap found to be negative, no study could hold it."""
+    gap = next(one for one in catalogue() if one.name == "azimuthal_gap")
+    monkeypatch.setattr("halbach_fe.diagnosed._steps", lambda study, _: [
+        (gap.apply(study, gap.places(study)[0], [-1e-4]), "a gap")])
+    monkeypatch.setattr("halbach_fe.diagnose.unknown", lambda *_: None)  # takes its time
+    out = tmp_path / "out"
+    assert main(["diagnose", str(study), "--measurements", str(measured(tmp_path, 0.0)),
+                 "-o", str(out), "--effects", "gain_x"]) == 3
+    assert "angular_gap_deg" in capsys.readouterr().err
+    assert {"diagnosis.json", "diagnosis.html"} <= {path.name for path in out.iterdir()}
+    assert not (out / "study.diagnosed.toml").exists()
+
+
+def test_the_readme_says_what_is_in_the_file():
+    section = (ROOT / "README.md").read_text().split("## What the model lacks")[1].split("\n## ")[0]
+    keys = re.findall(r"^\| `([a-z_]+)` \|", section, re.MULTILINE)
+    study = parse_study(tomllib.loads(STUDY))
+    update = SimpleNamespace(
+        study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
+        relative_error=lambda _: np.zeros(1), prediction_posterior=None)
+    nothing = SimpleNamespace(
+        before=update, after=update, named=(), unknown=None, probabilities={}, groups_before=[],
+        groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1)
+    assert keys == list(summary(nothing))
+    rows = [line.split("|") for line in section.splitlines()
+            if line.startswith(("| field |", "| instrument |"))]
+    assert {(row[1].strip(), name.strip()) for row in rows for name in row[2].split(",")} == {
+        (effect.kind, effect.name) for effect in catalogue()}

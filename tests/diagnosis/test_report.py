@@ -1,0 +1,130 @@
+"""The page of a diagnosis, for studies of all kinds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from halbach_fe.blocks import blocks_of
+from halbach_fe.diagnose import Unknown, diagnose
+from halbach_fe.diagnosed import amounts, human_unit, note, where
+from halbach_fe.diagnosis.selection import Candidate
+from halbach_fe.effects import catalogue
+from halbach_fe.effects.base import Parameter, Place
+from halbach_fe.exact_field import field_of
+from halbach_fe.field_map import field_map
+from halbach_fe.next_measurement import separations
+from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_report
+from tests.conftest import circle
+
+EFFECTS = {effect.name: effect for effect in catalogue()}
+NOISE = {"regions": [{"name": "all", "sigma_T": 2e-5}]}
+
+
+def diagnosed(study, points, add, names, workshop, generator):
+    """Diagnose the nominal map with something added and noise."""
+    field = field_of(blocks_of(study), points)
+    data = field_map(points, field + add(field) + 2e-5 * generator.standard_normal(points.shape))
+    effects = [EFFECTS[name] for name in names]
+    found = diagnose(study, data, workshop, effects=effects)
+    return found, separations(found, data, workshop, effects)
+
+
+@pytest.fixture
+def flat(dipole, workshop, generator):
+    """A cross-section by Fourier coefficients; the sensor of x shows 2 % more."""
+    study = dipole(array__recoil_permeability=1.0, noise=NOISE,
+                   observation={"quantity": "fourier_coefficients", "harmonics": 6, "positions": {
+                       "kind": "circles", "radius_m": [0.05, 0.075], "angles": 24}})
+    points = np.vstack([circle(0.05, 24), circle(0.075, 24)])
+    return diagnosed(study, points, lambda field: field * [0.02, 0, 0],
+                     ["background", "gain_x", "offset_y"], workshop, generator)
+
+
+def test_a_cross_section(flat, tmp_path):
+    found, further = flat
+    assert [one.hypothesis.effect.name for one in found.named] == ["gain_x"]
+    write_report(found, further, tmp_path)
+    page = (tmp_path / "diagnosis.html").read_text()
+    assert page.count("<img alt=") == 5
+    assert "along z" not in page.split("<h2>Structure")[1].split("<img")[0]  # no M_z
+    assert "sensitivity of a sensor (gain_x), " in verdict(found)[0]
+    assert " %" in verdict(found)[0]
+
+
+def test_a_line(short_dipole, workshop, generator, tmp_path):
+    study = short_dipole(array__recoil_permeability=1.0, noise=NOISE, observation={
+        "quantity": "flux_density", "components": ["x"], "positions": {
+            "kind": "line", "start_m": [0, 0, -0.2], "end_m": [0, 0, 0.2], "count": 41}})
+    points = np.linspace([0, 0, -0.2], [0, 0, 0.2], 41)
+    found, further = diagnosed(study, points, lambda _: [3e-4, 0, 0],
+                               ["background", "gain_x", "offset_x"], workshop, generator)
+    (one,) = found.named
+    rivals = {candidate.effect for candidate, _ in one.found.alternatives}
+    assert {one.hypothesis.effect.name, *rivals} >= {"background", "offset_x"}
+    write_report(found, further, tmp_path)
+    page = (tmp_path / "diagnosis.html").read_text()
+    assert "It does not tell" in page
+    assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page
+    assert "against offset_x" in page or "against background" in page
+    assert [row["count"] for row in change_table(found)] == ["41"]
+    (row,) = found_table(found)
+    assert row["it could be"] == ", ".join(dict.fromkeys(
+        candidate.effect for candidate, _ in one.found.alternatives))
+    alone = replace(one, found=replace(one.found, alternatives=()))
+    write_report(replace(found, named=(alone,)), [], tmp_path)
+    page = (tmp_path / "diagnosis.html").read_text()
+    assert "It does not tell" not in page
+    assert "No two effects have to be told apart" in page
+
+
+def test_verdicts(flat):
+    found, _ = flat
+    unknown = Unknown("either", 40.0, False, 2e-4, (0.05, 0.0, 0.0), None)
+    assert "nothing" not in " ".join(verdict(found))
+    assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
+    nothing = replace(found, named=(), after=found.before)
+    assert "no effect of the catalogue" in verdict(nothing)[0]
+    alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
+    assert verdict(alone)[0].startswith("Something outside the catalogue is missing")
+    assert "near (200, 0, 0) mm" in verdict(alone)[1]
+    fine = replace(found.before, prior_conflict=1.0)
+    assert verdict(replace(nothing, before=fine, after=fine))[0].startswith("Nothing is missing")
+
+
+def test_the_page_of_what_is_unknown(flat, tmp_path):
+    found, _ = flat
+    unknown = Unknown("either", 40.0, True, 2e-4, (0.05, 0.0, 0.0), None)
+    write_report(replace(found, named=(), after=found.before, unknown=unknown), [], tmp_path)
+    page = (tmp_path / "diagnosis.html").read_text()
+    assert 'class="warning"' in page
+    assert "tells a field from the sensors" in page
+
+
+def test_numbers_for_people(flat):
+    found, _ = flat
+    one = found.named[0]
+    certain = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["block_missing"]))
+    assert amounts(certain) == ["there"]
+    sag = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["arm_sag"]),
+                  found=replace(one.found, candidate=Candidate("arm_sag", "", (0,)),
+                                log_bayes_factor=31.25),
+                  values=np.array([-1.2345e-3]), sd=np.array([2.7e-5]))
+    assert amounts(sag) == ["−1.234 ± 0.027 mm"]
+    assert note(sag) == "arm_sag: sag -0.001234 ± 0.000027 m, log Bayes factor 31.2"
+    tiny = replace(sag, values=np.array([-1.2e-7]), sd=np.array([2.5e-9]))
+    assert note(tiny) == "arm_sag: sag (-1.200 ± 0.025)e-7 m, log Bayes factor 31.2"
+    assert human_unit(Parameter("gain", "1", 1.0)) == ("%", 100.0)
+    assert human_unit(Parameter("factor", "1", 1.0)) == ("", 1.0)
+    assert human_unit(Parameter("spin", "furlong", 1.0)) == ("furlong", 1.0)
+    assert where(Place(2, 11)) == "ring 2, slot 11"
+    assert where(Place(at_m=(0.5,))) == "at 0.5 m"
+    assert where(Place()) == ""
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
+def test_every_parameter_has_a_unit_that_is_told(effect):
+    assert all(human_unit(parameter)[0] or parameter.unit == "1"
+               for parameter in effect.parameters)
