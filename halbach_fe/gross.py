@@ -6,11 +6,12 @@ its points: as it stands, and with every error in question put right, single err
 factor near 1 is free, for iron and temperature. What other blocks and effects of usual size leave
 is known; a gross error is named only if the misfit is far larger, and if it explains nearly all of
 it. What the symmetry of the magnet makes the same, as z reversed and Bz of the wrong sign where
-both ends are alike, is named together.
+both ends are alike, is named together; measured blocks have no symmetry, and decide.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,13 +22,15 @@ import xarray as xr
 from pydantic import ValidationError
 from scipy.optimize import least_squares, minimize_scalar
 
+from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats, MagnetBlock, blocks_of, turn_of
-from halbach_fe.errors import HalbachError
+from halbach_fe.errors import HalbachError, HalbachWarning
 from halbach_fe.exact_field import unit_fields
 from halbach_fe.external import external_field
 from halbach_fe.field_map import points_of
 from halbach_fe.instrument import along_axes, probe_positions, sensor_matrix
-from halbach_fe.study import COMPONENTS, Axes, Component, Instrument, Study
+from halbach_fe.measured_prior import prior_from_blocks
+from halbach_fe.study import COMPONENTS, MU_0, Axes, Component, Instrument, Study
 
 POINTS = 160
 """Of the map, that are compared."""
@@ -71,6 +74,9 @@ LEAST_SHIFT_M = 0.006
 """Less is a small effect: six standard deviations of those in the catalogue."""
 
 RADII = tuple(float(one) for one in np.geomspace(0.4, 2.5, 17) if abs(one - 1) > 0.01)
+OFFSETS = tuple(float(one) for one in np.linspace(-0.5, 0.5, 11) if abs(one) > 0.01)
+"""Of the radius, as a factor, and over the bore's radius, from which the best is looked for."""
+
 LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
 FLUX_DENSITIES = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
 RINGS = 4
@@ -108,6 +114,8 @@ class Reading:
     magnet : Magnet or None
     radius : float
         Factor of the distances from the axis.
+    offset_m : float
+        Added to them.
     shift_m : tuple of float
         Of the points.
     """
@@ -118,6 +126,7 @@ class Reading:
     fields: Axes = SAME
     magnet: Magnet | None = None
     radius: float = 1.0
+    offset_m: float = 0.0
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
@@ -135,6 +144,8 @@ class Reading:
             found.append((self.magnet.name, self.magnet.title))
         if self.radius != 1:
             found.append(("wrong_radius", f"{self.radius:.3g} times the map's radius"))
+        if self.offset_m:
+            found.append(("wrong_radius", f"points {1e3 * self.offset_m:.1f} mm farther out"))
         if any(self.shift_m):
             shift = ", ".join(f"{1e3 * one:.1f}" for one in self.shift_m)
             found.append(("wrong_line", f"points that are off by ({shift}) mm"))
@@ -162,6 +173,7 @@ class Reading:
             "position_axes": _then(old.position_axes, self.positions),
             "field_axes": _then(old.field_axes, self.fields),
             "radius_scale": (1 + old.radius_scale) * self.radius - 1,
+            "radius_offset_m": old.radius_offset_m * self.radius + self.offset_m,
             "translation_m": tuple(np.add(old.translation_m, self.shift_m).tolist())}
         return study.model_copy(
             update={"instrument": Instrument.model_validate(old.model_dump() | changes)})
@@ -195,6 +207,18 @@ class Gross:
         """The errors in words."""
         return " and ".join(text for _, text in self.reading.errors)
 
+    @property
+    def start(self) -> dict[str, tuple[float, ...]]:
+        """Amplitudes of effects of the catalogue, by name, if it is nothing else: a search begins
+        with them, which a small effect's signature could not reach.
+        """
+        rest = replace(self.reading, offset_m=0.0, shift_m=(0.0, 0.0, 0.0))
+        if rest.errors:
+            return {}
+        offset, shift = (self.reading.offset_m,), self.reading.shift_m
+        return {name: values for name, values in (("wrong_radius", offset), ("wrong_line", shift))
+                if any(values)}
+
     def apply(self, study: Study) -> Study:
         """The study that reads the map right."""
         return self.reading.apply(study)
@@ -211,13 +235,16 @@ class _Misfit:
 NOWHERE = _Misfit(np.inf, np.inf)
 
 
-def find_gross(study: Study, data: xr.Dataset) -> tuple[Gross, ...]:
+def find_gross(
+    study: Study, data: xr.Dataset, blocks: BlockTable | None = None
+) -> tuple[Gross, ...]:
     """Find gross errors of a map, in the order in which they are to be put right."""
     found: list[Gross] = []
     rows = np.unique(np.linspace(0, data.sizes["point"] - 1, POINTS).round().astype(int))
     some = data.isel(point=rows)
     while len(found) < MOST:
-        one = _Search(study, points_of(some), np.asarray(some["B_T"].values, float)).find()
+        one = _Search(
+            study, points_of(some), np.asarray(some["B_T"].values, float), blocks).find()
         if one is None:
             break
         found.append(one)
@@ -231,8 +258,10 @@ class _Search:
     ``points`` (n, 3) and ``values`` (n, 3) are the map's, as its file has them.
     """
 
-    def __init__(self, study: Study, points: Floats, values: Floats) -> None:
-        self.study, self.points, self.values = study, points, values
+    def __init__(
+        self, study: Study, points: Floats, values: Floats, table: BlockTable | None = None
+    ) -> None:
+        self.study, self.points, self.values, self.table = study, points, values, table
         others = magnets(study)
         self.turned = tuple(one for one in others if one.turn_rad is not None)
         self.other = tuple(one for one in others if one.turn_rad is None)
@@ -256,8 +285,9 @@ class _Search:
                 if good:
                     break
             if good:
-                least = min(misfit.standard for misfit, _ in good)
-                alike = [one for one in good if one[0].standard <= ALIKE * least]
+                alike = _best(good)
+                if self.table and len(alike) > 1:
+                    alike = _best([(self.misfit(one, built=True), one) for _, one in alike])
                 (after, reading), *others = sorted(alike, key=lambda one: _rank(one[1]))
                 return Gross(reading, tuple(one for _, one in others), before.relative,
                              after.relative)
@@ -267,8 +297,8 @@ class _Search:
         """Whether it leaves next to nothing of what was there, and is no small effect."""
         if not (after.standard <= before.standard / DECISIVE and after.relative <= CLOSE):
             return False
-        if 0 < abs(reading.radius - 1) < LEAST_RADIUS or (
-                0 < float(np.linalg.norm(reading.shift_m)) < LEAST_SHIFT_M):
+        moved = np.linalg.norm([reading.offset_m, *reading.shift_m])
+        if 0 < abs(reading.radius - 1) < LEAST_RADIUS or 0 < moved < LEAST_SHIFT_M:
             return False
         try:
             reading.apply(self.study)
@@ -300,29 +330,40 @@ class _Search:
 
     def elsewhere(self, level: int) -> Iterator[Reading]:
         """The best with points at other radii, or shifted, and as many errors in all."""
+        radii = np.hypot(self.points[:, 0], self.points[:, 1])
+        circles, smallest = radii.any(), radii[radii > 0].min(initial=np.inf)
+        size = self.study.array.inner_radius_m
         for unit in self.lengths if level > 1 else (1.0,):
-            starts = [Reading(length_unit=unit, radius=one) for one in RADII]
-            tried = [one for start in starts for one in self.of_source(start, level)]
-            best = min(tried, key=lambda one: self.misfit(one).standard, default=None)
-            if best and np.hypot(self.points[:, 0], self.points[:, 1]).any():
-                yield self.refined(best)
+            source = Reading(length_unit=unit)
+            families = [[replace(source, offset_m=size * one) for one in OFFSETS
+                         if unit * smallest + size * one > 0]]
+            if circles:
+                families.append([replace(source, radius=one) for one in RADII])
+            for family in families:
+                tried = [one for start in family for one in self.of_source(start, level)]
+                best = min(tried, key=lambda one: self.misfit(one).standard, default=None)
+                if best:
+                    yield from self.decided(self.refined(best))
         if level == 1:
             yield from self.shifted()
 
     def refined(self, best: Reading) -> Reading:
         """The same with the best radius."""
-        step = RADII[1] / RADII[0]
+        def at(value: float) -> Reading:
+            if best.offset_m:
+                return replace(best, offset_m=float(value))
+            return replace(best, radius=float(value))
+
+        step = (OFFSETS[1] - OFFSETS[0]) * self.study.array.inner_radius_m
+        ratio = RADII[1] / RADII[0]
         found = minimize_scalar(
-            lambda radius: min(self.misfit(replace(best, radius=float(radius))).standard, 1e9),
-            bounds=(best.radius / step, best.radius * step), method="bounded",
-            options={"xatol": 1e-3})
-        return replace(best, radius=float(found.x))
+            lambda value: min(self.misfit(at(value)).standard, 1e9), method="bounded",
+            bounds=((best.offset_m - step, best.offset_m + step) if best.offset_m
+                    else (best.radius / ratio, best.radius * ratio)), options={"xatol": 1e-4})
+        return at(found.x)
 
     def shifted(self) -> Iterator[Reading]:
-        """The best with points that are all elsewhere by the same.
-
-        None if the opposite shift is as good, as from the axis of a magnet that is symmetric.
-        """
+        """The best with points that are all elsewhere by the same."""
         size = self.study.array.inner_radius_m
         starts = [np.zeros(3)] + [
             size * part * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -341,44 +382,72 @@ class _Search:
 
         best = min(starts, key=lambda one: self.misfit(reading(one)).standard)
         found = least_squares(residual, best, x_scale=size, diff_step=1e-4, max_nfev=8).x
-        opposite = self.misfit(reading(-found)).standard
-        if opposite > ALIKE * self.misfit(reading(found)).standard:
-            yield reading(found)
+        yield from self.decided(reading(found))
 
-    def misfit(self, reading: Reading) -> _Misfit:
-        """How far the map so read is from the nominal magnet."""
-        found = self.residual(reading)
+    def decided(self, moved: Reading) -> Iterator[Reading]:
+        """A reading of points elsewhere, unless those on the other side do as well, as they do
+        from the axis of a symmetric magnet: anything even would then explain the map.
+        """
+        x, y, z = (-one for one in moved.shift_m)
+        opposite = replace(moved, offset_m=-moved.offset_m, shift_m=(x, y, z))
+        if opposite == moved or (
+                self.misfit(opposite).standard > ALIKE * self.misfit(moved).standard):
+            yield moved
+
+    def misfit(self, reading: Reading, built: bool = False) -> _Misfit:
+        """How far the map so read is from the nominal magnet, or that of the measured blocks."""
+        found = self.residual(reading, built)
         if found is None:
             return NOWHERE
         residual, relative = found
         return _Misfit(float(np.sqrt(np.mean(residual**2))), relative)
 
-    def residual(self, reading: Reading) -> tuple[Floats, float] | None:
+    def residual(self, reading: Reading, built: bool = False) -> tuple[Floats, float] | None:
         """Standardized residuals (values,) and their rms over that of the map; None of readings
         inside of material, or of none that the study observes.
         """
+        turned = reading.magnet if reading.magnet in self.turned else None
         nominal = self.nominal(replace(
             reading, fields=SAME, flux_density_unit=1.0,
-            magnet=None if reading.magnet in self.turned else reading.magnet))
+            magnet=None if turned else reading.magnet))
         if nominal is None:
             return None
+        field = nominal.field(turned.turn_rad if turned and turned.turn_rad else 0.0)
+        if built:
+            field = self.of_measured_blocks(reading, field)
         old = self.study.instrument
         shown = along_axes(_then(old.field_axes, reading.fields), self.values) * (
             old.flux_density_unit_T * reading.flux_density_unit)
         used = ~np.isnan(shown) & self.observed
         if not used.any() or 2 * used.sum() < self.present:
             return None
-        turn = reading.magnet.turn_rad if reading.magnet in self.turned and reading.magnet else 0.0
-        field = nominal.field(turn or 0.0)[used]
         whole = max(_size(shown), 1e-300)
-        shown = shown[used]
-        main = max(whole, _size(nominal.field(0.0)))
-        sd = np.sqrt(nominal.variance[used] + (USUAL * main) ** 2)
+        sd = np.sqrt(nominal.variance[used] + (USUAL * max(whole, _size(field))) ** 2)
+        shown, field = shown[used], field[used]
         weighted = field / sd
         scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
                         1 - SCALE, 1 + SCALE)
         difference = shown - scale * field
         return difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole)
+
+    def of_measured_blocks(self, reading: Reading, nominal: Floats) -> Floats:
+        """B (n, 3) in T of the blocks of the table, or the nominal one if they do not fit."""
+        assert self.table is not None
+        try:
+            study = reading.apply(self.study)
+            with warnings.catch_warnings(action="ignore", category=HalbachWarning):
+                measured = prior_from_blocks(study, self.table).gaussian.mean
+        except (ValidationError, HalbachError):
+            return nominal
+        blocks = blocks_of(study)
+        mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
+        points = _probe_points(study.instrument, self.points)
+        panel = PANEL * study.array.inner_radius_m
+        total = external_field(study, points)
+        for block, one, unit in zip(blocks, mean, unit_fields(blocks, points, 4, panel),
+                                    strict=True):
+            total += unit @ (MU_0 * block.recoil_tensor @ one)
+        return np.asarray(total @ sensor_matrix(study.instrument).T)
 
     def nominal(self, source: Reading) -> _Nominal | None:
         """The nominal magnet's field where the points then are; None inside of material."""
@@ -411,9 +480,7 @@ class _Nominal:
         cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats
     ) -> _Nominal | None:
         """At the points (n, 3) that a map shows; None if one is inside of material."""
-        instrument = study.instrument
-        read = along_axes(instrument.position_axes, shown) * instrument.length_unit_m
-        points = probe_positions(instrument, read).mean(axis=1)
+        points = _probe_points(study.instrument, shown)
         if any(block.contains(points).any() for block in blocks):
             return None
         field, across, variance = (np.zeros_like(points) for _ in range(3))
@@ -423,7 +490,7 @@ class _Nominal:
             field += unit @ (np.array(block.easy_axis) * block.remanence)
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
             variance += np.sum((BLOCK_SD * block.remanence * unit) ** 2, axis=2)
-        sensors = sensor_matrix(instrument).T
+        sensors = sensor_matrix(study.instrument).T
         return cls(field @ sensors, across @ sensors,
                    external_field(study, points) @ sensors, variance)
 
@@ -500,6 +567,18 @@ def _wrapped(angle_deg: float) -> float:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' if abs(number) != 1 else ''}"
+
+
+def _best(found: Sequence[tuple[_Misfit, Reading]]) -> list[tuple[_Misfit, Reading]]:
+    """Those that explain the map as well as any."""
+    least = min(misfit.standard for misfit, _ in found)
+    return [one for one in found if one[0].standard <= ALIKE * least]
+
+
+def _probe_points(instrument: Instrument, shown: Floats) -> Floats:
+    """Where the probe was, (n, 3) in m, at points (n, 3) of a map's file."""
+    read = along_axes(instrument.position_axes, shown) * instrument.length_unit_m
+    return np.asarray(probe_positions(instrument, read).mean(axis=1))
 
 
 def _observed(study: Study) -> tuple[Component, ...]:

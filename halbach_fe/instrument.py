@@ -89,11 +89,19 @@ def probe_positions(instrument: Instrument, points: Floats) -> Floats:
     """Where each sensor was, (n, 3, 3) in m: by point of the map, sensor, coordinate."""
     stretched = points * [1 + instrument.radius_scale, 1 + instrument.radius_scale,
                           1 + instrument.z_scale]
+    if instrument.radius_offset_m:
+        stretched += instrument.radius_offset_m * outward(points)
     z = points[:, 2]
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
     sensors = stretched[:, None] + np.array(instrument.sensor_position_m)
     return np.asarray(sensors @ turn_of(instrument.rotation_rad).T + instrument.translation_m)
+
+
+def outward(points: Floats) -> Floats:
+    """Unit vectors (n, 3) away from the axis at points (n, 3); along x on it."""
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(points))])
 
 
 def sensor_matrix(instrument: Instrument) -> Floats:

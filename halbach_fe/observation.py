@@ -18,7 +18,7 @@ from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import gradient_of
 from halbach_fe.inference.noise import Noise
-from halbach_fe.instrument import probe
+from halbach_fe.instrument import probe, probe_positions
 from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
 from halbach_fe.study import Noise as NoiseSettings
 
@@ -256,19 +256,20 @@ def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> N
             settings, observation.positions[:, 2], observation.components)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
-        moved = _displacement(study, observation, np.array(settings.position_sd_m))
+        moved = displacement(study, observation, np.array(settings.position_sd_m))
         covariance = covariance + moved @ moved.T
     return Noise(_without_rounding(sparse.csr_array(covariance)))
 
 
-def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+def displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
     """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
     (3,) in m along each axis.
 
     The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
     the bore some per cent of the field, is left out of this scale of the noise.
     """
-    gradient = gradient_of(blocks_of(study), observation.map_points) * sd
+    points = probe_positions(study.instrument, observation.map_points).mean(axis=1)
+    gradient = gradient_of(blocks_of(study), points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
         observation.analysis @ sparse.bsr_array((gradient, number[:-1], number)))
