@@ -17,9 +17,17 @@ from numpy.typing import NDArray
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import gradient_of
+from halbach_fe.field_map import points_of
 from halbach_fe.inference.noise import Noise
 from halbach_fe.instrument import probe, probe_positions
-from halbach_fe.study import COMPONENTS, FourierCoefficients, Positions, Study
+from halbach_fe.study import (
+    COMPONENTS,
+    CirclePositions,
+    FluxDensity,
+    FourierCoefficients,
+    Positions,
+    Study,
+)
 from halbach_fe.study import Noise as NoiseSettings
 
 RADIUS_M = 1e-4
@@ -83,13 +91,17 @@ class Observation:
         """Size of a field (n, 3) in T as every reading sees it, whatever its direction or phase:
         |B| at the point, or the amplitude of the harmonic.
         """
-        if self.analysis.nnz == len(self):  # one component at one point each
-            sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
-            norms = np.linalg.norm(field, axis=1)[::sensors]
-            return np.asarray(norms[self.analysis.indices // len(COMPONENTS)])
-        harmonics = int(self.labels[-1][1:])
-        parts = self.apply(field).reshape(-1, 2, harmonics)  # A_1 ... A_K, B_1 ... B_K of each
-        return np.asarray(np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel())
+        sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
+        single = np.diff(self.analysis.indptr) == 1  # one component at one point
+        point = self.analysis.indices[self.analysis.indptr[:-1]] // len(COMPONENTS)
+        result = np.linalg.norm(field, axis=1)[::sensors][point]
+        if not single.all():
+            harmonics = max(int(label[1:]) for label, one in zip(self.labels, single, strict=True)
+                            if not one)
+            # A_1 ... A_K, B_1 ... B_K of each circle
+            parts = self.apply(field)[~single].reshape(-1, 2, harmonics)
+            result[~single] = np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel()
+        return result
 
 
 def together(one: Observation, other: Observation) -> Observation:
@@ -148,6 +160,33 @@ def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observ
                        labels, positions)
 
 
+def _on_circles(points: Floats, positions: CirclePositions) -> NDArray[np.bool_]:
+    """Which points (n, 3) in m have which of the radii (n, radii)."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    return np.isclose(radius[:, None], positions.radius_m, rtol=1e-6)
+
+
+def predicted_as(study: Study, data: xr.Dataset) -> Study:
+    """The study as it observes another map, which is only predicted: itself, or if it observes
+    Fourier coefficients and the map has points on none of its circles, flux densities there.
+
+    Raises
+    ------
+    MeasurementError
+        If such a map does not say how noisy it is; the study's noise is that of the coefficients.
+    """
+    observed = study.observation
+    if observed.quantity == "flux_density" or _on_circles(
+            points_of(data), observed.positions).any():
+        return study
+    if "sigma_T" not in data:
+        raise MeasurementError(must_be(
+            "sigma_T", "map", "given, as the study's noise is that of Fourier coefficients and the "
+            "map has points on none of its circles", "nothing", "Add the column sigma_T."))
+    return study.model_copy(update={"observation": FluxDensity(
+        quantity="flux_density", positions=observed.positions)})
+
+
 def circles(
     points: Floats, settings: FourierCoefficients
 ) -> list[tuple[float, NDArray[np.int64]]]:
@@ -160,7 +199,7 @@ def circles(
         If the points are not circles of equally spaced points about the z axis.
     """
     radii = np.array(settings.positions.radius_m)
-    on_circle = np.isclose(np.hypot(points[:, 0], points[:, 1])[:, None], radii, rtol=1e-6)
+    on_circle = _on_circles(points, settings.positions)
     if not on_circle.any(axis=1).all():
         raise MeasurementError(must_be(
             "points", "map", f"on circles of radius {', '.join(f'{one:g}' for one in radii)} m, "

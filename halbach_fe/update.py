@@ -37,6 +37,7 @@ from halbach_fe.observation import (
     held_out,
     noise_regions,
     observe,
+    predicted_as,
     reading_noise,
     together,
 )
@@ -237,7 +238,7 @@ def infer(
     linearized_only : bool
         Do not solve the updated magnet to see whether linearizing its iron was good enough.
     unseen : Dataset, optional
-        Another map, which is only predicted.
+        Another map, which is only predicted; see `halbach_fe.observation.predicted_as`.
 
     Raises
     ------
@@ -251,7 +252,7 @@ def infer(
     if unseen is not None:
         try:
             other, its_noise, its_readings = _measured(
-                study, unseen, np.zeros((unseen.sizes["point"], 3), bool))
+                predicted_as(study, unseen), unseen, np.zeros((unseen.sizes["point"], 3), bool))
         except MeasurementError as error:
             raise MeasurementError(
                 str(error).replace(" of map must", " of held-out map must")) from None

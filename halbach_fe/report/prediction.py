@@ -71,12 +71,12 @@ class Line:
 
 def places(update: Update) -> tuple[Floats, str]:
     """Where all readings stand in a figure, and what that is: z, or in a plane the angle, or the
-    order of a Fourier coefficient.
+    order of Fourier coefficients if there is nothing else.
     """
     x, y, z = update.observation.positions.T
     if np.ptp(z) > 0:
         return z, "z in m"
-    if update.observation.components[0]:
+    if any(update.observation.components):
         return np.degrees(np.arctan2(y, x)) % 360, "angle in degrees"
     return np.array([float(label[1:]) for label in update.observation.labels]), "harmonic"
 

@@ -569,9 +569,10 @@ def test_effects_that_cannot_be_read(text):
 
 @pytest.mark.parametrize("text", [
     "ring_gap=2,1e-4", "block_missing=1,9", "block_missing=1.5,1", "block_missing=0,1",
-    "magnetization_gradient=3,0,0.1", "sign_flipped_axis=4"])
+    "magnetization_gradient=3,1,0.1", "magnetization_gradient=1,0,0.1",
+    "sign_flipped_axis=4"])
 def test_effects_on_blocks_that_are_not_there(text):
-    with pytest.raises(StudyError, match="whole number"):
+    with pytest.raises(StudyError, match=r"whole number|one of them 0"):
         simulate(parse_study(RINGS), 1, hide=[wanted(text)])
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.blocks import blocks_of
-from halbach_fe.campaign import extras
+from halbach_fe.campaign import extras, vacuum
 from halbach_fe.campaign.bodies import Part, magnet_of, vector
 from halbach_fe.campaign.reaction import Elements, dipole_field, reaction_field
 from halbach_fe.campaign.simulate import field_of as full_field
@@ -128,6 +128,31 @@ def test_parts_add_up(short_dipole, shape):
     np.testing.assert_allclose(vacuum_field([changed], POINTS), 0.7 * whole, atol=1e-9)
     other = replace(changed, parts=changed.parts[:3])
     assert np.abs(vacuum_field([other], POINTS) - 0.7 * whole).max() > 1e-5
+
+
+def test_points_in_the_planes_of_faces(short_dipole, shape):
+    """Exactly there, and beside it by less and less; the field is continuous in air."""
+    study = of_shape(short_dipole, shape)
+    bodies = magnet_of(study).bodies
+    side = np.pi / 16 if "angular_gap_deg" not in shape else np.pi / 16 - np.radians(0.5)
+    for off in (0.0, 1e-15, 1e-12, 3e-11, 1e-10, 1e-9, 1e-8):
+        points = np.array([[0.05, 0.02, 0.08 + off], [0.05, 0.02, off], [0.05, 0.02, -0.08 - off],
+                           [0.07 * np.cos(side + off), 0.07 * np.sin(side + off), 0.01]])
+        np.testing.assert_allclose(vacuum_field(bodies, points), field_of(blocks_of(study), points),
+                                   atol=3e-7)
+
+
+def test_bodies_that_see_the_same_share_the_work(short_dipole, shape):
+    """Circles of 16 points, where all 16 blocks of a ring see the same: the field point by point
+    is the same, for which nothing is shared.
+    """
+    bodies = magnet_of(of_shape(short_dipole, shape)).bodies
+    bodies = (replace(bodies[0], displacement=(1e-3, 0.0, 0.0)), *bodies[1:])
+    points = np.vstack([circle(0.07, 16, z) for z in (-0.04, 0.0, 0.04)])
+    shared = any(len(task.polarizations) == 3 for task in vacuum.tasks_of(bodies, points))
+    assert shared == (len({body.shape for body in bodies}) == 1)  # not of cuboids turned in place
+    alone = np.vstack([vacuum_field(bodies, point[None]) for point in points])
+    np.testing.assert_allclose(vacuum_field(bodies, points), alone, atol=1e-8)
 
 
 # --- what materials add ------------------------------------------------------------------------

@@ -353,7 +353,10 @@ def test_a_study_can_be_read_and_simulated(campaigns):
 
 def test_uncertain_positions_move_the_probe():
     """Two campaigns of one seed differ by the gradient times the displacements of one."""
-    study = parse_study(changed(DIPOLE, noise={"regions": [{"name": "all", "sigma_T": 1e-9}]}))
+    study = parse_study(changed(
+        DIPOLE, noise={"regions": [{"name": "all", "sigma_T": 1e-9}]},
+        array__recoil_permeability=1.0,
+        prior={"magnitude_sd": 1e-6, "direction_sd_deg": 1e-4}))  # the nominal gradient holds
     loose = study.model_copy(update={"noise": study.noise.model_copy(
         update={"position_sd_m": (1e-4, 1e-4, 1e-4)})})
     points = points_from(study.observation.positions)

@@ -18,6 +18,7 @@ from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import observe
 from halbach_fe.report.inference import write_report
 from halbach_fe.report.prediction import main_line
+from halbach_fe.response import response
 from halbach_fe.study import MU_0, Instrument, parse_study
 from halbach_fe.update import infer, write_update
 from tests.conftest import circle
@@ -155,6 +156,31 @@ def test_a_second_map_is_only_predicted(short_dipole, generator, workshop, tmp_p
         other[name].values[0] = value
     with pytest.raises(MeasurementError, match="reading 1 of held-out map must be at a point in"):
         infer(apart, data, workshop, unseen=other)
+
+
+def test_the_axis_from_fourier_coefficients(short_dipole, generator, workshop):
+    """What the paper did: B on the axis, with noise of its own, by a model updated with circles."""
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    coefficients = short_dipole(
+        array__recoil_permeability=1.0, noise=NOISE, prior=study.prior.model_dump(),
+        observation={"quantity": "fourier_coefficients", "harmonics": 6, "positions": {
+            "kind": "circles", "radius_m": 0.08, "angles": 16}})
+    z = np.linspace(-0.15, 0.15, 21)
+    points = np.column_stack([0 * z, 0 * z, z])
+    everything = infer(study, data, workshop)  # by all three components, ten times as sure
+    field = observe(study, points, np.ones_like(points, bool))
+    matrix = response(study, field, workshop).matrix
+    truth = (matrix @ everything.posterior.mean).reshape(-1, 3)
+    axis = field_map(points, truth + 1e-5 * generator.standard_normal(truth.shape))
+    with pytest.raises(MeasurementError, match="sigma_T of held-out map must be given"):
+        infer(coefficients, data, workshop, unseen=axis)
+    axis["sigma_T"] = (("point", "component"), np.full(truth.shape, 1e-5))
+    update = infer(coefficients, data, workshop, unseen=axis)
+    _, unseen = update.scores
+    assert (unseen.part, unseen.readings) == ("held-out map", 63)
+    assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.75)  # sd 0.18
+    assert unseen.median_relative_error_posterior < 0.3 * unseen.median_relative_error_prior
+    write_report(update, workshop.folder)
 
 
 def test_held_out_components_whose_points_were_seen(short_dipole, generator, workshop):

@@ -269,6 +269,11 @@ def test_two_maps_together(dipole, generator):
                                np.concatenate([one.apply(field) for field in fields]))
     np.testing.assert_allclose(both.magnitude(np.vstack(fields)),
                                np.concatenate([one.magnitude(field) for field in fields]))
+    points_too = observe(dipole(), points, np.ones((24, 3), bool))
+    mixed = together(one, points_too)
+    np.testing.assert_allclose(mixed.magnitude(np.vstack(fields)), np.concatenate(
+        [one.magnitude(fields[0]), np.repeat(np.linalg.norm(fields[1], axis=1), 3)]))
+    assert mixed.components[len(one):] == ("x", "y", "z") * 24
 
 
 def test_positions_expand(dipole):

@@ -94,6 +94,9 @@ def _check_place(site: Site, hidden: Hidden) -> None:
     least = 0 if hidden.effect.name == "magnetization_gradient" else 1
     limits = {"ring": site.rings, "slot": site.slots, "other_ring": site.rings,
               "other_slot": site.slots, "seam": site.rings - 1, "axis": 3, "first": 3, "second": 3}
+    if least == 0 and (hidden.values[0] == 0) != (hidden.values[1] == 0):
+        raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
+                                 "those of a block, or both 0 for all", "one of them 0"))
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
         most = limits.get(parameter.name)
         if most is not None and (value != int(value) or not least <= value <= most):
