@@ -1,9 +1,11 @@
 """From a disagreement to its name: which effects a study lacks, and the study that has them.
 
-Effects are searched with their signatures, linear and cheap; those found go into the study in full
-and are solved for again, which moves the point of linearization, until nothing changes: a
+First what spoils all else is put right: a map that was misread, and single readings that are off.
+Then effects are searched with their signatures, linear and cheap; those found go into the study in
+full and are solved for again, which moves the point of linearization, until nothing changes: a
 Gauss-Newton method whose model is the real one. In every round all effects compete anew, the found
-ones with their signatures at that point.
+ones with their signatures at that point. Positions that shake are noise, with which all is judged
+once more.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats
 from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.gross import Gross, find_gross
+from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
 from halbach_fe.diagnosis.selection import (
     ALIKE,
@@ -33,16 +37,17 @@ from halbach_fe.diagnosis.selection import (
     select,
     with_candidates,
 )
+from halbach_fe.diagnosis.vibration import Vibration, settled, shaking, vibration_of
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Place
-from halbach_fe.instrument import map_time
+from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
 from halbach_fe.update import Update, infer
 
-MOST_ROUNDS = 6
+MOST_ROUNDS = 8
 SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
@@ -131,8 +136,10 @@ class Diagnosis:
 
     Attributes
     ----------
+    read : Study
+        The study that reads the map right, without outliers; all else is compared with it.
     before, after : Update
-        The inference with the study as it was, and with the effects that were named.
+        The inference with that study, and with the effects that were named.
     named : tuple of Named
     unknown : Unknown or None
         What they leave unexplained, if anything.
@@ -145,8 +152,15 @@ class Diagnosis:
     left_out_before, left_out_after : ndarray, shape (n,)
         Standardized residuals of the training readings.
     rounds : int
+    gross : tuple of Gross
+        How the map was misread.
+    outliers : tuple of Outlier
+        Readings that are off singly.
+    vibration : Vibration or None
+        Of the probe, if the readings show it.
     """
 
+    read: Study
     before: Update
     after: Update
     named: tuple[Named, ...]
@@ -158,11 +172,19 @@ class Diagnosis:
     left_out_before: Floats
     left_out_after: Floats
     rounds: int
+    gross: tuple[Gross, ...] = ()
+    outliers: tuple[Outlier, ...] = ()
+    vibration: Vibration | None = None
 
     @property
     def study(self) -> Study:
         """The study with what was missing."""
         return self.after.study
+
+    @property
+    def anything(self) -> bool:
+        """Whether anything was named: an error, outliers, an effect, or vibration."""
+        return bool(self.gross or self.outliers or self.named or self.vibration)
 
 
 def diagnose(
@@ -180,18 +202,37 @@ def diagnose(
         Another map, which is only predicted.
     """
     effects = catalogue() if effects is None else effects
-    named: tuple[Named, ...] = ()
+    gross, read, start = _read_right(study, data, blocks, effects)
+    for one in gross:
+        say(f"gross error: {one.reading.text}")
     signatures: Signatures = {}
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
+    named, vibration = start, None
+    outliers: tuple[Outlier, ...] = ()
+
+    def updated(name: str) -> Update:
+        return infer(shaking(applied(read, named), vibration), data, _room(workshop, name), blocks,
+                     unseen=unseen)
+
     for number in range(MOST_ROUNDS):
         say(f"round {number + 1}: the model with "
             f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
-        now = applied(study, named)
-        update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks,
-                       unseen=unseen)
-        search = look(study, update, times, workshop, effects, named, signatures)
+        update = updated(f"round-{number + 1}")
+        if number == 0:
+            outliers = outliers_of(update)
+        if number == 0 and outliers:
+            say(f"{len(outliers)} readings are off singly; without them")
+            read = excluding(read, outliers)
+            update = updated("without-outliers")
+        search = look(applied(read, start), update, times, workshop, effects, named, signatures)
         first = first or (update, search)
+        shaken = vibration_of(update, search.marginal, search.columns, search.training, vibration)
+        if not settled(vibration, shaken):
+            say(f"positions that shake by {1e3 * shaken.sd_m if shaken else 0:.2g} mm")
+            vibration = shaken
+            signatures.clear()  # whitened by the noise that it was
+            continue
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
             break
@@ -199,15 +240,36 @@ def diagnose(
     assert first is not None
     rest = unknown(search, update, named)
     if rest is not None and rest.alone:
-        named, (update, search) = (), first
+        named, vibration, (update, search) = start, None, first
     return Diagnosis(
-        before=first[0], after=update, named=named, unknown=rest,
+        read=read, before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         best_factors=best_factors(first[1].evidence, first[1].candidates),
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),
-        left_out_after=left_out(search.marginal, search.training), rounds=number + 1)
+        left_out_after=left_out(search.marginal, search.training), rounds=number + 1,
+        gross=gross, outliers=outliers, vibration=vibration)
+
+
+def _read_right(
+    study: Study, data: xr.Dataset, blocks: BlockTable | None, effects: Sequence[Effect]
+) -> tuple[tuple[Gross, ...], Study, tuple[Named, ...]]:
+    """Gross errors and the study that reads the map right; of points that were elsewhere by what an
+    effect of the catalogue can be, that effect, with which a search is to start.
+    """
+    found = find_gross(study, data, blocks)
+    known = {effect.name: effect for effect in effects}
+    start: tuple[Named, ...] = ()
+    if found and found[-1].start and found[-1].start.keys() <= known.keys():
+        start = tuple(
+            Named(Hypothesis(known[name], Place()), np.array(values), np.zeros(len(values)),
+                  Found(Candidate(name, "", ()), 0.0, 0.0, ()))
+            for name, values in found[-1].start.items())
+        found = found[:-1]
+    for one in found:
+        study = one.apply(study)
+    return found, study, start
 
 
 def applied(study: Study, named: Sequence[Named]) -> Study:
@@ -256,7 +318,7 @@ def look(
             key = effect.name, place
             present = there.get(key)
             if present is not None and not effect.discrete:
-                signatures.pop(key)
+                signatures.pop(key, None)
             if key not in signatures:
                 seen = effect.signature(bare if present is None else scene, place)
                 signatures[key] = whitened(update.observation.read(seen))
@@ -277,7 +339,8 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
     """Judge what named effects leave: a smooth field, or a smooth error of the sensors."""
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.part(rows), update.observation
-    points, scale = observation.map_points, float(np.median(update.errors.sd))
+    points = probe_points(update.study.instrument, observation.map_points)
+    scale = float(np.median(update.errors.sd))
     mine = [one.found.candidate for one in named]
     held = [column for one in mine for column in one.columns]
     own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
@@ -316,7 +379,7 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
 
 
 def _scene_of(study: Study, update: Update, times: Floats, workshop: Workshop) -> Scene:
-    points = update.observation.map_points
+    points = probe_points(study.instrument, update.observation.map_points)
     return Scene(study, points, times,
                  lambda other: solve_nominal(other, points, _room(workshop, "signatures")))
 
@@ -345,10 +408,12 @@ def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
 
 def _settled(old: Sequence[Named], new: Sequence[Named]) -> bool:
     """Tell whether a round changed nothing."""
-    if [one.found.candidate for one in old] != [one.found.candidate for one in new]:
+    before = {one.found.candidate: one for one in old}
+    if before.keys() != {one.found.candidate for one in new}:
         return False
-    return all((np.abs(one.values - other.values) <= SETTLED * other.sd).all()
-               or one.hypothesis.effect.discrete for one, other in zip(old, new, strict=True))
+    return all(one.hypothesis.effect.discrete or (
+        np.abs(one.values - before[one.found.candidate].values) <= SETTLED * one.sd).all()
+        for one in new)
 
 
 def _groups(update: Update, marginal: Marginal, residual: Floats) -> list[Group]:

@@ -98,6 +98,11 @@ def probe_positions(instrument: Instrument, points: Floats) -> Floats:
     return np.asarray(sensors @ turn_of(instrument.rotation_rad).T + instrument.translation_m)
 
 
+def probe_points(instrument: Instrument, points: Floats) -> Floats:
+    """Where the middle of the sensors was, (n, 3) in m, at points (n, 3) of a map."""
+    return np.asarray(probe_positions(instrument, points).mean(axis=1))
+
+
 def outward(points: Floats) -> Floats:
     """Unit vectors (n, 3) away from the axis at points (n, 3); along x on it."""
     angle = np.arctan2(points[:, 1], points[:, 0])

@@ -19,7 +19,7 @@ from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import gradient_of
 from halbach_fe.field_map import points_of
 from halbach_fe.inference.noise import Noise
-from halbach_fe.instrument import probe, probe_positions
+from halbach_fe.instrument import probe, probe_points
 from halbach_fe.study import (
     COMPONENTS,
     CirclePositions,
@@ -307,7 +307,7 @@ def displacement(study: Study, observation: Observation, sd: Floats) -> sparse.c
     The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
     the bore some per cent of the field, is left out of this scale of the noise.
     """
-    points = probe_positions(study.instrument, observation.map_points).mean(axis=1)
+    points = probe_points(study.instrument, observation.map_points)
     gradient = gradient_of(blocks_of(study), points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(

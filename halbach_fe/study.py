@@ -308,8 +308,8 @@ class Instrument(_Model):
     The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
     by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), stretches z by
     ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m`` at the far end (largest z of
-    the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a rotation vector) about the origin and moves by
-    ``translation_m``.
+    the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a
+    rotation vector) about the origin and moves by ``translation_m``.
     The sensor of component i is ``sensor_position_m[i]`` from there. With B' the field in the
     turned axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2

@@ -20,19 +20,21 @@ from scipy.spatial import KDTree
 from halbach_fe.blocks import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.inference.noise import Noise
+from halbach_fe.study import COMPONENTS, Component, ExcludedReading, Study
+from halbach_fe.update import HELD_OUT_MAP, Update
 
 NEIGHBOURS = 24
 """Of the same component; a polynomial of second order has ten coefficients."""
 
 LOCAL = 9.0
-"""Times the local scale. That is a median of some 24 numbers: of noise whose level is not known, one
-reading in 10^5 is beyond."""
+"""Times the local scale. That is a median of some 24 numbers: of noise whose level is not known,
+one reading in 10^5 is beyond."""
 
 ODDS = 1e-3
 """Prior odds of any reading being off."""
 
 RANGE = 0.1
-"""Of the largest reading: an outlier may be off by this much either way, anything equally likely."""
+"""Of the largest reading: an outlier may be off by this much either way, all equally likely."""
 
 FOUND = 5.0
 """Log posterior odds from which a reading is one: beyond some six standard deviations."""
@@ -45,6 +47,63 @@ PASSES = 6
 
 MOST = 0.1
 """Fraction of the readings that may be off: if it is more, they are no outliers."""
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A reading that is off.
+
+    Attributes
+    ----------
+    row : int
+        Of the map, from 1.
+    component : str
+    at_m : tuple of float
+        Where the map says that it is.
+    off_T, sd_T : float
+        Difference from what all readings that are not off foretell, and its standard deviation.
+    """
+
+    row: int
+    component: Component
+    at_m: tuple[float, ...]
+    off_T: float
+    sd_T: float
+
+
+def outliers_of(update: Update) -> tuple[Outlier, ...]:
+    """Find readings of a map that are off; none among Fourier coefficients, each of which is made
+    of many.
+    """
+    observation = update.observation
+    if (np.diff(observation.analysis.indptr) != 1).any():
+        return ()
+    own = np.array(update.parts) != HELD_OUT_MAP
+    root = update.response.matrix[own] @ update.prior.root
+    residual = (update.readings - update.prediction_prior.mean)[own]
+    noise, training = update.errors.part(own), ~update.held_out[own]
+    labels = [label for label, mine in zip(observation.labels, own, strict=True) if mine]
+    off = find_outliers(root, residual, noise, training, labels, observation.positions[own],
+                        float(np.abs(update.readings[own]).max()))
+    if not off.any():
+        return ()
+    now = foretold(root, residual, noise, training & ~off)
+    point, component = np.divmod(observation.analysis.indices[own], len(COMPONENTS))
+    return tuple(
+        Outlier(int(point[k]) + 1, COMPONENTS[component[k]],
+                tuple(observation.positions[own][k].tolist()), float(now.difference[k]),
+                float(now.sd[k])) for k in np.flatnonzero(off))
+
+
+def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
+    """The study that leaves outliers out."""
+    rows: dict[int, list[Component]] = {}
+    for one in outliers:
+        rows.setdefault(one.row, []).append(one.component)
+    inference = study.inference.model_copy(update={"excluded_readings": (
+        *study.inference.excluded_readings,
+        *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items()))})
+    return study.model_copy(update={"inference": inference})
 
 
 @dataclass(frozen=True)

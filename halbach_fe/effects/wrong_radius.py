@@ -17,7 +17,7 @@ class WrongRadius(InstrumentEffect):
 
     name = "wrong_radius"
     title = "wrong radius of the measurement"
-    parameters = (Parameter("offset", "m", 5e-3),)
+    parameters = (Parameter("offset", "m", 1e-2),)
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""

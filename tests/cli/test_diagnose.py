@@ -267,7 +267,8 @@ def test_the_readme_says_what_is_in_the_file():
         study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
         relative_error=lambda _: np.zeros(1), prediction_posterior=None)
     nothing = SimpleNamespace(
-        before=update, after=update, named=(), unknown=None, probabilities={}, groups_before=[],
+        before=update, after=update, gross=(), outliers=(), named=(), vibration=None,
+        unknown=None, anything=False, probabilities={}, groups_before=[],
         groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1)
     assert keys == list(summary(nothing))
     rows = [line.split("|") for line in section.splitlines()

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from halbach_fe.blocks import blocks_of
+from halbach_fe.diagnosis.gross import find_gross
 from halbach_fe.effects import catalogue
 from halbach_fe.exact_field import field_of
-from halbach_fe.blocks import blocks_of
 from halbach_fe.external import external_field
 from halbach_fe.field_map import field_map, points_of
-from halbach_fe.gross import find_gross
 from halbach_fe.instrument import as_read, probe, remainder
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured, with_array
+
+NONE = np.eye(3)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +22,7 @@ def right():
     return measured(STUDY, np.random.default_rng(7))
 
 
-def written(data, positions=np.eye(3), fields=np.eye(3)):
+def written(data, positions=NONE, fields=NONE):
     """A map whose columns are those of the right one times matrices."""
     return field_map(points_of(data) @ np.transpose(positions),
                      data["B_T"].values @ np.transpose(fields))
@@ -40,7 +42,6 @@ def about_z(degrees):
                      [0, 0, 1]])
 
 
-NONE = np.eye(3)
 WRITTEN = {
     "millimetres": (1e3 * NONE, NONE), "centimetres": (100 * NONE, NONE),
     "millitesla": (NONE, 1e3 * NONE), "gauss": (NONE, 1e4 * NONE),
@@ -134,19 +135,23 @@ def test_a_line_with_one_component(generator):
         name for one in found.alternatives for name in one.names}
 
 
-def test_clean_maps(generator):
-    for sd in (0.01, 0.02):
-        data = measured(STUDY, generator)
-        assert find_gross(STUDY, data) == ()
+def test_a_clean_map(right):
+    assert find_gross(STUDY, right) == ()
 
 
 SOLVED = {"iron_ring", "recoil_permeability", "recoil_permeability_across"}
+GROSS = {"wrong_line", "wrong_radius"}
+"""Where the catalogue and the gross errors meet; smaller ones are the former's."""
 
 
-@pytest.mark.parametrize("effect", [one for one in catalogue() if one.name not in SOLVED],
+@pytest.mark.parametrize("effect", [
+    one for one in catalogue() if one.name not in SOLVED | GROSS and one.name[-2:] not in (
+        "_y", "_z")],
                          ids=lambda one: one.name)
 def test_effects_of_usual_size_are_no_gross_errors(effect, right, generator):
-    """Negative control: three standard deviations of anything in the catalogue."""
+    """Negative control: three standard deviations of anything in the catalogue; of sensors that
+    differ by their component one.
+    """
     places = effect.places(STUDY)
     place = places[int(generator.integers(len(places)))]
     values = [(1 if effect.certain else 3) * one.sd for one in effect.parameters]
