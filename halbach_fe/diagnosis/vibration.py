@@ -8,7 +8,9 @@ everywhere must be the worse explanation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sparse
@@ -29,8 +31,8 @@ from halbach_fe.update import Update
 AMPLITUDES_M = np.geomspace(2e-5, 5e-4, 8)
 """Standard deviations of a position that are tried, equally likely."""
 
-FACTORS = np.geomspace(1, 30, 40)
-"""Of the noise, where it is larger everywhere."""
+LARGEST = 30.0
+"""Factor of the noise, where it is larger everywhere."""
 
 SMOOTH = 30.0
 """Size of smooth terms, over the noise of a reading: they may explain anything smooth."""
@@ -38,7 +40,7 @@ SMOOTH = 30.0
 ROOM = 3.0
 """What amplitudes of effects may be, over their usual size: they may explain what they can."""
 
-MOST_READINGS = 4000
+MOST_READINGS = 3000
 """That are compared; of more, some at random."""
 
 SUSPICIOUS = 2.0
@@ -55,7 +57,8 @@ class Vibration:
     Attributes
     ----------
     log_bayes_factor : float
-        Averaged over the amplitude; over noise that is larger everywhere, by the best factor.
+        Averaged over the amplitude; over noise without, or larger everywhere by the best factor,
+        whichever is better.
     sd_m : float
         The likeliest standard deviation of a position, along each axis.
     """
@@ -90,7 +93,7 @@ def vibration_of(
     moved = noise.whitening @ displacement(update.study, observation, np.ones(3))[training]
     scale, smooth = SMOOTH * float(np.median(noise.sd)), []
     points = probe_points(update.study.instrument, observation.map_points)
-    for terms in (harmonic_fields(points), sensor_errors(points)):
+    for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):
         readings = scale * observation.read(terms.fields)[:, training].T
         smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAYS[0])))
     anything = np.hstack([marginal.whitened, ROOM * columns, *smooth])
@@ -135,31 +138,28 @@ def judge_vibration(
     """
     moved = sparse.csr_array(displacement @ displacement.T)
 
-    def log_evidence(sd: float) -> float:
-        total = Noise(sparse.csr_array(
-            sparse.eye_array(len(residual)) + (sd**2 - present**2) * moved))
+    def log_evidence(sd: float, factor: float = 1.0) -> float:
+        total = Noise(sparse.csr_array(factor**2 * (
+            sparse.eye_array(len(residual)) + (sd**2 - present**2) * moved)))
         marginal = Marginal.of(total.whiten(root))
         white = total.whiten(residual)
         chi2 = float(white @ marginal.remove(white[:, None])[:, 0])
         return -chi2 / 2 - total.log_size - float(np.log(np.diag(marginal.factor[0])).sum())
 
-    def larger() -> float:
-        """Of noise without vibration that is larger everywhere."""
-        total = Noise(sparse.csr_array(sparse.eye_array(len(residual)) - present**2 * moved))
-        white, blocks = total.whiten(residual), total.whiten(root)
-        values, vectors = np.linalg.eigh(blocks.T @ blocks)
-        values, score = np.maximum(values, 0), (vectors.T @ (blocks.T @ white)) ** 2
-        return max(
-            -(white @ white - np.sum(score / (factor**2 + values))) / factor**2 / 2
-            - total.log_size - len(white) * np.log(factor)
-            - np.log1p(values / factor**2).sum() / 2 for factor in FACTORS)
+    def best(of: Callable[[float], float], low: float, high: float) -> float:
+        """Where a log evidence is largest, of positive numbers."""
+        found = minimize_scalar(lambda one: -of(float(np.exp(one))), method="bounded",
+                                bounds=(np.log(low), np.log(high)), options={"xatol": 1e-2})
+        return float(np.exp(found.x))
 
     found = np.array([log_evidence(sd) for sd in AMPLITUDES_M])
-    factor = float(special.logsumexp(found) - np.log(len(found)) - larger())
+    mean = float(special.logsumexp(found) - np.log(len(found)))
+    factor = mean - log_evidence(0.0)
+    if factor > FOUND:
+        larger = best(partial(log_evidence, 0.0), 1.0, LARGEST)
+        factor = min(factor, mean - log_evidence(0.0, larger))
     if factor < FOUND:
         return Vibration(factor, 0.0)
-    best = int(np.argmax(found))
-    near = np.log(AMPLITUDES_M[[max(best - 1, 0), min(best + 1, len(found) - 1)]])
-    likeliest = minimize_scalar(lambda one: -log_evidence(np.exp(one)), bounds=tuple(near),
-                                method="bounded", options={"xatol": 1e-2})
-    return Vibration(factor, float(np.exp(likeliest.x)))
+    top = int(np.argmax(found))
+    near = AMPLITUDES_M[[max(top - 1, 0), min(top + 1, len(found) - 1)]]
+    return Vibration(factor, best(log_evidence, *near.tolist()))
