@@ -205,6 +205,9 @@ def diagnose(
     gross, read, start = _read_right(study, data, blocks, effects)
     for one in gross:
         say(f"gross error: {one.reading.text}")
+    if blocks is not None and read.array.rings != study.array.rings:
+        nowhere = np.zeros_like(blocks.ring)  # which ring is which is not known then
+        blocks = replace(blocks, ring=nowhere, slot=nowhere)
     signatures: Signatures = {}
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
@@ -222,14 +225,14 @@ def diagnose(
         if number == 0:
             outliers = outliers_of(update)
         if number == 0 and outliers:
-            say(f"{len(outliers)} readings are off singly; without them")
+            say(f"outliers: {len(outliers)}; without them")
             read = excluding(read, outliers)
             update = updated("without-outliers")
         search = look(applied(read, start), update, times, workshop, effects, named, signatures)
         first = first or (update, search)
         shaken = vibration_of(update, search.marginal, search.columns, search.training, vibration)
         if not settled(vibration, shaken):
-            say(f"positions that shake by {1e3 * shaken.sd_m if shaken else 0:.2g} mm")
+            say(f"vibration: {1e3 * shaken.sd_m if shaken else 0:.2g} mm; with it in the noise")
             vibration = shaken
             signatures.clear()  # whitened by the noise that it was
             continue

@@ -117,7 +117,7 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
         study = error.apply(study)
         yield study, f"gross error: {error.reading.text}"
     study = diagnosis.read
-    yield study, f"outliers: {len(diagnosis.outliers)} readings" if diagnosis.outliers else ""
+    yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
     for one in diagnosis.named:
         hypothesis = one.hypothesis
         study = hypothesis.effect.apply(study, hypothesis.place, one.values.tolist())
@@ -209,17 +209,18 @@ def others(diagnosis: Diagnosis) -> list[Other]:
         found.append(Other(
             " and ".join(one.names), one.reading.text, "gross error",
             f"misfit {100 * one.misfit_before:.3g} % → {100 * one.misfit_after:.2g} %",
-            f"The map was misread: {one.reading.text}.",
+            f"Gross error: {one.reading.text}.",
             instead=", ".join(dict.fromkeys(instead)) or NOTHING))
     if diagnosis.outliers:
         rows = sorted({one.row for one in diagnosis.outliers})
-        text = ", ".join(map(str, rows[:MOST_ROWS])) + ", ..." * (len(rows) > MOST_ROWS)
+        text = f"row{'s' if len(rows) > 1 else ''} " + ", ".join(
+            map(str, rows[:MOST_ROWS])) + ", ..." * (len(rows) > MOST_ROWS)
         count = len(diagnosis.outliers)
         found.append(Other(
             "outliers", "readings that are off singly", "readings",
             f"{count} of {count + len(diagnosis.before.parts)}",
             f"{count} {'readings are' if count > 1 else 'reading is'} off singly and left out "
-            f"({'rows' if len(rows) > 1 else 'row'} {text} of the map).", place=f"rows {text}"))
+            f"({text} of the map).", place=text))
     if diagnosis.vibration:
         size = f"{1e3 * diagnosis.vibration.sd_m:.2g} mm"
         found.append(Other(

@@ -91,6 +91,8 @@ def probe_positions(instrument: Instrument, points: Floats) -> Floats:
                           1 + instrument.z_scale]
     if instrument.radius_offset_m:
         stretched += instrument.radius_offset_m * outward(points)
+    if any(instrument.eccentricity_m):
+        stretched += np.tensordot(instrument.eccentricity_m, run_out(points), 1)
     z = points[:, 2]
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
@@ -107,6 +109,14 @@ def outward(points: Floats) -> Floats:
     """Unit vectors (n, 3) away from the axis at points (n, 3); along x on it."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(points))])
+
+
+def run_out(points: Floats) -> Floats:
+    """Displacements (2, n, 3) of points (n, 3) on circles per unit of eccentricity along x and y:
+    farther out by the cosine or sine of the angle, which is right; none on the axis.
+    """
+    away = outward(points) * (np.hypot(points[:, 0], points[:, 1]) > 0)[:, None]
+    return np.stack([away[:, [0]] * away, away[:, [1]] * away])
 
 
 def sensor_matrix(instrument: Instrument) -> Floats:

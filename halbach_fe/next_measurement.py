@@ -59,7 +59,7 @@ NMR_LEAST_T = 0.04
 """Below that the usual probes see nothing."""
 
 MAPPER_KEYS = {"translation_m", "rotation_rad", "z_scale", "radius_scale", "radius_offset_m",
-               "arm_sag_m"}
+               "eccentricity_m", "arm_sag_m"}
 """Of the instrument, what belongs to the mapper and stays when its probe is turned; the rest
 belongs to the probe."""
 

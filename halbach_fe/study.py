@@ -306,7 +306,8 @@ class Instrument(_Model):
     ``field_axes = ["y", "-x", "z"]`` the column of Bx holds By, and that of By -Bx.
 
     The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
-    by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), stretches z by
+    by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), and off the axis
+    at the angle phi ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi``, stretches z by
     ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m`` at the far end (largest z of
     the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a
     rotation vector) about the origin and moves by ``translation_m``.
@@ -327,6 +328,7 @@ class Instrument(_Model):
     z_scale: Fraction = 0.0
     radius_scale: RadiusScale = 0.0
     radius_offset_m: Offset = 0.0
+    eccentricity_m: tuple[Offset, Offset] = (0.0, 0.0)
     arm_sag_m: Offset = 0.0
     sensor_position_m: tuple[Displacement, Displacement, Displacement] = (
         (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
