@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(summary(found, next_ones))
         return 0
     common.say(" ".join(verdict(found)))
-    if found.named:
+    if found.anything:
         common.print_table(found_table(found), "What the study lacks")
     common.print_table(change_table(found), "The model before and after")
     common.say(f"Report: {arguments.output / 'diagnosis.html'}")

@@ -1,9 +1,11 @@
 """From a disagreement to its name: which effects a study lacks, and the study that has them.
 
-Effects are searched with their signatures, linear and cheap; those found go into the study in full
-and are solved for again, which moves the point of linearization, until nothing changes: a
+First what spoils all else is put right: a map that was misread, and single readings that are off.
+Then effects are searched with their signatures, linear and cheap; those found go into the study in
+full and are solved for again, which moves the point of linearization, until nothing changes: a
 Gauss-Newton method whose model is the real one. In every round all effects compete anew, the found
-ones with their signatures at that point.
+ones with their signatures at that point. Positions that shake are noise, with which all is judged
+once more.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats
 from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.gross import Gross, find_gross
+from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
 from halbach_fe.diagnosis.selection import (
     ALIKE,
@@ -33,16 +37,17 @@ from halbach_fe.diagnosis.selection import (
     select,
     with_candidates,
 )
+from halbach_fe.diagnosis.vibration import Vibration, settled, shaking, vibration_of
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Parameter, Place
-from halbach_fe.instrument import map_time
+from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
 from halbach_fe.update import Update, infer
 
-MOST_ROUNDS = 6
+MOST_ROUNDS = 8
 SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
@@ -139,8 +144,10 @@ class Diagnosis:
 
     Attributes
     ----------
+    read : Study
+        The study that reads the map right, without outliers; all else is compared with it.
     before, after : Update
-        The inference with the study as it was, and with the effects that were named.
+        The inference with that study, and with the effects that were named.
     named : tuple of Named
     unknown : Unknown or None
         What they leave unexplained, if anything.
@@ -153,8 +160,15 @@ class Diagnosis:
     left_out_before, left_out_after : ndarray, shape (n,)
         Standardized residuals of the training readings.
     rounds : int
+    gross : tuple of Gross
+        How the map was misread.
+    outliers : tuple of Outlier
+        Readings that are off singly.
+    vibration : Vibration or None
+        Of the probe, if the readings show it.
     """
 
+    read: Study
     before: Update
     after: Update
     named: tuple[Named, ...]
@@ -166,11 +180,19 @@ class Diagnosis:
     left_out_before: Floats
     left_out_after: Floats
     rounds: int
+    gross: tuple[Gross, ...] = ()
+    outliers: tuple[Outlier, ...] = ()
+    vibration: Vibration | None = None
 
     @property
     def study(self) -> Study:
         """The study with what was missing."""
         return self.after.study
+
+    @property
+    def anything(self) -> bool:
+        """Whether anything was named: an error, outliers, an effect, or vibration."""
+        return bool(self.gross or self.outliers or self.named or self.vibration)
 
 
 def diagnose(
@@ -190,19 +212,41 @@ def diagnose(
         Of nominal magnets, see `remembering`; default one of its own.
     """
     effects = catalogue() if effects is None else effects
-    named: tuple[Named, ...] = ()
+    gross, read, start = _read_right(study, data, blocks, effects)
+    for one in gross:
+        say(f"gross error: {one.reading.text}")
+    if blocks is not None and read.array.rings != study.array.rings:
+        nowhere = np.zeros_like(blocks.ring)  # which ring is which is not known then
+        blocks = replace(blocks, ring=nowhere, slot=nowhere)
     signatures: Signatures = {}
     solver = solver or remembering(_room(workshop, "signatures"))
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
+    named, vibration = start, None
+    outliers: tuple[Outlier, ...] = ()
+
+    def updated(name: str) -> Update:
+        return infer(shaking(applied(read, named), vibration), data, _room(workshop, name), blocks,
+                     unseen=unseen)
+
     for number in range(MOST_ROUNDS):
         say(f"round {number + 1}: the model with "
             f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
-        now = applied(study, named)
-        update = infer(now, data, _room(workshop, f"round-{number + 1}"), blocks,
-                       unseen=unseen)
-        search = look(study, update, times, solver, effects, named, signatures)
+        update = updated(f"round-{number + 1}")
+        if number == 0:
+            outliers = outliers_of(update)
+        if number == 0 and outliers:
+            say(f"outliers: {len(outliers)}; without them")
+            read = excluding(read, outliers)
+            update = updated("without-outliers")
+        search = look(read, start, update, times, solver, effects, named, signatures)
         first = first or (update, search)
+        shaken = vibration_of(update, search.marginal, search.columns, search.training, vibration)
+        if not settled(vibration, shaken):
+            say(f"vibration: {1e3 * shaken.sd_m if shaken else 0:.2g} mm; with it in the noise")
+            vibration = shaken
+            signatures.clear()  # whitened by the noise that it was
+            continue
         found = _amplitudes(search, select(search.evidence, search.candidates))
         if _settled(named, found):
             break
@@ -210,15 +254,36 @@ def diagnose(
     assert first is not None
     rest = unknown(search, update, named)
     if rest is not None and rest.alone:
-        named, (update, search) = (), first
+        named, vibration, (update, search) = start, None, first
     return Diagnosis(
-        before=first[0], after=update, named=named, unknown=rest,
+        read=read, before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         best_factors=best_factors(first[1].evidence, first[1].candidates),
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),
-        left_out_after=left_out(search.marginal, search.training), rounds=number + 1)
+        left_out_after=left_out(search.marginal, search.training), rounds=number + 1,
+        gross=gross, outliers=outliers, vibration=vibration)
+
+
+def _read_right(
+    study: Study, data: xr.Dataset, blocks: BlockTable | None, effects: Sequence[Effect]
+) -> tuple[tuple[Gross, ...], Study, tuple[Named, ...]]:
+    """Gross errors and the study that reads the map right; of points that were elsewhere by what an
+    effect of the catalogue can be, that effect, with which a search is to start.
+    """
+    found = find_gross(study, data, blocks)
+    known = {effect.name: effect for effect in effects}
+    start: tuple[Named, ...] = ()
+    if found and found[-1].start and found[-1].start.keys() <= known.keys():
+        start = tuple(
+            Named(Hypothesis(known[name], Place()), np.array(values), np.zeros(len(values)),
+                  Found(Candidate(name, "", ()), 0.0, 0.0, ()))
+            for name, values in found[-1].start.items())
+        found = found[:-1]
+    for one in found:
+        study = one.apply(study)
+    return found, study, start
 
 
 def applied(study: Study, named: Sequence[Named]) -> Study:
@@ -229,13 +294,14 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 
 def look(
-    study: Study, update: Update, times: Floats, solver: Solver,
+    read: Study, start: Sequence[Named], update: Update, times: Floats, solver: Solver,
     effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
 
-    The residual is that of the study without them: what they do is added back, by their signatures
-    at this point. Other effects keep the ``signatures`` that they had first.
+    The residual is that of the study ``read`` without them: what they do is added back, by their
+    signatures at this point. Other effects keep the ``signatures`` that they had first, with those
+    in the model with which the search ``start``s.
     """
     rows = np.flatnonzero(~update.held_out)
     noise = update.errors.part(rows)
@@ -249,6 +315,7 @@ def look(
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
+    study = applied(read, start)
     scene, bare = (_scene_of(one, update, times, solver) for one in (update.study, study))
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     hypotheses: list[Hypothesis] = []
@@ -273,7 +340,7 @@ def look(
                     if possible:
                         signatures[key] = seen
             elif effect.discrete:
-                others = applied(study, [one for one in named if one is not present])
+                others = applied(read, [one for one in named if one is not present])
                 amounts = np.pad(present.values, (0, len(_scale(effect)) - len(present.values)))
                 amounts[0] = 1.0
                 seen = whitened(update.observation.read(_whole(
@@ -286,7 +353,7 @@ def look(
             hypotheses.append(Hypothesis(effect, place))
             candidates.append(Candidate(
                 effect.name, place.name, tuple(range(width, width + seen.shape[1])),
-                effect.certain or seen.shape[1] > len(effect.parameters)))
+                effect.certain or seen.shape[1] > len(effect.parameters), effect.only))
             width += seen.shape[1]
     stacked = np.hstack(columns)
     return Search(tuple(hypotheses), tuple(candidates), marginal.evidence(stacked, residual),
@@ -297,7 +364,8 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
     """Judge what named effects leave: a smooth field, or a smooth error of the sensors."""
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.part(rows), update.observation
-    points, scale = observation.map_points, float(np.median(update.errors.sd))
+    points = probe_points(update.study.instrument, observation.map_points)
+    scale = float(np.median(update.errors.sd))
     mine = [one.found.candidate for one in named]
     held = [column for one in mine for column in one.columns]
     own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
@@ -348,7 +416,7 @@ def _whole(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:
 
 
 def _scene_of(study: Study, update: Update, times: Floats, solver: Solver) -> Scene:
-    points = update.observation.map_points
+    points = probe_points(study.instrument, update.observation.map_points)
     return Scene(study, points, times, lambda other: solver(other, points))
 
 
@@ -392,9 +460,9 @@ def _scale(effect: Effect) -> Floats:
 
 def _settled(old: Sequence[Named], new: Sequence[Named]) -> bool:
     """Tell whether a round changed nothing."""
-    if [one.found.candidate for one in old] != [one.found.candidate for one in new]:
-        return False
-    return all(_alike(one, other) for one, other in zip(old, new, strict=True))
+    before = {one.hypothesis: one for one in old}
+    return before.keys() == {one.hypothesis for one in new} and all(
+        _alike(before[one.hypothesis], one) for one in new)
 
 
 def _alike(one: Named, other: Named) -> bool:

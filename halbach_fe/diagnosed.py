@@ -11,6 +11,8 @@ import numpy as np
 
 from halbach_fe.blocks import Floats
 from halbach_fe.diagnose import Diagnosis, Hypothesis, Named
+from halbach_fe.diagnosis.gross import Gross
+from halbach_fe.diagnosis.misread import Reading
 from halbach_fe.diagnosis.residuals import Group
 from halbach_fe.diagnosis.selection import Candidate
 from halbach_fe.effects.base import Parameter, Place
@@ -32,6 +34,10 @@ STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
 HUMAN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "1/T": ("%/T", 100.0),
          "1/T^2": ("%/T²", 100.0), "A m2": ("A m²", 1.0), "K": ("K", 1.0)}
 """Units for people, and how many of them."""
+
+NOTHING = "–"
+MOST_ROWS = 10
+"""Of outliers, that are told; all are in the summary."""
 
 FRACTIONS = {"gain", "loss", "gradient", "scale"}
 """Parameters without a unit that are told in percent."""
@@ -107,13 +113,18 @@ def write_study(text: str, study: Study, diagnosis: Diagnosis, folder: Path) -> 
 def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     """Studies on the way from a file's to the diagnosed one, and what each step is for."""
     yield study, "so that this file needs no other"
-    study = diagnosis.before.study
-    yield study, ""
+    for error in diagnosis.gross:
+        study = error.apply(study)
+        yield study, f"gross error: {error.reading.text}"
+    study = diagnosis.read
+    yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
     for one in diagnosis.named:
         hypothesis = one.hypothesis
         study = hypothesis.effect.apply(study, hypothesis.place, one.values.tolist())
         yield study, note(one)
-    yield diagnosis.study, ""
+    shaken = diagnosis.vibration
+    yield diagnosis.study, "" if shaken is None else (
+        f"vibration: {1e3 * shaken.sd_m:.2g} mm, log Bayes factor {shaken.log_bayes_factor:.1f}")
 
 
 def note(named: Named) -> str:
@@ -174,6 +185,52 @@ def where(place: Place) -> str:
     return ", ".join(parts) or place.name
 
 
+@dataclass(frozen=True)
+class Other:
+    """Something that was found and is no effect of the catalogue, as text.
+
+    ``instead`` are standard names of what it could be as well.
+    """
+
+    name: str
+    title: str
+    kind: str
+    amount: str
+    sentence: str
+    place: str = NOTHING
+    factor: str = NOTHING
+    instead: str = NOTHING
+
+
+def others(diagnosis: Diagnosis) -> list[Other]:
+    """Gross errors, outliers and vibration."""
+    found = []
+    for one in diagnosis.gross:
+        instead = [" and ".join(other.names) for other in one.alternatives]
+        found.append(Other(
+            " and ".join(one.names), one.reading.text, "gross error",
+            f"misfit {100 * one.misfit_before:.3g} % → {100 * one.misfit_after:.2g} %",
+            f"Gross error: {one.reading.text}.",
+            instead=", ".join(dict.fromkeys(instead)) or NOTHING))
+    if diagnosis.outliers:
+        rows = sorted({one.row for one in diagnosis.outliers})
+        text = f"row{'s' if len(rows) > 1 else ''} " + ", ".join(
+            map(str, rows[:MOST_ROWS])) + ", ..." * (len(rows) > MOST_ROWS)
+        count = len(diagnosis.outliers)
+        found.append(Other(
+            "outliers", "readings that are off singly", "readings",
+            f"{count} of {count + len(diagnosis.before.parts)}",
+            f"{count} {'readings are' if count > 1 else 'reading is'} off singly and left out "
+            f"({text} of the map).", place=text))
+    if diagnosis.vibration:
+        size = f"{1e3 * diagnosis.vibration.sd_m:.2g} mm"
+        found.append(Other(
+            "vibration", "positions that shake", "noise", f"{size} along each axis",
+            f"The positions shake by {size}.",
+            factor=f"{diagnosis.vibration.log_bayes_factor:.1f}"))
+    return found
+
+
 def rivals(named: Named) -> list[tuple[Candidate, float]]:
     """Other effects that would do as well, each at its best place, with log Bayes factors."""
     best: dict[str, tuple[Candidate, float]] = {}
@@ -185,16 +242,19 @@ def rivals(named: Named) -> list[tuple[Candidate, float]]:
 
 def summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dict[str, object]:
     """What a script wants to know of a diagnosis; the README says what everything is."""
+    conflicting = diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
     return {
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
         "rounds": diagnosis.rounds,
-        "verdict": "unknown" if diagnosis.unknown and not diagnosis.named else
-        "named" if diagnosis.named else
-        "unexplained" if diagnosis.before.prior_conflict > diagnosis.before.conflict_limit else
-        "nothing",
+        "verdict": "unknown" if diagnosis.unknown and not diagnosis.anything else
+        "unexplained" if not diagnosis.named and not diagnosis.unknown and conflicting else
+        "named" if diagnosis.anything else "nothing",
+        "gross": [_gross(one) for one in diagnosis.gross],
+        "outliers": [asdict(one) for one in diagnosis.outliers],
         "effects": [_entry(one) for one in diagnosis.named],
+        "vibration": asdict(diagnosis.vibration) if diagnosis.vibration else None,
         "unknown": asdict(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])),
         "groups": {"before": _groups(diagnosis.groups_before),
@@ -207,6 +267,15 @@ def summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dic
                   "recommended": one.recommended and one.recommended.name}
                  for one in separations],
     }
+
+
+def _gross(found: Gross) -> dict[str, object]:
+    def told(reading: Reading) -> dict[str, object]:
+        return {"errors": list(reading.names), "text": reading.text}
+
+    return {**told(found.reading), "misfit_before": found.misfit_before,
+            "misfit_after": found.misfit_after,
+            "alternatives": [told(one) for one in found.alternatives]}
 
 
 def _entry(named: Named) -> dict[str, object]:

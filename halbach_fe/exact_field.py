@@ -40,7 +40,9 @@ _CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
 _AT_ONCE = 4_000_000  # blocks times points whose places are compared at once
 
 
-def unit_field(block: MagnetBlock, points: Floats, order: int = _ORDER) -> Floats:
+def unit_field(
+    block: MagnetBlock, points: Floats, order: int = _ORDER, panel: float | None = None
+) -> Floats:
     """Field of one block for remanences of 1 T along x, y and z, in vacuum.
 
     Parameters
@@ -51,6 +53,9 @@ def unit_field(block: MagnetBlock, points: Floats, order: int = _ORDER) -> Float
         Points off the block's surface, where the result is not defined; inside it, mu_0 H.
     order : int
         Gauss points per panel of the outline.
+    panel : float, optional
+        Longest panel in m (default: the distance to the nearest point); what is nearer to the block
+        is less exact.
 
     Returns
     -------
@@ -61,7 +66,8 @@ def unit_field(block: MagnetBlock, points: Floats, order: int = _ORDER) -> Float
     result = np.empty((len(points), 3, 3))
     if not len(points):
         return result
-    sources, normals = quadrature(block.outline, _nearest(block.outline, points), order)
+    distance = _nearest(block.outline, points) if panel is None else panel
+    sources, normals = quadrature(block.outline, distance, order)
     step = max(1, _CHUNK // (8 * len(sources)))
     for first in range(0, len(points), step):
         part = slice(first, first + step)
@@ -70,7 +76,8 @@ def unit_field(block: MagnetBlock, points: Floats, order: int = _ORDER) -> Float
 
 
 def unit_fields(
-    blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER
+    blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER,
+    panel: float | None = None,
 ) -> Iterator[Floats]:
     """Yield `unit_field` of every block, in order.
 
@@ -78,11 +85,11 @@ def unit_fields(
     """
     at_once = max(1, _AT_ONCE // max(1, len(points)))
     for first in range(0, len(blocks), at_once):
-        yield from _fields_of_some(blocks[first:first + at_once], points, order)
+        yield from _fields_of_some(blocks[first:first + at_once], points, order, panel)
 
 
 def _fields_of_some(
-    blocks: Sequence[MagnetBlock], points: Floats, order: int
+    blocks: Sequence[MagnetBlock], points: Floats, order: int, panel: float | None
 ) -> Iterator[Floats]:
     seen_by = [points if block.in_place else block.to_place(points) for block in blocks]
     pieces = [(number, factor, part) for number, block in enumerate(blocks)
@@ -98,7 +105,7 @@ def _fields_of_some(
                           for number in members])
         union, inverse = unique_points(seen)
         fields[shape] = unit_field(_in_frame(pieces[members[0]][2], frames[members[0]]), union,
-                                   order)
+                                   order, panel)
         places.update(zip(members, inverse.reshape(len(members), len(points)), strict=True))
     for number, block in enumerate(blocks):
         total = np.zeros((len(points), 3, 3))

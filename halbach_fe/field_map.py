@@ -97,6 +97,7 @@ def read_map(path: str | Path) -> xr.Dataset:
     else:
         data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
     _check(data, path)
+    data.encoding["source"] = str(path)
     return data
 
 
@@ -373,21 +374,29 @@ def _check(data: xr.Dataset, path: Path) -> None:
     if blank.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
                                        "at least one component", "none", "Remove the line."))
-    if np.abs(points).max() > 10 * MAX_LENGTH_M:
-        raise MeasurementError(must_be(
-            "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{np.abs(points).max():g}",
-            "Are they in millimetres? Divide them by 1000."))
-    largest = float(np.nanmax(np.abs(values)))
-    if largest > MAX_FIELD_T:
-        unit = "gauss" if largest > 2000 else "millitesla"
-        raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
-                                       f"{largest:g}", f"Are they in {unit}?"))
     if "sigma_T" in data:
         sigma = data["sigma_T"].values[~np.isnan(values)]
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
             raise MeasurementError(must_be("sigma", where, "positive for every reading",
                                            "zero, a negative or a missing one"))
     _check_duplicates(data, points, where)
+
+
+def check_magnitudes(data: xr.Dataset) -> None:
+    """Refuse a map in other units than m and T; those of its file are the study's to tell."""
+    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+    farthest = float(np.abs(points_of(data)).max())
+    if farthest > 10 * MAX_LENGTH_M:
+        raise MeasurementError(must_be(
+            "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
+            "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study."))
+    largest = float(np.nanmax(np.abs(data["B_T"].values)))
+    if largest > MAX_FIELD_T:
+        unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
+        raise MeasurementError(must_be(
+            "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
+            f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
+            "study."))
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

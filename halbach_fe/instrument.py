@@ -1,8 +1,9 @@
 """What a mapper does to the field between magnet and map.
 
-`halbach_fe.study.Instrument` says what each number means. What is linear in B (where the sensors
-were, how they were turned, their gains and crosstalk) belongs to the model of a reading; the rest
-(offset, drift, non-linearity) is taken out of the map.
+`halbach_fe.study.Instrument` says what each number means. Units and axes are put right as the map
+is read. What is linear in B (where the sensors were, how they were turned, their gains and
+crosstalk) belongs to the model of a reading; the rest (offset, drift, non-linearity) is taken out
+of the map.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, turn_of
 from halbach_fe.errors import MeasurementError, must_be
-from halbach_fe.study import COMPONENTS, Instrument
+from halbach_fe.field_map import POSITION_COLUMNS, check_magnitudes, points_of
+from halbach_fe.study import COMPONENTS, Axes, Instrument
 
 ROUNDS = 50
 CONVERGED_T = 1e-12
@@ -39,6 +41,36 @@ class Probe:
     operator: sparse.csr_array
 
 
+def as_read(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
+    """A map in m and T along the magnet's axes, as the study says that it is to be read.
+
+    Raises
+    ------
+    MeasurementError
+        If its numbers are still those of another unit.
+    """
+    points = along_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
+    unit = instrument.flux_density_unit_T
+    field = along_axes(instrument.field_axes, data["B_T"].values) * unit
+    read = data.assign_coords({name: data[name].copy(data=points[:, axis])
+                               for axis, name in enumerate(POSITION_COLUMNS)})
+    read = read.assign(B_T=data["B_T"].copy(data=field))
+    if "sigma_T" in data:
+        sigma = np.abs(along_axes(instrument.field_axes, data["sigma_T"].values)) * unit
+        read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
+    check_magnitudes(read)
+    return read
+
+
+def along_axes(axes: Axes, columns: Floats) -> Floats:
+    """Vectors (n, 3) along the magnet's axes, of which ``axes`` are those of the columns (n, 3)."""
+    found = np.empty(columns.shape)
+    for column, axis in enumerate(axes):
+        sign = -1.0 if axis.startswith("-") else 1.0
+        found[:, COMPONENTS.index(axis[-1])] = sign * columns[:, column]
+    return found
+
+
 def probe(instrument: Instrument, points: Floats) -> Probe:
     """The probe on a map's points (n, 3) in m."""
     count = len(points)
@@ -57,11 +89,34 @@ def probe_positions(instrument: Instrument, points: Floats) -> Floats:
     """Where each sensor was, (n, 3, 3) in m: by point of the map, sensor, coordinate."""
     stretched = points * [1 + instrument.radius_scale, 1 + instrument.radius_scale,
                           1 + instrument.z_scale]
+    if instrument.radius_offset_m:
+        stretched += instrument.radius_offset_m * outward(points)
+    if any(instrument.eccentricity_m):
+        stretched += np.tensordot(instrument.eccentricity_m, run_out(points), 1)
     z = points[:, 2]
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
     sensors = stretched[:, None] + np.array(instrument.sensor_position_m)
     return np.asarray(sensors @ turn_of(instrument.rotation_rad).T + instrument.translation_m)
+
+
+def probe_points(instrument: Instrument, points: Floats) -> Floats:
+    """Where the middle of the sensors was, (n, 3) in m, at points (n, 3) of a map."""
+    return np.asarray(probe_positions(instrument, points).mean(axis=1))
+
+
+def outward(points: Floats) -> Floats:
+    """Unit vectors (n, 3) away from the axis at points (n, 3); along x on it."""
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(points))])
+
+
+def run_out(points: Floats) -> Floats:
+    """Displacements (2, n, 3) of points (n, 3) on circles per unit of eccentricity along x and y:
+    farther out by the cosine or sine of the angle, which is right; none on the axis.
+    """
+    away = outward(points) * (np.hypot(points[:, 0], points[:, 1]) > 0)[:, None]
+    return np.stack([away[:, [0]] * away, away[:, [1]] * away])
 
 
 def sensor_matrix(instrument: Instrument) -> Floats:

@@ -35,7 +35,7 @@ from halbach_fe.exact_field import unit_fields
 from halbach_fe.extent import boundary_half_length
 from halbach_fe.external import external_field
 from halbach_fe.inference.noise import Noise, independent
-from halbach_fe.instrument import map_time
+from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
 from halbach_fe.solve import Workshop
@@ -58,7 +58,8 @@ NMR_ACCURACY = 2e-6
 NMR_LEAST_T = 0.04
 """Below that the usual probes see nothing."""
 
-MAPPER_KEYS = {"translation_m", "rotation_rad", "z_scale", "radius_scale", "arm_sag_m"}
+MAPPER_KEYS = {"translation_m", "rotation_rad", "z_scale", "radius_scale", "radius_offset_m",
+               "eccentricity_m", "arm_sag_m"}
 """Of the instrument, what belongs to the mapper and stays when its probe is turned; the rest
 belongs to the probe."""
 
@@ -258,7 +259,7 @@ def present(diagnosis: Diagnosis, data: xr.Dataset) -> Campaign:
     columns = (len(COMPONENTS) * used[:, None] + np.arange(len(COMPONENTS))).ravel()
     covariance = update.errors.part(kept).covariance * (kept.sum() / own.sum())
     return Campaign(
-        observation.map_points[used], map_time(data)[used],
+        probe_points(update.study.instrument, observation.map_points[used]), map_time(data)[used],
         sparse.csr_array(sparse.csc_array(analysis)[:, columns]),
         Noise(sparse.csr_array(covariance)), np.eye(3), np.eye(3))
 

@@ -19,7 +19,7 @@ from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import gradient_of
 from halbach_fe.field_map import points_of
 from halbach_fe.inference.noise import Noise
-from halbach_fe.instrument import probe
+from halbach_fe.instrument import probe, probe_points
 from halbach_fe.study import (
     COMPONENTS,
     CirclePositions,
@@ -295,19 +295,20 @@ def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> N
             settings, observation.positions[:, 2], observation.components)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
-        moved = _displacement(study, observation, np.array(settings.position_sd_m))
+        moved = displacement(study, observation, np.array(settings.position_sd_m))
         covariance = covariance + moved @ moved.T
     return Noise(_without_rounding(sparse.csr_array(covariance)))
 
 
-def _displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+def displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
     """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
     (3,) in m along each axis.
 
     The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
     the bore some per cent of the field, is left out of this scale of the noise.
     """
-    gradient = gradient_of(blocks_of(study), observation.map_points) * sd
+    points = probe_points(study.instrument, observation.map_points)
+    gradient = gradient_of(blocks_of(study), points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
         observation.analysis @ sparse.bsr_array((gradient, number[:-1], number)))
@@ -323,6 +324,24 @@ def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
     kept = np.abs(entries.data) > ROUNDING * np.sqrt(variance[rows] * variance[columns])
     return sparse.csr_array((entries.data[kept], (rows[kept], columns[kept])),
                             shape=covariance.shape)
+
+
+def excluded(study: Study, count: int) -> NDArray[np.bool_]:
+    """Tell which components (count, 3) of a map of so many rows the study leaves out.
+
+    Raises
+    ------
+    MeasurementError
+        If the map has no such row.
+    """
+    found = np.zeros((count, len(COMPONENTS)), bool)
+    for one in study.inference.excluded_readings:
+        if one.row > count:
+            raise MeasurementError(must_be(
+                "rows", "map", f"at least the {one.row} that inference.excluded_readings names",
+                f"{count}", "Is it another map?"))
+        found[one.row - 1, [COMPONENTS.index(name) for name in one.components]] = True
+    return found
 
 
 def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:

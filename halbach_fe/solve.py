@@ -450,8 +450,8 @@ def _newton_task(
         job = stage(case.study, case.mesh, places, folder, case.formulation, case.blocks,
                     (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
-        iterated = not gateaux and job.unknowns > case.formulation.factorized_for_newton
-        if iterated:
+        unknowns = case.formulation.unknowns(case.mesh)
+        if not gateaux and unknowns > case.formulation.factorized_for_newton:
             job = replace(job, options=runner.NEWTON_STEPS, linear_residual=runner.NEWTON_RESIDUAL)
         return replace(
             job, resolution="Newton", solves=max(columns, 1),

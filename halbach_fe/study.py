@@ -43,6 +43,10 @@ Rotation = tuple[Angle, Angle, Angle]
 Moment = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False)]
 Fractions = tuple[Fraction, Fraction, Fraction]
+RadiusScale = Annotated[float, Field(ge=-0.9, le=2.0, allow_inf_nan=False)]
+Unit = Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)]
+SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Axes = tuple[SignedAxis, SignedAxis, SignedAxis]
 FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
 PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
@@ -296,11 +300,17 @@ class Instrument(_Model):
     """How the mapper's readings differ from B where it says it was; taken out of the map before
     anything else is done with it.
 
+    First what is written in the map is put right. Its coordinates and its sigma and B count in
+    ``length_unit_m`` and ``flux_density_unit_T`` (0.001 if they are in mm and mT). Its columns x,
+    y, z are along ``position_axes`` of the magnet, and Bx, By, Bz along ``field_axes``: with
+    ``field_axes = ["y", "-x", "z"]`` the column of Bx holds By, and that of By -Bx.
+
     The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
-    by ``1 + radius_scale`` and z by ``1 + z_scale`` and lets the arm sag towards -y, by
-    ``arm_sag_m`` at the far end (largest z of the map), with the square of the distance from the
-    near one; T turns by ``rotation_rad`` (a rotation vector) about the origin and moves by
-    ``translation_m``.
+    by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), and off the axis
+    at the angle phi ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi``, stretches z by
+    ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m`` at the far end (largest z of
+    the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a
+    rotation vector) about the origin and moves by ``translation_m``.
     The sensor of component i is ``sensor_position_m[i]`` from there. With B' the field in the
     turned axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
@@ -309,10 +319,16 @@ class Instrument(_Model):
     sees of x.
     """
 
+    length_unit_m: Unit = 1.0
+    flux_density_unit_T: Unit = 1.0
+    position_axes: Axes = ("x", "y", "z")
+    field_axes: Axes = ("x", "y", "z")
     translation_m: Displacement = (0.0, 0.0, 0.0)
     rotation_rad: Fractions = (0.0, 0.0, 0.0)
     z_scale: Fraction = 0.0
-    radius_scale: Fraction = 0.0
+    radius_scale: RadiusScale = 0.0
+    radius_offset_m: Offset = 0.0
+    eccentricity_m: tuple[Offset, Offset] = (0.0, 0.0)
     arm_sag_m: Offset = 0.0
     sensor_position_m: tuple[Displacement, Displacement, Displacement] = (
         (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -323,6 +339,14 @@ class Instrument(_Model):
     cubic_per_T2: Fractions = (0.0, 0.0, 0.0)
     offset_T: FluxDensityVector = (0.0, 0.0, 0.0)
     drift_T: FluxDensityVector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Instrument:
+        for name in ("position_axes", "field_axes"):
+            axes = getattr(self, name)
+            if {axis[-1] for axis in axes} != set(COMPONENTS):
+                raise ValueError(f"{name} must name x, y and z once each, but is {list(axes)}")
+        return self
 
 
 class Mesh(_Model):
@@ -525,10 +549,28 @@ class HeldOut(_Model):
         return self
 
 
+class ExcludedReading(_Model):
+    """Components, or all, of a row of the map, from 1; its number alone stands for all."""
+
+    row: Annotated[int, Field(ge=1)]
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
+
+
+def _row_or_table(value: Any) -> Any:
+    return {"row": value} if isinstance(value, int) else value
+
+
 class Inference(_Model):
-    """How the update is done and judged."""
+    """How the update is done and judged.
+
+    ``excluded_readings`` are neither used nor predicted, as outliers should be. Their components
+    are those of the magnet's axes.
+    """
 
     held_out: HeldOut | None = None
+    excluded_readings: tuple[
+        Annotated[ExcludedReading, BeforeValidator(
+            _row_or_table, json_schema_input_type=Union[int, ExcludedReading])], ...] = ()  # noqa: UP007
 
 
 class Plan(_Model):

@@ -16,7 +16,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, InlineTable, Item, Table
 
 from halbach_fe.errors import StudyError
-from halbach_fe.study import Study, parse_study
+from halbach_fe.study import ExcludedReading, Study, parse_study
 
 LOST = ("Written anew: the study's own file cannot be changed key by key, so that its comments are "
         "there only.")
@@ -92,7 +92,8 @@ def _change_list(
 ) -> None:
     """Set what differs between two lists of tables, the second not shorter than the first."""
     if name not in table:
-        table[name] = [] if _in_line(table) else tomlkit.aot()
+        in_rows = _in_line(table) or isinstance(after[0], ExcludedReading)  # many, and short
+        table[name] = [] if in_rows else tomlkit.aot()
     there = table[name]
     for number, (old, new) in enumerate(zip(before, after, strict=False)):
         _change(there[number], old, new, _inside(there, note))

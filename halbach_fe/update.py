@@ -28,11 +28,12 @@ from halbach_fe.inference import linear
 from halbach_fe.inference.linear import predict, whitened
 from halbach_fe.inference.noise import Noise
 from halbach_fe.inference.prior import Gaussian, block_prior
-from halbach_fe.instrument import without_remainder
+from halbach_fe.instrument import as_read, without_remainder
 from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import (
     Observation,
+    excluded,
     held_out,
     noise_regions,
     observe,
@@ -245,12 +246,13 @@ def infer(
         If a map or the blocks do not fit the study.
     """
     of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
-    observation, noise, readings = _measured(study, data)
+    observation, noise, readings = _measured(study, data, excluded(study, data.sizes["point"]))
     keep = held_out(study, observation)
     parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
     if unseen is not None:
         try:
-            other, its_noise, its_readings = _measured(predicted_as(study, unseen), unseen)
+            other, its_noise, its_readings = _measured(
+                predicted_as(study, unseen), unseen, np.zeros((unseen.sizes["point"], 3), bool))
         except MeasurementError as error:
             raise MeasurementError(
                 str(error).replace(" of map must", " of held-out map must")) from None
@@ -292,18 +294,25 @@ def infer(
         measured_blocks=of_blocks.count if of_blocks and not prior else None)
 
 
-def _measured(study: Study, data: xr.Dataset) -> tuple[Observation, Noise, Floats]:
-    """A map as the study observes it, with its noise and its readings in T."""
-    points = points_of(data)
-    inside = points_in_material(study, points)
+def _measured(
+    study: Study, data: xr.Dataset, left_out: NDArray[np.bool_]
+) -> tuple[Observation, Noise, Floats]:
+    """A map as the study observes it but for components (n, 3) that are left out, with its noise
+    and its readings in T.
+    """
+    data = as_read(study.instrument, data)
+    observation = observe(
+        study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out)
+    inside = points_in_material(study, observation.points)
     if inside.any():
-        row = int(np.argmax(inside))
-        x, y, z = points[row]
+        first = int(np.argmax(inside))
+        x, y, z = observation.points[first]
+        sensors = len(inside) // data.sizes["point"]
         raise MeasurementError(must_be(
-            f"reading {row + 1}", "map", "at a point in air",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron ({inside.sum()} such readings)",
+            f"reading {first // sensors + 1}", "map", "at a point in air",
+            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
+            f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
             "Check the study's radii and the map's axes and units."))
-    observation = observe(study, points, ~np.isnan(data["B_T"].values))
     return (observation, reading_noise(study, observation, data),
             observation.read(np.nan_to_num(without_remainder(study.instrument, data))))
 

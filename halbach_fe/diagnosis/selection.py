@@ -38,12 +38,15 @@ class Candidate:
         Of the evidence.
     certain : bool
         Whether the amplitude of the first is 1 if it is there, as of a missing block.
+    only : bool
+        Whether its effect is in one place at most.
     """
 
     effect: str
     place: str
     columns: tuple[int, ...]
     certain: bool = False
+    only: bool = False
 
     @property
     def free(self) -> tuple[int, ...]:
@@ -132,14 +135,33 @@ def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -
         now = with_candidates(evidence, [candidates[number] for number in chosen])
         odds = gains(now, candidates) + prior
         odds[chosen] = -np.inf
+        taken = {candidates[number].effect for number in chosen if candidates[number].only}
+        odds[[number for number, one in enumerate(candidates) if one.effect in taken]] = -np.inf
         best = int(np.argmax(odds))
         if odds[best] < FOUND:
             break
         before = len(chosen)
-        chosen = _needed(evidence, candidates, [*chosen, best], prior)
+        chosen = _at_best_places(evidence, candidates, [*chosen, best])
+        best = chosen[-1]
+        chosen = _needed(evidence, candidates, chosen, prior)
         if best not in chosen or len(chosen) <= before - 1:
             break  # adding and dropping would go on for ever
     return [_found(evidence, candidates, chosen, number, prior) for number in chosen]
+
+
+def _at_best_places(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int]
+) -> list[int]:
+    """Move what is in one place only to where it is best, the others being there."""
+    chosen = list(chosen)
+    for index, number in enumerate(chosen):
+        if candidates[number].only:
+            others = [candidates[k] for k in chosen if k != number]
+            places = [k for k, one in enumerate(candidates)
+                      if one.effect == candidates[number].effect]
+            factors = gains(with_candidates(evidence, others), [candidates[k] for k in places])
+            chosen[index] = places[int(np.argmax(factors))]
+    return chosen
 
 
 def _needed(

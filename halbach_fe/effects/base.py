@@ -62,6 +62,8 @@ class Effect(ABC):
         More of them, that are looked for once the effect is in the model.
     certain : bool
         Whether it is there with amplitude 1 or not at all, as a block upside down.
+    only : bool
+        Whether it is in one place at most, as an iron ring.
     discrete : bool
         Whether `apply` puts all of it into a study, whatever its amplitude.
     """
@@ -72,6 +74,7 @@ class Effect(ABC):
     parameters: tuple[Parameter, ...]
     refinements: ClassVar[tuple[Parameter, ...]] = ()
     certain: ClassVar[bool] = False
+    only: ClassVar[bool] = False
     discrete: ClassVar[bool] = False
 
     def places(self, study: Study) -> Sequence[Place]:

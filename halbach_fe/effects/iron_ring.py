@@ -34,6 +34,7 @@ class IronRingEffect(Effect):
     kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
+    only = True
     discrete = True
 
     def places(self, study: Study) -> Sequence[Place]:

@@ -24,7 +24,7 @@ class RadiusScale(InstrumentEffect):
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""
-        return {"radius_scale": instrument.radius_scale + values[0]}
+        return {"radius_scale": (1 + instrument.radius_scale) * (1 + values[0]) - 1}
 
 
 EFFECTS = (RadiusScale(),)

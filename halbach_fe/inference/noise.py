@@ -105,6 +105,11 @@ class Noise:
         return joined(1), joined(2)
 
     @property
+    def whitening(self) -> sparse.csr_array:
+        """W, sparse."""
+        return self._factors[1]
+
+    @property
     def log_size(self) -> float:
         """Logarithm of the root of the determinant."""
         return float(np.log(self._factors[0].diagonal()).sum())

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from halbach_fe.diagnose import Diagnosis, Named
 from halbach_fe.diagnosed import (
+    NOTHING,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
+    others,
     rivals,
     scores,
     where,
@@ -23,7 +25,6 @@ from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
 from halbach_fe.update import ALL_READINGS
 
-NOTHING = "–"
 FIGURES = {
     "groups": (figures.groups, "Chi² per reading of groups of readings, each foretold by all "
                "others; filled where chance is no explanation"),
@@ -54,15 +55,16 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     """What was found, in sentences."""
     titles = _catalogue_titles(diagnosis)
     before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
-    said = []
+    said = [one.sentence for one in others(diagnosis)]
     if diagnosis.named:
         said.append("The map is explained by: " + "; ".join(
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
-    elif unknown is None and before.prior_conflict <= before.conflict_limit:
-        return [f"Nothing is missing: the map agrees with the study within noise (chi² per reading "
-                f"{before.prior_conflict:.3g})."]
+    elif unknown is None and after.prior_conflict <= after.conflict_limit:
+        start = "Nothing else is missing: then" if said else "Nothing is missing:"
+        return [*said, f"{start} the map agrees with the study within noise (chi² per reading "
+                f"{after.prior_conflict:.3g})."]
     if unknown is not None:
         x, y, z = (f"{1e3 * one:.0f}" for one in unknown.at_m)
         said.append(
@@ -74,9 +76,9 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             x, y, z = (f"{1e3 * one:.0f}" for one in unknown.source_m)
             said.append(f"If it is a small magnetized object, then near ({x}, {y}, {z}) mm.")
     elif not diagnosis.named:
-        return [f"The map disagrees with the study (chi² per reading {before.prior_conflict:.3g}, "
-                f"where {before.conflict_limit:.3g} would be rare), and no effect of the catalogue "
-                "explains it, nor anything smooth: look for outliers, and at the noise."]
+        return [*said, f"The map disagrees with the study (chi² per reading "
+                f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
+                "no effect of the catalogue explains it, nor anything smooth: look at the noise."]
     if diagnosis.named:
         held = ["".join(f", of held-out ones {one.chi2_per_reading:.3g}" for one in found[1:2])
                 for found in (scores(before, diagnosis.left_out_before),
@@ -90,12 +92,16 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
 
 
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Rows of the effects that a study lacks, as text."""
-    return [{"effect": one.found.candidate.effect, "place": where(one.hypothesis.place),
-             "amplitude": "; ".join(amounts(one)),
-             "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
-             "it could be": ", ".join(candidate.effect for candidate, _ in rivals(one)) or NOTHING}
-            for one in diagnosis.named]
+    """Rows of what a study lacks, as text."""
+    found = [{"effect": one.name, "place": one.place, "amplitude": one.amount,
+              "log Bayes factor": one.factor, "it could be": one.instead}
+             for one in others(diagnosis)]
+    return found + [
+        {"effect": one.found.candidate.effect, "place": where(one.hypothesis.place),
+         "amplitude": "; ".join(amounts(one)),
+         "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
+         "it could be": ", ".join(candidate.effect for candidate, _ in rivals(one)) or NOTHING}
+        for one in diagnosis.named]
 
 
 def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
@@ -123,11 +129,15 @@ def write_report(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, verdict=verdict(diagnosis),
         shown=dict(zip(drawn, pictures, strict=True)),
-        found=[_entry(one, titles) for one in diagnosis.named],
+        found=[{"what": one.title, "where": one.place, "how much": one.amount,
+                "log Bayes factor": one.factor, "kind": one.kind} for one in others(diagnosis)]
+        + [_entry(one, titles) for one in diagnosis.named],
         changes=change_table(diagnosis), disagreeing="; ".join(
             f"{one.when}: {_disagreeing(one.groups)}" for one in states(diagnosis)),
         states=[one.when for one in states(diagnosis)],
-        classes=[_class(one, titles) for one in diagnosis.named if rivals(one)],
+        classes=[f"The map would be the same with {_either(texts)}." for error in diagnosis.gross
+                 if (texts := [one.text for one in error.alternatives])]
+        + [_class(one, titles) for one in diagnosis.named if rivals(one)],
         structure=figures.structure(diagnosis),
         further=[_next(one, separations, titles) for one in diagnosis.named if rivals(one)],
         ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,

@@ -17,6 +17,7 @@ import pytest
 from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.cli import main
 from halbach_fe.diagnosed import summary
+from halbach_fe.diagnosis.misread import PLAUSIBLE
 from halbach_fe.effects import catalogue
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.study import parse_study
@@ -205,6 +206,40 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert "before" not in page.split("<h2>How sure")[0]
 
 
+def test_a_misread_map_with_outliers(study, tmp_path, capsys):
+    """In millimetres, with three readings that are off; nothing else is missing."""
+    out, data = tmp_path / "out", tmp_path / "map.csv"
+    shown = fields(0.0).copy()
+    off = [(11, 0), (120, 2), (121, 1)]
+    for row, column in off:
+        shown[row, column] += 3e-3
+    write_map(field_map(1e3 * POINTS, shown), data)
+    assert main(["diagnose", str(study), "--measurements", str(data), "-o", str(out),
+                 "--effects", "gain_x"]) == 0
+    said = capsys.readouterr()
+    assert "Gross error: coordinates in millimetres. 3 readings are off singly" in said.err
+    assert "Nothing else is missing" in said.err
+    assert "millimetres" in said.out
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["verdict"] == "named"
+    assert [one["errors"] for one in found["gross"]] == [["millimetres"]]
+    assert [(one["row"], one["component"]) for one in found["outliers"]] == [
+        (row + 1, "xyz"[column]) for row, column in off]
+    assert (found["effects"], found["vibration"]) == ([], None)
+    assert found["readings"]["training"] + found["readings"]["held out"] == 597
+    page = (out / "diagnosis.html").read_text()
+    assert "<strong>Gross error: coordinates in millimetres.</strong>" in page
+    assert "3 of 600" in page
+    text = (out / "study.diagnosed.toml").read_text()
+    assert "length_unit_m = 0.001  # gross error: coordinates in millimetres" in text
+    assert '{row = 12, components = ["x"]}' in text
+    assert "# outliers: 3" in text
+    assert main(["infer", str(out / "study.diagnosed.toml"), "--measurements", str(data),
+                 "-o", str(tmp_path / "again"), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)["prior_conflict"]
+    assert again == pytest.approx(found["scores"]["after"][0]["chi2_per_reading"], rel=1e-9)
+
+
 @pytest.mark.parametrize(("change", "code", "said"), [
     ({"study": "inner_radius_m = 50"}, 3, "millimetres"),
     ({"map": "x_m,y_m,z_m,Bx_T\n0,0,0,many\n"}, 4, "must be a finite number"),
@@ -267,9 +302,11 @@ def test_the_readme_says_what_is_in_the_file():
         study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
         relative_error=lambda _: np.zeros(1), prediction_posterior=None)
     nothing = SimpleNamespace(
-        before=update, after=update, named=(), unknown=None, probabilities={}, groups_before=[],
+        before=update, after=update, gross=(), outliers=(), named=(), vibration=None,
+        unknown=None, anything=False, probabilities={}, groups_before=[],
         groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1)
     assert keys == list(summary(nothing))
+    assert all(f"`{name}`" in section for name in PLAUSIBLE)
     rows = [line.split("|") for line in section.splitlines()
             if line.startswith(("| field |", "| instrument |"))]
     assert {(row[1].strip(), name.strip()) for row in rows for name in row[2].split(",")} == {

@@ -13,13 +13,13 @@ from halbach_fe.analytic import Sector, ideal_sectors, layered_bore_field
 from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.exact_field import gradient_of
-from halbach_fe.field_map import field_map
+from halbach_fe.field_map import field_map, points_of
 from halbach_fe.nonlinear import newton_readings
 from halbach_fe.observation import observe
 from halbach_fe.report.inference import write_report
 from halbach_fe.report.prediction import main_line
 from halbach_fe.response import response
-from halbach_fe.study import MU_0
+from halbach_fe.study import MU_0, Instrument, parse_study
 from halbach_fe.update import infer, write_update
 from tests.conftest import circle
 
@@ -223,6 +223,38 @@ def test_maps_that_do_not_fit_the_study(short_dipole, dipole, workshop):
         infer(dipole(noise=NOISE), sloped, workshop)
     with pytest.raises(StudyError, match="how noisy"):
         infer(short_dipole(), field_map(np.zeros((1, 3)), np.ones((1, 3))), workshop)
+
+
+def test_the_study_says_how_a_map_is_to_be_read(short_dipole, generator, workshop):
+    """A map with a wrong radius, in mm and with axes exchanged, is that which it was made of."""
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    right = infer(study, data, workshop)
+    points, field = points_of(data), data["B_T"].values
+    written = field_map(1e3 * (points * [3.0, 3.0, 1.0])[:, [1, 0, 2]], field * [1, 1, -1])
+    with pytest.raises(MeasurementError, match="a point in air"):
+        infer(study, field_map(points * [2.0, 2.0, 1.0], field), workshop)
+    instrument = Instrument(length_unit_m=1e-3, radius_scale=1 / 3 - 1,
+                            position_axes=("y", "x", "z"), field_axes=("x", "y", "-z"))
+    found = infer(study.model_copy(update={"instrument": instrument}), written, workshop)
+    # solvers of the response stop at 1e-10, and points are off by their rounding
+    np.testing.assert_allclose(found.posterior.mean, right.posterior.mean, rtol=0,
+                               atol=1e-5 * right.posterior.sd.min())
+
+
+def test_excluded_readings_are_gone(short_dipole, generator, workshop):
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    broken = data.copy(deep=True)
+    broken["B_T"].values[6, 1] += 0.3
+    broken["B_T"].values[100] = 0.2
+    told = {"held_out": {"every": 3, "window": 5},
+            "excluded_readings": [{"row": 7, "components": ["y"]}, 101]}
+    without = infer(parse_study(study.model_dump(exclude_none=True) | {"inference": told}), broken,
+                    workshop)
+    assert len(without.observation) == 3 * data.sizes["point"] - 4
+    assert without.prior_conflict < without.conflict_limit
+    assert infer(study, broken, workshop).prior_conflict > 100  # as it is with them
+    with pytest.raises(MeasurementError, match=r"at least the 101 that inference\.excl"):
+        infer(without.study, data.isel(point=slice(0, 100)), workshop)
 
 
 def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, workshop):

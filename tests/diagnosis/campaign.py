@@ -1,0 +1,65 @@
+"""A small magnet of cuboids in vacuum, measured in magpylib."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+
+from halbach_fe.blocks import blocks_of, position_angle_deg
+from halbach_fe.field_map import field_map
+from halbach_fe.study import Study, parse_study
+from tests.conftest import circle
+
+NOISE_T = 5e-5
+
+DOCUMENT = {
+    "name": "cuboids", "dimension": 3,
+    "array": {
+        "blocks_per_ring": 12, "rings": 3, "inner_radius_m": 0.1, "outer_radius_m": 0.15,
+        "ring_length_m": 0.06, "first_block_angle_deg": 90.0,
+        "first_magnetization_angle_deg": 180.0, "remanence_T": 1.2,
+        "block": {"shape": "cuboid", "width_m": 0.04}},
+    "mesh": {"block_size_m": 0.02},
+    "observation": {
+        "quantity": "flux_density",
+        "positions": {"kind": "circles", "radius_m": [0.05, 0.07], "angles": 12,
+                      "z_min_m": -0.2, "z_max_m": 0.2, "count": 11}},
+    "noise": {"regions": [{"name": "all", "sigma_T": NOISE_T}]},
+    "prior": {"magnitude_sd": 0.01, "direction_sd_deg": 1.0, "common_mode_sd": 0.01},
+}
+STUDY = parse_study(DOCUMENT)
+CIRCLES = np.vstack([circle(radius, 12, z, 0.1) for radius in (0.05, 0.07)
+                     for z in np.linspace(-0.2, 0.2, 11)])
+
+
+def with_array(**keys) -> Study:
+    return parse_study(DOCUMENT | {"array": DOCUMENT["array"] | keys})
+
+
+def drawn(study: Study, generator: np.random.Generator, sd=0.01) -> np.ndarray:
+    """Polarizations (blocks, 3) in T of blocks that are off by 1 % and 1 deg, and all by 1 %."""
+    nominal = np.array([np.array(one.easy_axis) * one.remanence for one in blocks_of(study)])
+    size = sd * np.linalg.norm(nominal, axis=1)[:, None]
+    return (nominal * (1 + sd * generator.standard_normal())
+            + size * np.array([1.0, 1.0, np.pi / 1.8]) * generator.standard_normal(nominal.shape))
+
+
+def field(study: Study, polarizations: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """B (n, 3) in T by magpylib, of blocks in their places."""
+    array, total = study.array, np.zeros(points.shape)
+    size = (array.outer_radius_m - array.inner_radius_m, array.block.width_m, array.ring_length_m)
+    radius = (array.outer_radius_m + array.inner_radius_m) / 2
+    for block, polarization in zip(blocks_of(study), polarizations, strict=True):
+        angle = np.radians(position_angle_deg(array, block.slot))
+        cuboid = magpylib.magnet.Cuboid(dimension=size, position=(
+            radius * np.cos(angle), radius * np.sin(angle), (block.z_min + block.z_max) / 2))
+        cuboid.rotate_from_angax(np.degrees(angle), "z", anchor=None)
+        cuboid.polarization = cuboid.orientation.inv().apply(polarization)
+        total += cuboid.getB(points)
+    return total
+
+
+def measured(study, generator, points=CIRCLES, at=None):
+    """A map of a magnet as it might be built, of points that may have been elsewhere."""
+    true = field(study, drawn(study, generator), points if at is None else at)
+    return field_map(points, true + NOISE_T * generator.standard_normal(true.shape))
