@@ -1,6 +1,7 @@
 """From a disagreement to its name: which effects a study lacks, and the study that has them.
 
 First what spoils all else is put right: a map that was misread, and single readings that are off.
+Where the solver's own error explains the misfit, that is all there is to say.
 Then effects are searched with their signatures, linear and cheap; those found go into the study in
 full and are solved for again, which moves the point of linearization, until nothing changes: a
 Gauss-Newton method whose model is the real one. In every round all effects compete anew, the found
@@ -22,6 +23,7 @@ from halbach_fe.blocks import Floats
 from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.gross import Gross, find_gross
+from halbach_fe.diagnosis.numerical import Numerical, numerical_of
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.residuals import Group, groups, left_out
 from halbach_fe.diagnosis.selection import (
@@ -166,6 +168,8 @@ class Diagnosis:
         Readings that are off singly.
     vibration : Vibration or None
         Of the probe, if the readings show it.
+    numerical : Numerical or None
+        The solver's own error, if it explains the misfit; then nothing else is looked for.
     """
 
     read: Study
@@ -183,6 +187,7 @@ class Diagnosis:
     gross: tuple[Gross, ...] = ()
     outliers: tuple[Outlier, ...] = ()
     vibration: Vibration | None = None
+    numerical: Numerical | None = None
 
     @property
     def study(self) -> Study:
@@ -224,6 +229,7 @@ def diagnose(
     first: tuple[Update, Search] | None = None
     named, vibration = start, None
     outliers: tuple[Outlier, ...] = ()
+    numerical: Numerical | None = None
 
     def updated(name: str) -> Update:
         return infer(shaking(applied(read, named), vibration), data, _room(workshop, name), blocks,
@@ -241,6 +247,10 @@ def diagnose(
             update = updated("without-outliers")
         search = look(read, start, update, times, solver, effects, named, signatures)
         first = first or (update, search)
+        numerical = None if named else numerical_of(update)
+        if numerical:
+            say("the solver's own error explains the misfit")
+            break
         shaken = vibration_of(update, search.marginal, search.columns, search.training, vibration)
         if not settled(vibration, shaken):
             say(f"vibration: {1e3 * shaken.sd_m if shaken else 0:.2g} mm; with it in the noise")
@@ -252,7 +262,7 @@ def diagnose(
             break
         named = found
     assert first is not None
-    rest = unknown(search, update, named)
+    rest = None if numerical else unknown(search, update, named)
     if rest is not None and rest.alone:
         named, vibration, (update, search) = start, None, first
     return Diagnosis(
@@ -263,7 +273,7 @@ def diagnose(
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),
         left_out_after=left_out(search.marginal, search.training), rounds=number + 1,
-        gross=gross, outliers=outliers, vibration=vibration)
+        gross=gross, outliers=outliers, vibration=vibration, numerical=numerical)
 
 
 def _read_right(

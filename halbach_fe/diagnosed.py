@@ -203,7 +203,7 @@ class Other:
 
 
 def others(diagnosis: Diagnosis) -> list[Other]:
-    """Gross errors, outliers and vibration."""
+    """Gross errors, outliers, the solver's error and vibration."""
     found = []
     for one in diagnosis.gross:
         instead = [" and ".join(other.names) for other in one.alternatives]
@@ -222,6 +222,15 @@ def others(diagnosis: Diagnosis) -> list[Other]:
             f"{count} of {count + len(diagnosis.before.parts)}",
             f"{count} {'readings are' if count > 1 else 'reading is'} off singly and left out "
             f"({text} of the map).", place=text))
+    if diagnosis.numerical:
+        one = diagnosis.numerical
+        found.append(Other(
+            "solver_error", "error of mesh and open boundary", "numerical",
+            f"up to {1e3 * one.largest_error_T:.2g} mT, {one.largest_over_noise:.2g} times the "
+            "noise",
+            f"The solver's own error explains the misfit: chi² per reading is {one.chi2_noise:.3g} "
+            f"by the noise alone and {one.chi2_errors:.3g} with that error. Make `mesh` finer or "
+            "`open_boundary` farther before anything is concluded."))
     if diagnosis.vibration:
         size = f"{1e3 * diagnosis.vibration.sd_m:.2g} mm"
         found.append(Other(
@@ -248,12 +257,14 @@ def summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dic
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
         "rounds": diagnosis.rounds,
-        "verdict": "unknown" if diagnosis.unknown and not diagnosis.anything else
+        "verdict": "numerical" if diagnosis.numerical else
+        "unknown" if diagnosis.unknown and not diagnosis.anything else
         "unexplained" if not diagnosis.named and not diagnosis.unknown and conflicting else
         "named" if diagnosis.anything else "nothing",
         "gross": [_gross(one) for one in diagnosis.gross],
         "outliers": [asdict(one) for one in diagnosis.outliers],
         "effects": [_entry(one) for one in diagnosis.named],
+        "numerical": asdict(diagnosis.numerical) if diagnosis.numerical else None,
         "vibration": asdict(diagnosis.vibration) if diagnosis.vibration else None,
         "unknown": asdict(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])),

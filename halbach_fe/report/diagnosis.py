@@ -56,6 +56,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     titles = _catalogue_titles(diagnosis)
     before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
     said = [one.sentence for one in others(diagnosis)]
+    if diagnosis.numerical:
+        return said
     if diagnosis.named:
         said.append("The map is explained by: " + "; ".join(
             _named(one, titles) for one in diagnosis.named) + ".")

@@ -303,7 +303,7 @@ def test_the_readme_says_what_is_in_the_file():
         relative_error=lambda _: np.zeros(1), prediction_posterior=None)
     nothing = SimpleNamespace(
         before=update, after=update, gross=(), outliers=(), named=(), vibration=None,
-        unknown=None, anything=False, probabilities={}, groups_before=[],
+        numerical=None, unknown=None, anything=False, probabilities={}, groups_before=[],
         groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1)
     assert keys == list(summary(nothing))
     assert all(f"`{name}`" in section for name in PLAUSIBLE)
