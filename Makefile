@@ -1,19 +1,24 @@
 # make demo     the main job: the FASER dipole, before and after its measurement
 # make test     all tests
 # make verify-calibration  are the posteriors as sure as they may be?
+# make verify-diagnosis    are hidden effects found, and only those?
 # make study-faser           the published profile, and the synthetic twin of the whole campaign
 # make study-linear-3d       the paper's linear validation: 576 magnetizations from a map of the bore
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo study-faser study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
+.PHONY: demo verify-diagnosis study-faser study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
 
 verify-calibration: setup
 	.venv/bin/python studies/calibration/run.py -o results/calibration
+
+# Effects are hidden in simulated campaigns; hours, and an interrupted run goes on.
+verify-diagnosis: setup-test
+	.venv/bin/python studies/diagnosis/run.py -o results/diagnosis
 
 study-faser: demo
 	.venv/bin/python studies/faser/twin.py -o results/faser-twin

@@ -8,11 +8,14 @@ Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted ru
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +34,13 @@ HERE = Path(__file__).parent
 DETECTABLE = 5.0
 """Log Bayes factor of the true effect, from which a case counts."""
 
-NONE, UNKNOWN = "none", "unknown"
+NONE = "none"
+STATED = (1e-3, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.001)
+"""Probabilities that are compared with how often it was so; of smaller ones there are thousands."""
+
+NO_BLOCKS = {"magnitude_sd": 1e-5, "direction_sd_deg": 1e-3, "common_mode_sd": 1e-5}
+"""A prior that leaves nothing to the blocks: a detector that does not integrate them out."""
+
 BACK = (0.9, 1.1)
 """chi2 per held-out reading of a model that lacks nothing."""
 
@@ -50,13 +59,13 @@ class Case:
         return f"{self.seed:03d}-{'-'.join(self.hidden) or self.outside or NONE}"
 
 
-def cases(study: Study, singles: int, clean: int, pairs: int, outside: int) -> list[Case]:
-    """Effects that both the campaign and the catalogue know, alone and in pairs; none; others."""
-    known = {effect.name for effect in catalogue()}
-    names = [name for name in CAN_BE_HIDDEN if name in known]
+def cases(singles: int, clean: int, pairs: int, outside: int) -> list[Case]:
+    """Effects that the campaign can hide, alone and in pairs of small ones; none; others."""
+    names = list(CAN_BE_HIDDEN)
+    small = [name for name in names if CAN_BE_HIDDEN[name].group != "gross"]
     generator = np.random.default_rng(1)
     drawn = [(name,) for _ in range(singles) for name in names]
-    drawn += [tuple(generator.choice(names, 2, replace=False).tolist()) for _ in range(pairs)]
+    drawn += [tuple(generator.choice(small, 2, replace=False).tolist()) for _ in range(pairs)]
     found = [Case(number, hidden) for number, hidden in enumerate(drawn)]
     found += [Case(len(found) + number) for number in range(clean)]
     return found + [Case(len(found) + number, outside=list(OUTSIDE)[number % len(OUTSIDE)])
@@ -91,7 +100,7 @@ OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
 
 def run_case(
     study: Study, case: Case, workshop: Workshop, solver: Solver
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Simulate, diagnose, and compare with what is sealed."""
     campaign = simulate(study, case.seed, hide=[(CAN_BE_HIDDEN[name], None)
                                                 for name in case.hidden])
@@ -100,32 +109,67 @@ def run_case(
         added = OUTSIDE[case.outside](points_of(readings), np.random.default_rng(case.seed))
         readings = readings.assign(B_T=readings["B_T"] + added)
     found = diagnose(study, readings, workshop, campaign.blocks, solver=solver)
-    return {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
-            "truth": campaign.truth["effects"], **outcome(found)}
+    result = {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
+              "truth": campaign.truth["effects"], **outcome(found)}
+    if not case.hidden and not case.outside:
+        sure = study.model_copy(update={"prior": study.prior.model_copy(update=NO_BLOCKS)})
+        result["without_blocks"] = outcome(diagnose(
+            sure, readings, workshop, solver=solver))["named"]
+    return result
 
 
-def outcome(found: Diagnosis) -> dict[str, object]:
+def outcome(found: Diagnosis) -> dict[str, Any]:
     """What is scored of a diagnosis."""
     chi2 = {name: [score.chi2_posterior for score in update.scores if score.part == HELD_OUT]
             for name, update in (("before", found.before), ("after", found.after))}
+    named = [sorted({name for reading in (one.reading, *one.alternatives)
+                     for name in reading.names}) for one in found.gross]
+    named += [[name] for name, there in (
+        ("outliers", found.outliers), ("vibration", found.vibration)) if there]
     return {
-        "named": [list(one.found.effects) for one in found.named],
+        "named": named + [list(one.found.effects) for one in found.named],
         "factors": [one.found.log_bayes_factor for one in found.named],
         "unknown": None if found.unknown is None else found.unknown.kind,
         "probabilities": found.probabilities, "best": found.best_factors,
+        "disagrees": found.before.prior_conflict > found.before.conflict_limit,
         "chi2_before": chi2["before"][0], "chi2_after": chi2["after"][0], "rounds": found.rounds}
 
 
-def detectable(result: dict[str, object], name: str) -> bool:
-    """Whether readings can tell of an effect at all, by its own evidence."""
-    return bool(result["best"].get(name, -np.inf) > DETECTABLE)
+def known_as(name: str) -> list[str]:
+    """Names in the catalogue of what the campaign hides: that, or one of each sensor."""
+    return [effect.name for effect in catalogue()
+            if effect.name == name or effect.name[:-2] == name] or [name]
 
 
-def summary(results: list[dict[str, object]]) -> dict[str, float]:
+def detectable(result: dict[str, Any], name: str) -> bool:
+    """Whether readings can tell of an effect at all: by its own evidence, or, of what has none
+    because it is no signature, by their disagreement.
+    """
+    factors = [result["best"][one] for one in known_as(name) if one in result["best"]]
+    if not factors:
+        return bool(result["named"] or result["disagrees"])
+    return bool(max(factors) > DETECTABLE)
+
+
+def named(result: dict[str, Any], name: str) -> bool:
+    """Whether an effect is among those that were named, or named as what they could be instead."""
+    return any(set(known_as(name)) & set(names) for names in result["named"])
+
+
+def wrong(result: dict[str, Any]) -> int:
+    """How many were named that are not hidden."""
+    hidden = {one for name in result["hidden"] for one in known_as(name)}
+    return sum(not hidden & set(names) for names in result["named"])
+
+
+def rate(hits: Iterable[bool]) -> float:
+    """Mean, or NaN of nothing."""
+    found = list(hits)
+    return float(np.mean(found)) if found else float("nan")
+
+
+def summary(results: list[dict[str, Any]]) -> dict[str, float]:
     """Rates over all cases."""
-    def named(result: dict[str, object], name: str) -> bool:
-        return any(name in names for names in result["named"])
-
     single = [one for one in results if len(one["hidden"]) == 1
               and detectable(one, one["hidden"][0])]
     pairs = [one for one in results if len(one["hidden"]) == 2
@@ -133,28 +177,45 @@ def summary(results: list[dict[str, object]]) -> dict[str, float]:
     clean = [one for one in results if not one["hidden"] and not one["outside"]]
     outside = [one for one in results if one["outside"]]
     right = [one for one in single + pairs if all(named(one, name) for name in one["hidden"])]
-
-    def rate(hits: list[bool]) -> float:
-        return float(np.mean(hits)) if hits else float("nan")
-
+    labels = np.random.default_rng(0).permutation([one["hidden"][0] for one in single])
     return {
-        "naming_rate_single": rate([named(one, one["hidden"][0]) for one in single]),
+        "naming_rate_single": rate(named(one, one["hidden"][0]) for one in single),
         "single_cases": len(single),
-        "naming_rate_pairs": rate([all(named(one, name) for name in one["hidden"])
-                                   for one in pairs]),
+        "naming_rate_pairs": rate(all(named(one, name) for name in one["hidden"])
+                                  for one in pairs),
         "pair_cases": len(pairs),
-        "false_alarm_rate": rate([bool(one["named"] or one["unknown"]) for one in clean]),
+        "others_named_per_case": float(np.mean([wrong(one) for one in single + pairs] or [0])),
+        "false_alarm_rate": rate(bool(one["named"] or one["unknown"]) for one in clean),
         "clean_cases": len(clean),
-        "unknown_rate": rate([one["unknown"] is not None for one in outside]),
+        "unknown_rate": rate(one["unknown"] is not None for one in outside),
         "outside_cases": len(outside),
-        "heldout_recovered_rate": rate([BACK[0] <= one["chi2_after"] <= BACK[1]
-                                        for one in right])}
+        "heldout_recovered_rate": rate(BACK[0] <= one["chi2_after"] <= BACK[1] for one in right),
+        "control_naming_rate_shuffled_labels": rate(
+            named(one, label) for one, label in zip(single, labels, strict=True)),
+        "control_false_alarm_rate_without_blocks": rate(
+            bool(one["without_blocks"]) for one in clean if "without_blocks" in one)}
+
+
+def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
+    """How often effects are there to which some probability is given, where one at most is."""
+    stated = [(probability, name in {k for one in result["hidden"] or [NONE] for k in (
+        [NONE] if one == NONE else known_as(one))})
+        for result in results if len(result["hidden"]) <= 1 and not result["outside"]
+        for name, probability in result["probabilities"].items()]
+    probability, there = (np.array(one, float) for one in zip(*stated, strict=True))
+    rows = []
+    for low, high in itertools.pairwise(STATED):
+        some = (probability >= low) & (probability < high)
+        if some.any():
+            rows.append({"stated": float(probability[some].mean()),
+                         "happened": float(there[some].mean()), "statements": int(some.sum())})
+    return rows
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run all cases and print the rates."""
     study, results = read_study(arguments.study), []
-    chosen = cases(study, arguments.singles, arguments.clean, arguments.pairs, arguments.outside)
+    chosen = cases(arguments.singles, arguments.clean, arguments.pairs, arguments.outside)
     with common.workshop(arguments) as workshop:
         there = replace(workshop, folder=arguments.output / "work")
         solver = remembering(there)
@@ -167,8 +228,9 @@ def run(arguments: argparse.Namespace) -> int:
             common.say(f"{number}/{len(chosen)} {case.name}: {one['named']} "
                        f"{one['unknown'] or ''} chi2 {one['chi2_before']:.2f} -> "
                        f"{one['chi2_after']:.2f}")
-    rates = summary(results)
-    write_text(arguments.output / "summary.json", json.dumps(rates, indent=1) + "\n")
+    rates, stated = summary(results), reliability(results)
+    write_text(arguments.output / "summary.json", json.dumps(
+        {"rates": rates, "reliability": stated}, indent=1) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
                         if len(one["hidden"]) == 1 for names in one["named"] or [[NONE]])
     common.print_table([{"hidden": hidden, "named": ", ".join(names), "cases": str(count)}
@@ -176,6 +238,8 @@ def run(arguments: argparse.Namespace) -> int:
                        "What was hidden alone, and what was named")
     common.print_table([{"figure": name, "value": f"{value:.3g}"} for name, value in rates.items()],
                        "Rates")
+    common.print_table([{name: f"{value:.3g}" for name, value in row.items()} for row in stated],
+                       "Probabilities of effects, and how often they were there")
     return 0
 
 
