@@ -376,7 +376,8 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
     noise, observation = update.errors.part(rows), update.observation
     points = probe_points(update.study.instrument, observation.map_points)
     scale = float(np.median(update.errors.sd))
-    mine = [one.found.candidate for one in named]
+    # columns of this search: other places may have been looked at in the one that found them
+    mine = [search.candidates[search.hypotheses.index(one.hypothesis)] for one in named]
     held = [column for one in mine for column in one.columns]
     own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
            for one in mine]
