@@ -1,0 +1,45 @@
+"""Effects on a magnet by magpylib, from the map to the name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.diagnose import diagnose
+from halbach_fe.effects import catalogue
+from halbach_fe.effects.blocks_swapped import BlocksSwapped
+from halbach_fe.field_map import field_map, points_of
+from tests.diagnosis.campaign import CIRCLES, STUDY, measured
+
+class Restless(BlocksSwapped):
+    """Looks at more pairs in every round."""
+
+    looked = 0
+
+    def shortlist(self, study, mean, information, score):
+        self.looked += 7
+        return super().shortlist(study, mean, information, score)[:self.looked]
+
+
+def uniform(data):
+    return field_map(points_of(data), data["B_T"].values + [4e-4, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("name", ["offset_x", "z_scale", "none"])
+def test_a_search_among_pairs_of_blocks(name, workshop, generator):
+    """Which pairs are looked at closely changes from round to round; the rest is the same."""
+    if name == "z_scale":  # 1 mm at the ends of the map
+        data = measured(STUDY, generator, at=CIRCLES * [1.0, 1.0, 1.005])
+    else:
+        data = measured(STUDY, generator)
+        data = uniform(data) if name == "offset_x" else data
+    some = [effect for effect in catalogue() if effect.name in (
+        "background", "gain_x", "gain_z", "length", "offset_x", "z_scale")]
+    found = diagnose(STUDY, data, workshop, effects=[Restless(), *some])
+    assert found.unknown is None
+    assert [name] == [one for each in found.named for one in each.found.effects if one == name] or (
+        name == "none" and not found.named)
+    assert found.after.prior_conflict < found.after.conflict_limit
+    if name == "z_scale":
+        assert found.named[0].values == pytest.approx([0.005], abs=4 * found.named[0].sd[0])
+    assert np.isfinite(found.left_out_after).all()
