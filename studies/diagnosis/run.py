@@ -111,10 +111,10 @@ def run_case(
     found = diagnose(study, readings, workshop, campaign.blocks, solver=solver)
     result = {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
               "truth": campaign.truth["effects"], **outcome(found)}
-    if not case.hidden and not case.outside:
+    if not case.hidden and not case.outside and case.seed % 4 == 0:  # it takes long
         sure = study.model_copy(update={"prior": study.prior.model_copy(update=NO_BLOCKS)})
-        result["without_blocks"] = outcome(diagnose(
-            sure, readings, workshop, solver=solver))["named"]
+        alarm = diagnose(sure, readings, workshop, solver=solver)
+        result["without_blocks"] = bool(alarm.anything or alarm.unknown)
     return result
 
 
@@ -193,7 +193,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
         "control_naming_rate_shuffled_labels": rate(
             named(one, label) for one, label in zip(single, labels, strict=True)),
         "control_false_alarm_rate_without_blocks": rate(
-            bool(one["without_blocks"]) for one in clean if "without_blocks" in one)}
+            one["without_blocks"] for one in clean if "without_blocks" in one)}
 
 
 def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:

@@ -11,6 +11,7 @@ from halbach_fe.effects.blocks_swapped import BlocksSwapped
 from halbach_fe.field_map import field_map, points_of
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured
 
+
 class Restless(BlocksSwapped):
     """Looks at more pairs in every round."""
 
@@ -22,7 +23,7 @@ class Restless(BlocksSwapped):
 
 
 def uniform(data):
-    return field_map(points_of(data), data["B_T"].values + [4e-4, 0.0, 0.0])
+    return field_map(points_of(data), np.add(data["B_T"].values, [4e-4, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("name", ["offset_x", "z_scale", "none"])
