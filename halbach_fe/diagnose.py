@@ -37,6 +37,7 @@ from halbach_fe.diagnosis.selection import (
     log_evidence,
     probabilities,
     select,
+    tailored,
     with_candidates,
 )
 from halbach_fe.diagnosis.vibration import Vibration, settled, shaking, vibration_of
@@ -449,7 +450,8 @@ def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:
     for one in found:
         if one.candidate.certain:
             evidence = evidence.shifted(one.candidate.columns[0])
-    fit = evidence.fit([column for one in found for column in one.candidate.free])
+    fit = tailored(evidence, [one.candidate for one in found]).fit(
+        [column for one in found for column in one.candidate.free])
     deviation = np.sqrt(np.diag(fit.covariance))
     named, first = [], 0
     for one in found:

@@ -223,14 +223,14 @@ def others(diagnosis: Diagnosis) -> list[Other]:
             f"{count} {'readings are' if count > 1 else 'reading is'} off singly and left out "
             f"({text} of the map).", place=text))
     if diagnosis.numerical:
-        one = diagnosis.numerical
+        cause = diagnosis.numerical
         found.append(Other(
             "solver_error", "error of mesh and open boundary", "numerical",
-            f"up to {1e3 * one.largest_error_T:.2g} mT, {one.largest_over_noise:.2g} times the "
+            f"up to {1e3 * cause.largest_error_T:.2g} mT, {cause.largest_over_noise:.2g} times the "
             "noise",
-            f"The solver's own error explains the misfit: chi² per reading is {one.chi2_noise:.3g} "
-            f"by the noise alone and {one.chi2_errors:.3g} with that error. Make `mesh` finer or "
-            "`open_boundary` farther before anything is concluded."))
+            "The solver's own error explains the misfit: chi² per reading is "
+            f"{cause.chi2_noise:.3g} by the noise alone and {cause.chi2_errors:.3g} with that "
+            "error. Make `mesh` finer or `open_boundary` farther before anything is concluded."))
     if diagnosis.vibration:
         size = f"{1e3 * diagnosis.vibration.sd_m:.2g} mm"
         found.append(Other(

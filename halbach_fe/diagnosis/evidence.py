@@ -15,7 +15,7 @@ of their prior standard deviation. Thousands of signatures are compared at the p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as linalg
@@ -55,22 +55,25 @@ class Evidence:
     chi2 : float
         c; its expectation is the number of readings if nothing is missing.
     readings : int
+    prior : ndarray, shape (k,)
+        Precisions of the amplitudes before, in the same units: 1 unless widened.
     """
 
     information: Floats
     score: Floats
     chi2: float
     readings: int
+    prior: Floats
 
     def fit(self, chosen: Sequence[int]) -> Fit:
-        """Fit a set of columns, their amplitudes having mean 0 and standard deviation 1."""
+        """Fit a set of columns, their amplitudes having mean 0."""
         index = np.asarray(chosen, int)
         if not len(index):
             return Fit(0.0, np.zeros(0), np.zeros((0, 0)))
-        precision = self.information[np.ix_(index, index)] + np.eye(len(index))
+        precision = self.information[np.ix_(index, index)] + np.diag(self.prior[index])
         factor = linalg.cho_factor(precision, lower=True)
         mean = linalg.cho_solve(factor, self.score[index])
-        size = float(np.log(np.diag(factor[0])).sum())
+        size = float(np.log(np.diag(factor[0])).sum() - np.log(self.prior[index]).sum() / 2)
         return Fit(float(self.score[index] @ mean / 2) - size, mean,
                    linalg.cho_solve(factor, np.eye(len(index))))
 
@@ -79,25 +82,31 @@ class Evidence:
         index = np.asarray(chosen, int)
         if not len(index):
             return self
-        precision = self.information[np.ix_(index, index)] + np.eye(len(index))
+        precision = self.information[np.ix_(index, index)] + np.diag(self.prior[index])
         cross = linalg.cho_solve(linalg.cho_factor(precision), self.information[index])
         weights = cross.T @ self.score[index]
         fit = self.fit(chosen)
         return Evidence(
             self.information - self.information[index].T @ cross, self.score - weights,
-            self.chi2 - float(self.score[index] @ fit.mean), self.readings)
+            self.chi2 - float(self.score[index] @ fit.mean), self.readings, self.prior)
 
     def only(self, chosen: Sequence[int]) -> Evidence:
         """The same of some columns."""
         index = np.asarray(chosen, int)
-        return Evidence(self.information[np.ix_(index, index)], self.score[index], self.chi2,
-                        self.readings)
+        return replace(self, information=self.information[np.ix_(index, index)],
+                       score=self.score[index], prior=self.prior[index])
 
     def shifted(self, column: int) -> Evidence:
         """The same of readings less one signature, of amplitude 1."""
         row = self.information[column]
-        return Evidence(self.information, self.score - row,
-                        self.chi2 - 2 * self.score[column] + row[column], self.readings)
+        return replace(self, score=self.score - row,
+                       chi2=self.chi2 - 2 * self.score[column] + row[column])
+
+    def widened(self, chosen: Sequence[int], width: float) -> Evidence:
+        """The same with other prior standard deviations of a set of columns."""
+        prior = self.prior.copy()
+        prior[np.asarray(chosen, int)] = width**-2
+        return replace(self, prior=prior)
 
     def log_evidences(self, groups: Sequence[Sequence[int]]) -> Floats:
         """Log evidence of every group of columns by itself, over that of no effect."""
@@ -107,10 +116,12 @@ class Evidence:
             sizes.setdefault(len(group), []).append(number)
         for size, members in sizes.items():
             index = np.array([groups[number] for number in members])
-            precision = self.information[index[:, :, None], index[:, None, :]] + np.eye(size)
+            prior = self.prior[index]
+            precision = self.information[index[:, :, None], index[:, None, :]] + (
+                prior[:, :, None] * np.eye(size))
             score = self.score[index]
             mean = np.linalg.solve(precision, score[:, :, None])[:, :, 0]
-            found[members] = (np.einsum("gk,gk->g", score, mean)
+            found[members] = (np.einsum("gk,gk->g", score, mean) + np.log(prior).sum(axis=1)
                               - np.linalg.slogdet(precision)[1]) / 2
         return found
 
@@ -148,7 +159,8 @@ class Marginal:
             own += columns[part].T @ columns[part]
         half = linalg.solve_triangular(self.factor[0], cross, lower=True)
         total = own - half.T @ half
-        return Evidence(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), len(columns))
+        return Evidence(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), len(columns),
+                        np.ones(len(total) - 1))
 
     def remove(self, columns: Floats) -> Floats:
         """S^-1 times whitened columns (n, k), whitened once more: what the blocks cannot hide."""

@@ -21,6 +21,13 @@ FOUND = 5.0
 ALIKE = 3.0
 """Log evidence by which candidates must differ to be told apart."""
 
+WIDE = 5.0
+"""Standard deviations that an amplitude has with probability 1/2, in place of 1: what is much
+larger than usual is one large effect, not two that share it."""
+
+WIDE_FROM = float(np.sqrt(np.log(WIDE) * 2 / (1 - WIDE**-2)))
+"""Amplitude from which the wide prior is the likelier one, 1.83."""
+
 EFFECT_ODDS = 1 / 50
 """Prior odds of each effect being there."""
 
@@ -97,11 +104,23 @@ def gains(evidence: Evidence, candidates: Sequence[Candidate]) -> Floats:
     """Log Bayes factor (candidates,) of each candidate over none."""
     found = np.empty(len(candidates))
     free = [number for number, one in enumerate(candidates) if not one.certain]
-    found[free] = evidence.log_evidences([candidates[number].columns for number in free])
+    columns = [candidates[number].columns for number in free]
+    wide = evidence.widened(range(len(evidence.prior)), WIDE)
+    found[free] = np.logaddexp(evidence.log_evidences(columns), wide.log_evidences(columns)
+                               ) - np.log(2)
     for number, one in enumerate(candidates):
         if one.certain:
             found[number] = log_evidence(evidence, [one])
     return found
+
+
+def tailored(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """The evidence with a wide prior for those of some candidates, all there, that are large."""
+    free = [column for one in candidates for column in one.free]
+    sizes = dict(zip(free, evidence.widened(free, WIDE).fit(free).mean**2, strict=True))
+    large = [column for one in candidates for column in one.free
+             if np.mean([sizes[other] for other in one.free]) > WIDE_FROM**2]
+    return evidence.widened(large, WIDE)
 
 
 def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
@@ -109,7 +128,8 @@ def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evid
     for one in candidates:
         if one.certain:
             evidence = evidence.shifted(one.columns[0])
-    return evidence.given([column for one in candidates for column in one.free])
+    return tailored(evidence, candidates).given(
+        [column for one in candidates for column in one.free])
 
 
 def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
@@ -120,7 +140,8 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
             column = one.columns[0]
             total += float(evidence.score[column] - evidence.information[column, column] / 2)
             evidence = evidence.shifted(column)
-    return total + evidence.fit(
+        total -= np.log(2) * bool(one.free)
+    return total + tailored(evidence, candidates).fit(
         [column for one in candidates for column in one.free]).log_evidence
 
 

@@ -70,7 +70,8 @@ def test_a_certain_effect_shifts_the_readings(problem):
     other = Candidate("other", "", (3,))
     together = dense(response, signatures[:, [3]], residual - signatures[:, 1]) - dense(
         response, signatures[:, :0], residual)
-    assert log_evidence(evidence, [certain, other]) == pytest.approx(together)
+    # a small amplitude, of two prior widths that were equally likely
+    assert log_evidence(evidence, [certain, other]) == pytest.approx(together - np.log(2))
 
 
 def test_left_out_residuals_are_those_of_each_reading_given_the_others(problem):
@@ -135,6 +136,15 @@ def test_several_effects_are_found_together(seed):
 def test_twins_are_named_together():
     (found,) = select(*hidden({0: 1.0}))
     assert set(found.effects) == {"effect 0", "effect 19"}
+
+
+def test_one_large_effect_is_not_two(monkeypatch):
+    """Twenty standard deviations; with the usual prior alone, a twin takes half of it."""
+    (found,) = select(*hidden({0: 20.0}))
+    assert found.candidate.effect == "effect 0"
+    monkeypatch.setattr("halbach_fe.diagnosis.selection.WIDE", 1.0)
+    both = select(*hidden({0: 20.0}))
+    assert {one.candidate.effect for one in both} == {"effect 0", "effect 19"}
 
 
 def test_shuffled_signatures_break_the_naming():
