@@ -17,9 +17,10 @@ from typing import Literal
 
 import numpy as np
 import xarray as xr
+from pydantic import ValidationError
 
 from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.diagnosis.discrepancy import Terms, harmonic_fields, judge, sensor_errors
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.gross import Gross, find_gross
@@ -43,6 +44,7 @@ from halbach_fe.diagnosis.selection import (
 from halbach_fe.diagnosis.vibration import Vibration, settled, shaking, vibration_of
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect, Parameter, Place
+from halbach_fe.errors import HalbachError
 from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
@@ -258,7 +260,7 @@ def diagnose(
             vibration = shaken
             signatures.clear()  # whitened by the noise that it was
             continue
-        found = _amplitudes(search, select(search.evidence, search.candidates))
+        found = _found(read, search)
         if _settled(named, found):
             break
         named = found
@@ -442,6 +444,28 @@ def remembering(workshop: Workshop) -> Solver:
             known[key] = solve_nominal(study, points, workshop)
         return known[key]
     return solve
+
+
+def _found(read: Study, search: Search) -> tuple[Named, ...]:
+    """What is missing, of what can be: no gap is negative."""
+    barred: set[int] = set()
+    while True:
+        found = _amplitudes(
+            search, select(search.evidence, search.candidates, barred=barred))
+        bad = next((number for number in range(len(found))
+                    if not _possible(read, found[:number + 1])), None)
+        if bad is None:
+            return found
+        barred.add(search.candidates.index(found[bad].found.candidate))
+
+
+def _possible(study: Study, named: Sequence[Named]) -> bool:
+    """Tell whether a study can have effects of their amplitudes."""
+    try:
+        blocks_of(Study.model_validate(applied(study, named).model_dump()))
+    except (ValidationError, HalbachError):
+        return False
+    return True
 
 
 def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:

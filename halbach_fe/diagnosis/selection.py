@@ -7,7 +7,7 @@ itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,24 +145,28 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
         [column for one in candidates for column in one.free]).log_evidence
 
 
-def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -> list[Found]:
+def select(
+    evidence: Evidence, candidates: Sequence[Candidate], most: int = 6,
+    barred: Collection[int] = (),
+) -> list[Found]:
     """Find missing effects one after the other; drop those that later ones make needless.
 
-    ``most`` is how many effects are looked for.
+    ``most`` is how many effects are looked for, ``barred`` are numbers of candidates that cannot
+    be, as their amplitudes are impossible.
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
     while len(chosen) < most:
         now = with_candidates(evidence, [candidates[number] for number in chosen])
         odds = gains(now, candidates) + prior
-        odds[chosen] = -np.inf
+        odds[[*chosen, *barred]] = -np.inf
         taken = {candidates[number].effect for number in chosen if candidates[number].only}
         odds[[number for number, one in enumerate(candidates) if one.effect in taken]] = -np.inf
         best = int(np.argmax(odds))
         if odds[best] < FOUND:
             break
         before = len(chosen)
-        chosen = _at_best_places(evidence, candidates, [*chosen, best])
+        chosen = _at_best_places(evidence, candidates, [*chosen, best], barred)
         best = chosen[-1]
         chosen = _needed(evidence, candidates, chosen, prior)
         if best not in chosen or len(chosen) <= before - 1:
@@ -171,7 +175,8 @@ def select(evidence: Evidence, candidates: Sequence[Candidate], most: int = 6) -
 
 
 def _at_best_places(
-    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int]
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int],
+    barred: Collection[int],
 ) -> list[int]:
     """Move what is in one place only to where it is best, the others being there."""
     chosen = list(chosen)
@@ -179,7 +184,7 @@ def _at_best_places(
         if candidates[number].only:
             others = [candidates[k] for k in chosen if k != number]
             places = [k for k, one in enumerate(candidates)
-                      if one.effect == candidates[number].effect]
+                      if one.effect == candidates[number].effect and k not in barred]
             factors = gains(with_candidates(evidence, others), [candidates[k] for k in places])
             chosen[index] = places[int(np.argmax(factors))]
     return chosen

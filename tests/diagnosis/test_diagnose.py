@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from halbach_fe.blocks import blocks_of
 from halbach_fe.diagnose import diagnose
 from halbach_fe.effects import catalogue
+from halbach_fe.effects.base import Place
 from halbach_fe.effects.blocks_swapped import BlocksSwapped
+from halbach_fe.exact_field import field_of
 from halbach_fe.field_map import field_map, points_of
-from tests.diagnosis.campaign import CIRCLES, STUDY, measured
+from halbach_fe.study import parse_study
+from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured
 
 
 class Restless(BlocksSwapped):
@@ -44,3 +48,19 @@ def test_a_search_among_pairs_of_blocks(name, workshop, generator):
     if name == "z_scale":
         assert found.named[0].values == pytest.approx([0.005], abs=4 * found.named[0].sd[0])
     assert np.isfinite(found.left_out_after).all()
+
+
+def test_impossible_amplitudes_are_no_explanation(workshop, generator):
+    """Blocks that are wider than their sectors: what that does is not called a gap."""
+    gap = next(effect for effect in catalogue() if effect.name == "azimuthal_gap")
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | {
+        "outer_radius_m": 0.15, "block": {"shape": "sector"}}})
+    nominal = field_of(blocks_of(study), CIRCLES)
+    change = field_of(blocks_of(gap.apply(study, Place(), [3e-4])), CIRCLES) - nominal
+    noise = NOISE_T * generator.standard_normal(CIRCLES.shape)
+    wider, narrower = (field_map(CIRCLES, nominal + sign * change + noise) for sign in (-1, 1))
+    tight = study.model_copy(update={"prior": study.prior.model_copy(update={
+        "magnitude_sd": 1e-4, "direction_sd_deg": 0.01, "common_mode_sd": 1e-4})})
+    (named,) = diagnose(tight, narrower, workshop, effects=[gap]).named
+    assert named.values == pytest.approx([3e-4], abs=4 * named.sd[0])
+    assert diagnose(tight, wider, workshop, effects=[gap]).named == ()
