@@ -125,7 +125,7 @@ class BlockException(_Model):
     mounted_from: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
     magnetization_factor: Annotated[float, Field(ge=-2.0, le=2.0)] = 1.0
     magnetization_gradient: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
-    inner_corner_loss: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
+    inner_corner_loss: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     displacement_m: Displacement = (0.0, 0.0, 0.0)
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
     shift_m: Displacement = (0.0, 0.0, 0.0)

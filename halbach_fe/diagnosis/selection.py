@@ -171,7 +171,7 @@ def select(
         chosen = _needed(evidence, candidates, chosen, prior)
         if best not in chosen or len(chosen) <= before - 1:
             break  # adding and dropping would go on for ever
-    return [_found(evidence, candidates, chosen, number, prior) for number in chosen]
+    return [_found(evidence, candidates, chosen, number, prior, barred) for number in chosen]
 
 
 def _at_best_places(
@@ -206,14 +206,14 @@ def _needed(
 
 def _found(
     evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], number: int,
-    prior: Floats,
+    prior: Floats, barred: Collection[int],
 ) -> Found:
     """One found candidate, and what would do in its place."""
     others = [candidates[k] for k in chosen if k != number]
     now = with_candidates(evidence, others)
     factors = gains(now, candidates)
     odds = factors + prior
-    alike = [k for k in np.argsort(-odds) if k != number and k not in chosen
+    alike = [k for k in np.argsort(-odds) if k != number and k not in chosen and k not in barred
              and odds[k] > odds[number] - ALIKE]
     return Found(candidates[number], float(factors[number]), float(odds[number]),
                  tuple((candidates[k], float(factors[k])) for k in alike))

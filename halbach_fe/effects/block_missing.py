@@ -19,6 +19,7 @@ class BlockMissing(Effect):
     parameters = (Parameter("there", "1", 1.0),)
     certain = True
     discrete = True
+    factor = 0.0  # of the block's magnetization
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
@@ -27,12 +28,12 @@ class BlockMissing(Effect):
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
         (block,) = blocks_at(scene, place)
-        return -scene.block_fields[block][None]
+        return (self.factor - 1) * scene.block_fields[block][None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         return with_exceptions(study, [BlockException(
-            ring=place.ring, slot=place.slot, magnetization_factor=0.0)])
+            ring=place.ring, slot=place.slot, magnetization_factor=self.factor)])
 
 
 EFFECTS = (BlockMissing(),)

@@ -24,9 +24,10 @@ class CornersDemagnetized(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        there = study.array.exceptions[-1].inner_corner_loss if study.array.exceptions else None
+        there = next((one.inner_corner_loss for one in reversed(study.array.exceptions)
+                      if one.inner_corner_loss is not None and not (one.ring or one.slot)), 0.0)
         return with_exceptions(study, [BlockException(
-            inner_corner_loss=(there or 0.0) + float(values[0]))])
+            inner_corner_loss=there + float(values[0]))])
 
 
 EFFECTS = (CornersDemagnetized(),)

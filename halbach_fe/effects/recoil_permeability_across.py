@@ -4,24 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from halbach_fe.blocks import Floats
-from halbach_fe.effects.base import Effect, Parameter, Place, with_array
-from halbach_fe.scene import Scene
+from halbach_fe.effects.base import Place, with_array
+from halbach_fe.effects.recoil_permeability import RecoilPermeability
 from halbach_fe.study import Study
 
 
-class RecoilPermeabilityAcross(Effect):
+class RecoilPermeabilityAcross(RecoilPermeability):
     """Of all blocks, across their easy axes."""
 
     name = "recoil_permeability_across"
     title = "recoil permeability of the blocks across the easy axis"
-    kind = "field"
-    parameters = (Parameter("difference", "1", 0.05),)
-
-    def signature(self, scene: Scene, place: Place) -> Floats:
-        """See `Effect.signature`."""
-        step = 0.02  # upwards: below 1 there is none
-        return ((scene.solve(self.apply(scene.study, place, [step])) - scene.solved) / step)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

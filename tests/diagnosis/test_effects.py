@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from halbach_fe.blocks import blocks_of
 from halbach_fe.effects import catalogue
+from halbach_fe.effects.base import Place
 from halbach_fe.exact_field import field_of
 from halbach_fe.external import external_field
 from halbach_fe.instrument import probe, remainder
@@ -86,3 +88,13 @@ def test_seams_move_what_is_beyond_them_outwards():
              for place in effect.places(STUDY)]
     assert moved == pytest.approx(np.array([
         [-1e-3, 0, 0, 0], [-5e-4, -5e-4, 5e-4, 5e-4], [0, 0, 0, 1e-3]]))
+
+
+def test_losses_of_corners_add_up_and_are_no_gains():
+    corners, shifted = EFFECTS["corners_demagnetized"], EFFECTS["ring_shifted"]
+    study = corners.apply(STUDY, Place(), [0.2])
+    study = shifted.apply(study, shifted.places(study)[0], [1e-3, 0.0])
+    assert corners.apply(study, Place(), [0.1]).array.exceptions[-1].inner_corner_loss == (
+        pytest.approx(0.3))
+    with pytest.raises(ValidationError, match="inner_corner_loss"):
+        corners.apply(study, Place(), [-0.3])

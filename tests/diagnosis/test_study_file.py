@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from halbach_fe import study_file
 from halbach_fe.effects import catalogue
@@ -68,10 +69,10 @@ def with_effects(study, names, generator):
         place = places[generator.integers(len(places))]
         values = [1.0] if effect.certain else [
             parameter.sd * float(generator.standard_normal()) for parameter in effect.parameters]
-        now = effect.apply(study, place, values)
         try:
+            now = effect.apply(study, place, values)
             parse_study(now.model_dump())
-        except StudyError:  # a gap below 0
+        except (StudyError, ValidationError):  # a gap or a loss below 0
             continue
         study = now
         found.append((study, f"{name} {place.name}: {values[0]:.3g}"))
