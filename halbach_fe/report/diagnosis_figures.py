@@ -192,6 +192,8 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
         right.barh(range(len(bars)), [value for _, value, _ in bars],
                    color=[colour for *_, colour in bars])
         right.set_yticks(range(len(bars)), [name for name, *_ in bars])
+        right.set_xscale("log")  # from a handful to a hundred thousand
+        right.set_xlim(left=1)
         right.axvline(FOUND, color=MEASURED, lw=0.8, ls="--")
         right.set_xlabel("log Bayes factor")
     else:
