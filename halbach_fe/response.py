@@ -33,7 +33,7 @@ from halbach_fe.routes import (
     finite_element_part,
 )
 from halbach_fe.solve import Workshop
-from halbach_fe.study import COMPONENTS, MU_0, Study, curve_of, is_nonlinear
+from halbach_fe.study import COMPONENTS, MU_0, Study, curve_of
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
     for number, block in enumerate(blocks):
         readings = observation.apply(np.moveaxis(parts.block(number), 2, 0))
-        share = readings * (block.remanence * np.array(block.easy_axis[:dimension]))[:, None]
+        source = parts.sources[number]
+        share = readings * (source.remanence * np.array(source.easy_axis[:dimension]))[:, None]
         total += share.sum(axis=0)
         magnitude += np.abs(share).sum(axis=0)
         if exact:
@@ -102,11 +103,12 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     direct = observation.apply(parts.along_nominal)
+    error = (reading_errors(study, observation, parts.nominal, error_workshop(workshop))
+             if parts.error is None else observation.magnitude(parts.error))
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
-    error = reading_errors(study, observation, parts.nominal, error_workshop(workshop))
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
     offset = observation.apply(external_field(study, observation.points))
-    if is_nonlinear(study):
+    if parts.linearized:
         field = exact_part(study, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
     built = Response(matrix, parameter_names(study), nominal, offset,

@@ -6,6 +6,9 @@ functions times ``cos n phi``, ``cos k z`` and their sines, and polynomials that
 one: each component is a Fourier series in z and angle by itself. Both have many terms with
 amplitudes of one unknown scale, smaller for finer ones, and the evidence is averaged over the
 scale; so a named effect with one amplitude, where it explains as much, is the better explanation.
+
+The solver's own error is such a field as well, smooth and of a size that is known: no effect may be
+named for what it can explain.
 """
 
 from __future__ import annotations
@@ -109,6 +112,15 @@ def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> Terms:
                     add(k * slope * turn * wave_z, order * over * sine * wave_z,
                         k * bessel * turn * slope_z, order, wave)
     return Terms(np.array(found), np.array(fineness, float))
+
+
+def of_size(terms: Terms, size: float) -> Floats:
+    """Fields (k, n, 3) whose amplitudes of standard deviation 1, finer ones smaller, make an rms of
+    ``size`` in each component.
+    """
+    weights = np.exp(-terms.fineness @ DECAYS[0])
+    weights *= np.sqrt(3) * size / np.linalg.norm(weights)
+    return weights[:, None, None] * terms.fields
 
 
 def sensor_errors(points: Floats, orders: int = 3, waves: int = 8) -> Terms:

@@ -3,8 +3,8 @@
 Each reading is compared with what all others foretell of it, blocks integrated out, and that
 difference with those of its neighbours: whatever a model lacks is smooth, and what is left of it
 varies little from one reading to the next, or is rough all around. A second-order polynomial
-through the neighbours foretells the difference, and how far they are from it themselves is the
-local scale.
+through the neighbours, robust against other outliers, foretells the difference, and how far they
+are from it themselves is the local scale.
 """
 
 from __future__ import annotations
@@ -38,6 +38,13 @@ RANGE = 0.1
 
 FOUND = 5.0
 """Log posterior odds from which a reading is one: beyond some six standard deviations."""
+
+ROBUST = 6
+"""Fits of a polynomial: neighbours far from the last one weigh less, as several may be off."""
+
+CAUCHY = 2.385
+"""Times the scale, at which a neighbour weighs half (P. W. Holland and R. E. Welsch, Communications
+in Statistics A6 (1977) 813)."""
 
 MAD = 1.4826
 """Standard deviation over the median of the magnitude, of normal numbers."""
@@ -215,38 +222,42 @@ class _Neighbourhood:
     def odd_ones(
         self, now: Foretold, off: NDArray[np.bool_], largest: float
     ) -> NDArray[np.bool_]:
-        """Tell which readings (k,) are off, the largest first, as they spoil their neighbours'."""
+        """Tell which readings (k,) are off: suspects, and of these the ones that are far even from
+        what all other readings foretell with equal weights.
+        """
         difference, sd = now.difference[self.rows], now.sd[self.rows]
-        off, again = off.copy(), np.ones(len(off), bool)
-        deviation, local = np.empty(len(off)), np.empty(len(off))
-        own = np.empty(len(off))
-        while again.any():
-            deviation[again], own[again], local[again] = self._deviations(difference, off, again)
+
+        def odd(off: NDArray[np.bool_], fits: int) -> NDArray[np.bool_]:
+            deviation, own, local = self._deviations(difference, off, fits)
             standard = deviation / (own * sd)
             odds = (standard**2 / 2 - np.log(2 * RANGE * largest / (np.sqrt(2 * np.pi) * sd))
                     + np.log(ODDS))
-            odd = (odds > FOUND) & (deviation > LOCAL * local)
-            worst = np.where(odd & ~off, deviation, 0.0)
-            new = (worst > 0) & (worst >= worst[self.nearest].max(axis=1))
-            off |= new
-            again = new[self.nearest].any(axis=1)
-        return off & odd
+            return (odds > FOUND) & (deviation > LOCAL * local)
+
+        suspects = off | odd(off, ROBUST)
+        while True:
+            left = suspects & odd(suspects, 1)
+            if (left == suspects).all():
+                return left
+            suspects = left
 
     def _deviations(
-        self, difference: Floats, off: NDArray[np.bool_], chosen: NDArray[np.bool_]
+        self, difference: Floats, off: NDArray[np.bool_], fits: int
     ) -> tuple[Floats, Floats, Floats]:
-        """Of chosen readings: deviation from what the neighbours that are not off foretell, its
+        """Deviation of readings (k,) from what the neighbours that are not off foretell, its
         standard deviation if theirs is 1, and as these scatter.
         """
-        nearest = self.nearest[chosen]
-        good = ~off[nearest]
-        terms, values = self.terms[chosen] * good[:, :, None], difference[nearest] * good
-        inverse = np.linalg.pinv(terms, rcond=1e-6)
+        good = ~off[self.nearest]
+        terms, values = self.terms * good[:, :, None], difference[self.nearest] * good
+        root = good.astype(float)
+        for _ in range(fits):
+            inverse = np.linalg.pinv(terms * root[:, :, None], rcond=1e-6) * root[:, None]
+            rest = values - np.einsum("kij,kjl,kl->ki", terms, inverse, values, optimize=True)
+            typical = np.nanmedian(np.where(good, np.abs(rest), np.nan), axis=1)[:, None]
+            root = good / np.hypot(1, rest / np.maximum(CAUCHY * MAD * typical, 1e-300))
         weights = inverse[:, 0]
-        rest = values - np.einsum("kij,kjl,kl->ki", terms, inverse, values, optimize=True)
         rank = np.einsum("kij,kji->k", terms, inverse)
         free = np.maximum(good.sum(axis=1) - rank, 1)
-        scale = MAD * np.nanmedian(np.where(good, np.abs(rest), np.nan), axis=1) * np.sqrt(
-            good.sum(axis=1) / free)
+        scale = MAD * typical[:, 0] * np.sqrt(good.sum(axis=1) / free)
         own = np.sqrt(1 + np.sum(weights**2, axis=1))
-        return (np.abs(difference[chosen] - np.sum(weights * values, axis=1)), own, own * scale)
+        return (np.abs(difference - np.sum(weights * values, axis=1)), own, own * scale)

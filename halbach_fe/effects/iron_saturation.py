@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 from halbach_fe.blocks import Floats
 from halbach_fe.effects.base import Effect, Parameter, Place
+from halbach_fe.effects.iron_ring import STEEL
 from halbach_fe.scene import Scene
 from halbach_fe.study import IronRing, SteelCurve, Study
-
-STEEL = "aisi_1010"
 
 
 class IronSaturation(Effect):

@@ -121,15 +121,19 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 
 def write_report(
-    diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path
+    diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path,
+    assumptions: Sequence[str] = (),
 ) -> None:
-    """Write diagnosis.html, self-contained, and its figures as PNG into ``folder``."""
+    """Write diagnosis.html, self-contained, and its figures as PNG into ``folder``.
+
+    ``assumptions`` are sentences that the reader must know before the result.
+    """
     drawn = {name: (draw(diagnosis), text) for name, (draw, text) in FIGURES.items()}
     pictures = save({f"diagnosis_{name}.png": one for name, one in drawn.items()}, folder)
     titles = _catalogue_titles(diagnosis)
     write_page(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
-        study=diagnosis.before.study, verdict=verdict(diagnosis),
+        study=diagnosis.before.study, verdict=verdict(diagnosis), assumptions=assumptions,
         shown=dict(zip(drawn, pictures, strict=True)),
         found=[{"what": one.title, "where": one.place, "how much": one.amount,
                 "log Bayes factor": one.factor, "kind": one.kind} for one in others(diagnosis)]

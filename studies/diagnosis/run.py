@@ -1,6 +1,7 @@
 """Sealed cases of hidden effects, and how often the diagnosis names them.
 
-Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on::
+Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on. Cases are
+independent, and --jobs of them run at a time::
 
     python studies/diagnosis/run.py -o results/diagnosis
 """
@@ -10,9 +11,12 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import multiprocessing
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,10 +29,13 @@ from halbach_fe.campaign.simulate import simulate
 from halbach_fe.cli import common
 from halbach_fe.diagnose import Diagnosis, Solver, diagnose, remembering
 from halbach_fe.effects import catalogue
+from halbach_fe.errors import CheckFailedError, HalbachError
+from halbach_fe.extent import magnet_half_length
 from halbach_fe.field_map import points_of
+from halbach_fe.report.sealed_cases import write_sealed_cases
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study, read_study
-from halbach_fe.update import HELD_OUT, write_text
+from halbach_fe.update import HELD_OUT, Update, write_text
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0
@@ -43,6 +50,14 @@ NO_BLOCKS = {"magnitude_sd": 1e-5, "direction_sd_deg": 1e-3, "common_mode_sd": 1
 
 BACK = (0.9, 1.1)
 """chi2 per held-out reading of a model that lacks nothing."""
+
+WANTED = {
+    "naming_rate_single": (0.95, 1.0), "naming_rate_pairs": (0.9, 1.0),
+    "false_alarm_rate": (0.0, 0.02), "unknown_rate": (0.9, 1.0),
+    "heldout_recovered_rate": (0.95, 1.0), "iron_fringe_reduction": (10.0, np.inf),
+    "control_naming_rate_shuffled_labels": (0.0, 0.2),
+    "control_false_alarm_rate_without_blocks": (0.5, 1.0)}
+"""Rates; of the controls, which must fail, too."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +147,15 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
         "unknown": None if found.unknown is None else found.unknown.kind,
         "probabilities": found.probabilities, "best": found.best_factors,
         "disagrees": found.before.prior_conflict > found.before.conflict_limit,
+        "fringe_T": [fringe(found.before), fringe(found.after)],
         "chi2_before": chi2["before"][0], "chi2_after": chi2["after"][0], "rounds": found.rounds}
+
+
+def fringe(update: Update) -> float:
+    """Rms difference in T of held-out readings beyond the magnet's ends from their prediction."""
+    beyond = np.abs(update.observation.positions[:, 2]) > magnet_half_length(update.study)
+    some = update.held_out & beyond
+    return float(np.sqrt(np.mean((update.readings - update.prediction_posterior.mean)[some]**2)))
 
 
 def known_as(name: str) -> list[str]:
@@ -189,6 +212,9 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
         "clean_cases": len(clean),
         "unknown_rate": rate(one["unknown"] is not None for one in outside),
         "outside_cases": len(outside),
+        "iron_fringe_reduction": float(np.median([
+            np.divide(*one["fringe_T"]) for one in results if one["hidden"] == ["iron_ring"]]
+            or [np.nan])),
         "heldout_recovered_rate": rate(BACK[0] <= one["chi2_after"] <= BACK[1] for one in right),
         "control_naming_rate_shuffled_labels": rate(
             named(one, label) for one, label in zip(single, labels, strict=True)),
@@ -196,12 +222,17 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
             one["without_blocks"] for one in clean if "without_blocks" in one)}
 
 
+def truly_there(result: dict[str, Any]) -> set[str]:
+    """Effects that have a probability and are hidden; what was put right before is none."""
+    hidden = {one for name in result["hidden"] for one in known_as(name)}
+    return hidden & result["probabilities"].keys() or {NONE}
+
+
 def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
     """How often effects are there to which some probability is given, where one at most is."""
-    stated = [(probability, name in {k for one in result["hidden"] or [NONE] for k in (
-        [NONE] if one == NONE else known_as(one))})
-        for result in results if len(result["hidden"]) <= 1 and not result["outside"]
-        for name, probability in result["probabilities"].items()]
+    single = [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]]
+    stated = [(probability, name in truly_there(one))
+              for one in single for name, probability in one["probabilities"].items()]
     probability, there = (np.array(one, float) for one in zip(*stated, strict=True))
     rows = []
     for low, high in itertools.pairwise(STATED):
@@ -212,27 +243,64 @@ def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
     return rows
 
 
+_solver: dict[Path, Solver] = {}
+"""Of this process, which keeps what it solved for other cases."""
+
+
+def run_one(study: Study, case: Case, workshop: Workshop, path: Path) -> str:
+    """Run a case in a process of its own and keep what came of it; return why not, if it failed."""
+    there = replace(workshop, folder=workshop.folder / f"work-{os.getpid()}")
+    solver = _solver.setdefault(there.folder, remembering(there))
+    try:
+        write_text(path, json.dumps(run_case(study, case, there, solver), indent=1) + "\n")
+    except HalbachError as error:
+        return str(error)
+    return ""
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run all cases and print the rates."""
-    study, results = read_study(arguments.study), []
+    study = read_study(arguments.study)
     chosen = cases(arguments.singles, arguments.clean, arguments.pairs, arguments.outside)
-    with common.workshop(arguments) as workshop:
-        there = replace(workshop, folder=arguments.output / "work")
-        solver = remembering(there)
-        for number, case in enumerate(chosen, start=1):
-            path = arguments.output / "cases" / f"{case.name}.json"
-            if not path.exists():
-                write_text(path, json.dumps(run_case(study, case, there, solver), indent=1) + "\n")
-            results.append(json.loads(path.read_text()))
-            one = results[-1]
-            common.say(f"{number}/{len(chosen)} {case.name}: {one['named']} "
-                       f"{one['unknown'] or ''} chi2 {one['chi2_before']:.2f} -> "
-                       f"{one['chi2_after']:.2f}")
+    if arguments.only:
+        chosen = [one for one in chosen if one.seed in arguments.only]
+    paths = {case: arguments.output / "cases" / f"{case.name}.json" for case in chosen}
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the cases share the cores
+    with (common.workshop(arguments) as workshop,
+          ProcessPoolExecutor(arguments.jobs, multiprocessing.get_context("spawn")) as pool):
+        alone = replace(workshop, jobs=1, progress=None)
+        waiting = {pool.submit(run_one, study, case, alone, path): case
+                   for case, path in paths.items() if not path.exists()}
+        for number, future in enumerate(as_completed(waiting), start=1):
+            case = waiting[future]
+            failure = future.result()
+            common.say(f"{number}/{len(waiting)} " + (
+                f"{case.name} failed: {failure}" if failure
+                else sentence(json.loads(paths[case].read_text()))))
+    results = [json.loads(path.read_text()) for path in paths.values() if path.exists()]
+    rates = report(study, results, arguments.output)
+    missed = [f"{len(paths) - len(results)} cases failed"] * (len(results) < len(paths)) + [
+        f"{name} is {rates[name]:.3g}" for name, (low, high) in WANTED.items()
+        if not (np.isnan(rates[name]) or low <= rates[name] <= high)]
+    if missed:
+        raise CheckFailedError(f"The diagnosis should be better: {'; '.join(missed)}.")
+    return 0
+
+
+def sentence(one: dict[str, Any]) -> str:
+    """What came of a case."""
+    return (f"{one['case']}: {one['named']} {one['unknown'] or ''} chi2 {one['chi2_before']:.2f} "
+            f"-> {one['chi2_after']:.2f}")
+
+
+def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[str, float]:
+    """Write rates, table and page; print and return the rates."""
     rates, stated = summary(results), reliability(results)
-    write_text(arguments.output / "summary.json", json.dumps(
+    write_text(folder / "summary.json", json.dumps(
         {"rates": rates, "reliability": stated}, indent=1) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
                         if len(one["hidden"]) == 1 for names in one["named"] or [[NONE]])
+    write_sealed_cases(study, results, rates, stated, confusion, folder)
     common.print_table([{"hidden": hidden, "named": ", ".join(names), "cases": str(count)}
                         for (hidden, names), count in sorted(confusion.items())],
                        "What was hidden alone, and what was named")
@@ -240,7 +308,8 @@ def run(arguments: argparse.Namespace) -> int:
                        "Rates")
     common.print_table([{name: f"{value:.3g}" for name, value in row.items()} for row in stated],
                        "Probabilities of effects, and how often they were there")
-    return 0
+    common.say(f"Report: {folder / 'sealed_cases.html'}")
+    return rates
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -248,6 +317,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     for name, count in (("singles", 2), ("clean", 20), ("pairs", 20), ("outside", 12)):
         parser.add_argument(f"--{name}", type=int, default=count, metavar="N",
                             help="cases (of each effect, for singles; default: %(default)s)")
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="numbers of cases")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,105 @@
+"""What came of sealed cases: what was hidden and what was named, stated probabilities, the gap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.study import Study
+
+Confusion = Mapping[tuple[str, tuple[str, ...]], int]
+"""Cases by what was hidden alone, and the names that were given to something found."""
+
+
+def write_sealed_cases(
+    study: Study, results: Sequence[Mapping[str, Any]], rates: Mapping[str, float],
+    reliability: Sequence[Mapping[str, float]], confusion: Confusion, folder: Path,
+) -> None:
+    """Write sealed_cases.html and its figures.
+
+    Parameters
+    ----------
+    results : sequence of mapping
+        Of each case: hidden, named, chi2_before, chi2_after.
+    reliability : sequence of mapping
+        Probability stated, and how often it happened, in bins: stated, happened, statements.
+    """
+    drawn = {
+        "confusion.png": (_confusion(confusion), "What was named of what was hidden alone; effects "
+                          "that are named together cannot be told apart by that map"),
+        "reliability.png": (_reliability(reliability), "How often effects were there whose "
+                            "probability was stated; bars are 95 % of what chance allows"),
+        "gap.png": (_gap(results), "Chi² per held-out reading of every case, before and after; the "
+                    "band is 0.9 to 1.1")}
+    write_page(folder / "sealed_cases.html", "sealed_cases.html.j2", save(drawn, folder),
+               study=study, cases=len(results),
+               rates=[{"figure": name.replace("_", " "), "value": f"{value:.3g}"}
+                      for name, value in rates.items()],
+               rows=[{"case": one["case"], "named": ", ".join(
+                   " or ".join(names) for names in one["named"]) or "nothing",
+                   "unknown": one["unknown"] or "", "chi² before": f"{one['chi2_before']:.3g}",
+                   "after": f"{one['chi2_after']:.3g}"} for one in results])
+
+
+def _confusion(confusion: Confusion) -> Figure:
+    """A square for each hidden effect and each first name given to it."""
+    if not confusion:
+        return Figure()
+    hidden = sorted({one for one, _ in confusion})
+    called = [next((name for name in names if name == truth or name[:-2] == truth), names[0])
+              for truth, names in confusion]
+    bases = [name[:-2] if name[:-2] in hidden else name for name in called]
+    columns = [*(name for name in hidden if name in bases),
+               *sorted(set(bases) - set(hidden))]
+    counts = np.zeros((len(hidden), len(columns)))
+    for ((truth, _), count), base in zip(confusion.items(), bases, strict=True):
+        counts[hidden.index(truth), columns.index(base)] += count
+    figure = Figure(figsize=(3 + 0.22 * len(columns), 2.5 + 0.2 * len(hidden)),
+                    layout="constrained")
+    axis = figure.subplots()
+    axis.imshow(np.where(counts, counts, np.nan), cmap="Blues", vmin=0, vmax=counts.max())
+    for row, column in np.argwhere(counts):
+        axis.text(column, row, f"{counts[row, column]:.0f}", ha="center", va="center", fontsize=7,
+                  color="white" if counts[row, column] > counts.max() / 2 else "black")
+    axis.set(xlabel="named", ylabel="hidden")
+    axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
+    axis.set_yticks(range(len(hidden)), hidden, fontsize=7)
+    return figure
+
+
+def _reliability(rows: Sequence[Mapping[str, float]]) -> Figure:
+    """Stated probability against frequency, with what a binomial allows."""
+    figure = Figure(figsize=(5, 4.6), layout="constrained")
+    axis = figure.subplots()
+    stated = np.array([row["stated"] for row in rows])
+    counts = np.array([row["statements"] for row in rows])
+    spread = 1.96 * np.sqrt(stated * (1 - stated) / np.maximum(counts, 1))
+    axis.plot([0, 1], [0, 1], color=PUBLISHED)
+    axis.errorbar(stated, stated, np.vstack([np.minimum(spread, stated),
+                                             np.minimum(spread, 1 - stated)]),
+                  fmt="none", ecolor=PUBLISHED, capsize=3)
+    axis.plot(stated, [row["happened"] for row in rows], "o", color=POSTERIOR)
+    for row in rows:
+        axis.annotate(f"{row['statements']:.0f}", (row["stated"], row["happened"]),
+                      textcoords="offset points", xytext=(6, -10), fontsize=8)
+    axis.set(xlabel="probability stated", ylabel="how often it was so", xlim=(-0.03, 1.06),
+             ylim=(-0.06, 1.06))
+    return figure
+
+
+def _gap(results: Sequence[Mapping[str, Any]]) -> Figure:
+    """Held-out chi2 of all cases, sorted by what it was before."""
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    axis = figure.subplots()
+    ordered = sorted(results, key=lambda one: one["chi2_before"])
+    axis.axhspan(0.9, 1.1, color=PUBLISHED, alpha=0.4, lw=0)
+    axis.semilogy([one["chi2_before"] for one in ordered], ".", color=PRIOR, label="before")
+    axis.semilogy([one["chi2_after"] for one in ordered], ".", color=POSTERIOR, label="after")
+    axis.set(xlabel="case", ylabel="chi² per held-out reading")
+    axis.legend()
+    return figure

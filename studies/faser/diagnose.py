@@ -1,0 +1,49 @@
+"""The first FASER dipole: what the model lacks, by the published on-axis profile.
+
+One component on one line tells little: many effects look alike there, and the published noise of
+the fringe field is larger than most. The result is what the readings support, with the assumptions
+of `run.py` beside it::
+
+    python studies/faser/diagnose.py -o results/faser-diagnosis
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from run import HERE, assumptions, options, profile_to_map, with_step
+
+from halbach_fe.cli import common
+from halbach_fe.diagnose import diagnose
+from halbach_fe.diagnosed import write_study, write_summary
+from halbach_fe.field_map import read_map
+from halbach_fe.next_measurement import separations
+from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_report
+from halbach_fe.study import read_study
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose the published profile, write everything, print what was found."""
+    measured = arguments.output / "measured.csv"
+    profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, arguments.z_step_m)
+    study = with_step(read_study(arguments.study), arguments.z_step_m)
+    data = read_map(measured)
+    with common.workshop(arguments) as workshop:
+        found = diagnose(study, data, workshop, say=common.say)
+        next_ones = separations(found, data, workshop)
+    assumed = assumptions(found.before, arguments.z_step_m)
+    write_summary(found, next_ones, arguments.output)
+    write_report(found, next_ones, arguments.output, assumed)
+    write_study(arguments.study.read_text(encoding="utf-8"), study, found, arguments.output)
+    common.say("Assumed:\n" + "\n".join(f"- {one}" for one in assumed))
+    common.say(" ".join(verdict(found)))
+    if found.anything:
+        common.print_table(found_table(found), "What the model lacks, if the assumptions hold")
+    common.print_table(change_table(found), "The model before and after")
+    common.say(f"Report: {arguments.output / 'diagnosis.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(common.run_study(__doc__ or "", HERE / "study.toml", "faser-diagnosis", run, options))
