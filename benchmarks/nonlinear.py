@@ -63,11 +63,12 @@ def faser(note: Note) -> None:
     with tempfile.TemporaryDirectory() as name:
         workshop = Workshop(find_getdp(), Path(name), jobs=2)
         started = time.monotonic()
-        part = finite_element_part(study, points, workshop, columns=False).nominal
+        parts = finite_element_part(study, points, workshop, columns=False)
+        part = parts.nominal
         note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
              f"Newton's method, {len(newton_history(workshop.folder)) - 1} steps")
         started = time.monotonic()
-        stated = reading_errors(study, observation, part, error_workshop(workshop))
+        stated = reading_errors(study, observation, parts, error_workshop(workshop))
         note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
              "the dual formulation, Newton's method again")
     note("nonlinear.faser_3d_memory_GiB", sum(resource.getrusage(who).ru_maxrss for who in (

@@ -169,7 +169,7 @@ def symmetry(study: Study, folder: Path, note: Note) -> None:
     note("response.symmetry_speedup", seconds[1] / seconds[0], "ratio",
          f"all {3 * len(blocks_of(short))} columns of 2 rings on one 3D mesh, one by one")
     observation = observe(short, points, np.ones_like(points, bool))
-    stated = reading_errors(short, observation, fields[1], workshop).max()
+    stated = reading_errors(short, observation, parts, workshop).max()
     note("response.symmetry_difference", float(np.abs(fields[0] - fields[1]).max() / stated),
          "of the stated error", "the array's reaction, with and without symmetry")
 

@@ -36,8 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_points(study, points)
     observation = observe(study, points, np.ones_like(points, bool))
     with common.workshop(arguments) as workshop:
-        part = finite_element_part(study, points, workshop, columns=False).nominal
-        flux_density = exact_part(study, points) + part
+        part = finite_element_part(study, points, workshop, columns=False)
+        flux_density = exact_part(study, points) + part.nominal
         data = field_map(points, flux_density, attributes={
             "study": study.name, "halbach_fe": metadata.version("halbach-fe"),
             "getdp": workshop.getdp.version, "method": study.solver.method})

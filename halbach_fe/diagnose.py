@@ -20,7 +20,7 @@ import xarray as xr
 from pydantic import ValidationError
 
 from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.blocks import Floats, points_in_material
 from halbach_fe.diagnosis.discrepancy import (
     Terms,
     harmonic_fields,
@@ -55,14 +55,10 @@ from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
 from halbach_fe.solve import Progress, Workshop
-from halbach_fe.study import Study, is_nonlinear
+from halbach_fe.study import Study
 from halbach_fe.update import Update, infer
 
 MOST_ROUNDS = 8
-ROUGHER = 1.5
-"""Times the size of elements, of iron that saturates: half the time, and a field that differs by
-6e-5 T of the 5 mT that a ring of 5 mm makes (four rings of the FASER dipole)."""
-
 SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
@@ -271,7 +267,7 @@ def diagnose(
             vibration = shaken
             signatures.clear()  # whitened by the noise that it was
             continue
-        found = _found(read, search)
+        found = _found(read, search, update.observation.map_points)
         if _settled(named, found):
             break
         named = found
@@ -344,35 +340,15 @@ def look(
     study = applied(read, start)
     scene, bare = (_scene_of(one, update, times, solver) for one in (update.study, study))
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
-    candidates: list[Candidate] = []
-    columns: list[Floats] = []
     kept = marginal.remove(response)
     information, score = response.T @ kept, kept.T @ training
     worth_a_look = [Hypothesis(effect, place) for effect in effects if effect.places(study)
                     for place in dict.fromkeys((
                         *effect.shortlist(update.study, update.prior.mean, information, score),
                         *(place for name, place in (*signatures, *there) if name == effect.name)))]
-    hypotheses: list[Hypothesis] = []
     candidates: list[Candidate] = []
     columns: list[Floats] = []
-
-    def compare(hypothesis: Hypothesis, seen: Floats) -> None:
-        effect, place = hypothesis.effect, hypothesis.place
-        width = sum(one.shape[1] for one in columns)
-        columns.append(seen * _scale(effect)[:seen.shape[1]])
-        hypotheses.append(hypothesis)
-        candidates.append(Candidate(
-            effect.name, place.name, tuple(range(width, width + seen.shape[1])),
-            effect.certain or seen.shape[1] > len(effect.parameters), effect.only))
-
-    def whole(hypothesis: Hypothesis, amounts: Floats) -> Floats:
-        """Whitened, with all else in the model."""
-        effect = hypothesis.effect
-        others = applied(read, [one for one in named if one.hypothesis != hypothesis and not (
-            effect.only and one.hypothesis.effect.name == effect.name)])
-        return whitened(update.observation.read(_whole(
-            hypothesis, amounts, _scene_of(others, update, times, solver))))
-
+    width = 0
     for number, hypothesis in enumerate(worth_a_look):
         progress(number, len(worth_a_look))
         effect, place = hypothesis.effect, hypothesis.place
@@ -384,55 +360,23 @@ def look(
                 seen = signatures[key] = whitened(update.observation.read(
                     effect.signature(bare, place)))
         elif effect.discrete:
-            amounts = _all_of(effect, present.values)
-            seen = whole(hypothesis, amounts)
+            others = applied(read, [one for one in named if one is not present])
+            amounts = np.pad(present.values, (0, len(_scale(effect)) - len(present.values)))
+            amounts[0] = 1.0
+            seen = whitened(update.observation.read(_whole(
+                present.hypothesis, amounts, _scene_of(others, update, times, solver))))
             residual = residual + seen @ amounts
         else:
             seen = whitened(update.observation.read(effect.signature(scene, place)))
             residual = residual + seen @ present.values
-        compare(hypothesis, seen)
-    def search() -> Search:
-        stacked = np.hstack(columns)
-        return Search(tuple(hypotheses), tuple(candidates), marginal.evidence(stacked, residual),
-                      stacked, residual, marginal, training)
-
-    better = [one for one in _between(named, search()) if one not in hypotheses]
-    for hypothesis in better:
-        seen = whole(hypothesis, _all_of(hypothesis.effect, np.ones(1)))
-        signatures[hypothesis.effect.name, hypothesis.place] = seen
-        compare(hypothesis, seen)
-    return search()
-
-
-def _all_of(effect: Effect, values: Floats) -> Floats:
-    """Amplitudes of an effect that is there as a whole, with its refinements."""
-    return np.concatenate([[1.0], values[1:], np.zeros(len(_scale(effect)) - len(values))])
-
-
-def _between(named: Sequence[Named], search: Search) -> list[Hypothesis]:
-    """Places between those that were looked at, of effects that are named, where these may explain
-    the readings better.
-    """
-    found = []
-    for one in named:
-        effect = one.hypothesis.effect
-        rest = [search.candidates[search.hypotheses.index(other.hypothesis)]
-                for other in named if other is not one]
-        evidence = with_candidates(search.evidence, rest)
-        mine = [number for number, other in enumerate(search.hypotheses)
-                if other.effect is effect]
-        first = [search.candidates[number].columns[0] for number in mine]
-        information = evidence.information[np.ix_(first, first)]
-        score = evidence.score[first]
-
-        def gain(weights: Floats, information: Floats = information, score: Floats = score
-                 ) -> float:
-            return float(weights @ score - weights @ information @ weights / 2)
-
-        place = effect.between([search.hypotheses[number].place for number in mine], gain)
-        if place is not None:
-            found.append(Hypothesis(effect, place))
-    return found
+        columns.append(seen * _scale(effect)[:seen.shape[1]])
+        candidates.append(Candidate(
+            effect.name, place.name, tuple(range(width, width + seen.shape[1])),
+            effect.certain or seen.shape[1] > len(effect.parameters), effect.only))
+        width += seen.shape[1]
+    stacked = np.hstack(columns)
+    return Search(tuple(worth_a_look), tuple(candidates), marginal.evidence(stacked, residual),
+                  stacked, residual, marginal, training)
 
 
 def _solver_error(update: Update) -> Floats:
@@ -503,19 +447,7 @@ def _whole(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:
 
 def _scene_of(study: Study, update: Update, times: Floats, solver: Solver) -> Scene:
     points = probe_points(study.instrument, update.observation.map_points)
-    return Scene(study, points, times, lambda other: solver(_roughly(other), points))
-
-
-def _roughly(study: Study) -> Study:
-    """The study as a search solves it: iron that saturates on larger elements, as the model itself
-    decides in the end.
-    """
-    if study.dimension == 2 or not is_nonlinear(study):
-        return study
-    mesh = study.mesh
-    return study.model_copy(update={"mesh": mesh.model_copy(update={
-        "block_size_m": ROUGHER * mesh.block_size_m,
-        "bore_size_m": mesh.bore_size_m and ROUGHER * mesh.bore_size_m})})
+    return Scene(study, points, times, lambda other: solver(other, points))
 
 
 def remembering(workshop: Workshop) -> Solver:
@@ -530,26 +462,29 @@ def remembering(workshop: Workshop) -> Solver:
     return solve
 
 
-def _found(read: Study, search: Search) -> tuple[Named, ...]:
-    """What is missing, of what can be: no gap is negative."""
+def _found(read: Study, search: Search, points: Floats) -> tuple[Named, ...]:
+    """What is missing, of what can be: no gap is negative, and the points (n, 3) in m of the map
+    are in air.
+    """
     barred: set[int] = set()
     while True:
         found = _amplitudes(
             search, select(search.evidence, search.candidates, barred=barred))
         bad = next((number for number in range(len(found))
-                    if not _possible(read, found[:number + 1])), None)
+                    if not _possible(read, found[:number + 1], points)), None)
         if bad is None:
             return found
         barred.add(search.candidates.index(found[bad].found.candidate))
 
 
-def _possible(study: Study, named: Sequence[Named]) -> bool:
+def _possible(study: Study, named: Sequence[Named], points: Floats) -> bool:
     """Tell whether a study can have effects of their amplitudes."""
     try:
-        blocks_of(Study.model_validate(applied(study, named).model_dump()))
+        changed = Study.model_validate(applied(study, named).model_dump())
+        inside = points_in_material(changed, probe_points(changed.instrument, points))
     except (ValidationError, HalbachError):
         return False
-    return True
+    return not inside.any()
 
 
 def _amplitudes(search: Search, found: Sequence[Found]) -> tuple[Named, ...]:

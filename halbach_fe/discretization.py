@@ -13,7 +13,7 @@ from halbach_fe.blocks import Floats
 from halbach_fe.extent import boundary_half_length, boundary_radius, magnet_half_length
 from halbach_fe.mesh import meridian_size
 from halbach_fe.observation import Observation
-from halbach_fe.routes import MESHES, choose_route, finite_element_part
+from halbach_fe.routes import MESHES, ElementFields, choose_route, finite_element_part
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study
 
@@ -54,7 +54,7 @@ def error_workshop(workshop: Workshop) -> Workshop:
 
 
 def reading_errors(
-    study: Study, observation: Observation, nominal: Floats, workshop: Workshop
+    study: Study, observation: Observation, parts: ElementFields, workshop: Workshop
 ) -> Floats:
     """Error bar of every reading, (readings,) in T, by what another discretization says.
 
@@ -64,9 +64,12 @@ def reading_errors(
 
     Parameters
     ----------
-    nominal : ndarray, shape (n, 3), in T
-        The finite-element part of the nominal array's field at the observation's points.
+    parts : ElementFields
+        The finite-element part of the field at the observation's points.
     """
+    nominal = parts.nominal
+    if parts.error is not None:
+        return observation.magnitude(parts.error)
     if not nominal.any():  # nothing is left to finite elements
         return np.zeros(len(observation))
     route = choose_route(study, observation.points)

@@ -188,9 +188,9 @@ def _with_vacuum_for_iron(study: Study, route: str) -> Study:
 
 
 def _error(study: Study, observation: Observation, workshop: Workshop) -> Floats:
-    part = finite_element_part(study, observation.points, replace(
-        workshop, folder=workshop.folder / "nominal"), columns=False).nominal
-    return reading_errors(study, observation, part, error_workshop(workshop))
+    parts = finite_element_part(study, observation.points, replace(
+        workshop, folder=workshop.folder / "nominal"), columns=False)
+    return reading_errors(study, observation, parts, error_workshop(workshop))
 
 
 def _check_iron(

@@ -103,8 +103,7 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     matrix = np.hstack(columns)
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     direct = observation.apply(parts.along_nominal)
-    error = (reading_errors(study, observation, parts.nominal, error_workshop(workshop))
-             if parts.error is None else observation.magnitude(parts.error))
+    error = reading_errors(study, observation, parts, error_workshop(workshop))
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
     offset = observation.apply(external_field(study, observation.points))

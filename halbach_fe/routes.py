@@ -136,12 +136,12 @@ def finite_element_part(
         return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, blocks_of(study),
                              lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)
+    near = simpler(study)
+    if study.solver.route == "auto" and route == "scalar_potential" and suits(near, points):
+        return _about(near, study, points, workshop, columns)
     if not columns:
         nominal = _solve_nominal(study, points, workshop, route)
         return ElementFields(np.nan, nominal, nominal, blocks_of(study), _not_solved)
-    even = regular(study)
-    if study.solver.route == "auto" and route == "scalar_potential" and suits(even, points):
-        return _about_regular(study, even, points, workshop)
     # in a cross-section there is little to save, and iron saturates where the field is
     placed = study.solver.symmetry and size == 3 and not is_nonlinear(study)
     symmetry = symmetry_of(study) if placed else no_symmetry(study)
@@ -167,8 +167,8 @@ def finite_element_part(
                          blocks_of(study), block)
 
 
-def regular(study: Study) -> Study:
-    """The study whose blocks are alike, without gaps between them."""
+def simpler(study: Study) -> Study:
+    """The study with blocks that are alike, without gaps between them."""
     array = study.array
     exceptions = tuple(one.model_copy(update={
         "recoil_permeability": None, "recoil_permeability_across": None})
@@ -180,22 +180,22 @@ def regular(study: Study) -> Study:
         "block": block, "exceptions": exceptions, "recoil_permeability_across": None})})
 
 
-def _about_regular(
-    study: Study, even: Study, points: Floats, workshop: Workshop
+def _about(
+    near: Study, study: Study, points: Floats, workshop: Workshop, columns: bool
 ) -> ElementFields:
-    """An array that is not quite regular: what makes it so is solved for with the nominal array, on
-    a 3D mesh with and without it; single blocks react as in the regular array.
+    """The nominal array on a 3D mesh, and single blocks as they react in a simpler array, which
+    azimuthal modes can do.
 
-    They only stand for what magnetizations deviate from nominal, a per cent, and their reaction is
-    some per cent of their field, of which gaps and permeabilities change some per cent again. The
-    nominal field's error is taken to be what the regular array's is on a 3D mesh.
+    Blocks only stand for what magnetizations deviate from nominal, a per cent or so, and their
+    reaction is some per cent of their field. What such a mesh is off is known of the simpler array,
+    and taken to be the same here.
     """
-    base = finite_element_part(even, points, workshop)
-    with_it, without = (
+    base = finite_element_part(near, points, workshop, columns)
+    nominal, same_mesh = (
         _solve_nominal(one, points, replace(workshop, folder=workshop.folder / name),
                        "scalar_potential")
-        for one, name in ((study, "irregular"), (even, "regular")))
-    return replace(base, nominal=base.nominal + with_it - without, error=without - base.nominal)
+        for one, name in ((study, "as-it-is"), (near, "simpler")))
+    return replace(base, nominal=nominal, error=same_mesh - base.nominal)
 
 
 def _superposition_tolerance(study: Study, route: str, placed: bool) -> float:

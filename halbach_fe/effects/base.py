@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -26,14 +26,13 @@ class Parameter:
 @dataclass(frozen=True)
 class Place:
     """Where an effect may be: a ring, a slot of it (0 is all), coordinates or lengths in m;
-    ``other`` is the ring and slot of a second block, ``material`` what it is made of.
+    ``other`` is the ring and slot of a second block.
     """
 
     ring: int = 0
     slot: int = 0
     at_m: tuple[float, ...] = ()
     other: tuple[int, int] = (0, 0)
-    material: str = ""
 
     @property
     def name(self) -> str:
@@ -41,8 +40,7 @@ class Place:
         ring, slot = (f"{letter}{number:02d}" if number else ""
                       for letter, number in (("r", self.ring), ("s", self.slot)))
         if self.at_m:
-            return " ".join(filter(None, (
-                self.material, f"at {', '.join(f'{one:.4g}' for one in self.at_m)} m")))
+            return f"at {', '.join(f'{one:.4g}' for one in self.at_m)} m"
         if self.other[0]:
             return f"{ring}{slot}, r{self.other[0]:02d}s{self.other[1]:02d}"
         return ring + slot
@@ -106,15 +104,6 @@ class Effect(ABC):
         all parameters, in a scene without the effect.
         """
         return np.empty((0, *scene.points.shape))
-
-    def between(
-        self, places: Sequence[Place], gain: Callable[[Floats], float]
-    ) -> Place | None:
-        """The best place between some whose signatures are known, if these can be interpolated.
-
-        ``gain`` is the log evidence of a mixture, of weights (places,), of their signatures.
-        """
-        return None
 
     @abstractmethod
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

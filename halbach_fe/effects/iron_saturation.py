@@ -6,9 +6,13 @@ from collections.abc import Sequence
 
 from halbach_fe.blocks import Floats
 from halbach_fe.effects.base import Effect, Parameter, Place
-from halbach_fe.effects.iron_ring import STEEL
 from halbach_fe.scene import Scene
 from halbach_fe.study import IronRing, SteelCurve, Study
+
+STEEL = "aisi_1010"
+
+SOLID = "scalar_potential"
+"""The route of iron that saturates."""
 
 
 class IronSaturation(Effect):
@@ -27,8 +31,11 @@ class IronSaturation(Effect):
         return [Place()] if ring is not None and ring.curve is None else []
 
     def signature(self, scene: Scene, place: Place) -> Floats:
-        """See `Effect.signature`."""
-        return (scene.solve(self.apply(scene.study, place, [1.0])) - scene.solved)[None]
+        """See `Effect.signature`; both on the same kind of mesh, whose errors cancel so."""
+        solid = scene.study.solver.model_copy(update={"route": SOLID})
+        before = scene.study if scene.study.dimension == 2 else scene.study.model_copy(
+            update={"solver": solid})
+        return (scene.solve(self.apply(before, place, [1.0])) - scene.solve(before))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

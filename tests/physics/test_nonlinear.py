@@ -209,9 +209,10 @@ def test_highly_permeable_tube_against_shielded_multipoles(dipole, workshop, ord
             "kind": "froehlich_kennelly", "saturation_polarization_T": saturation,
             "initial_relative_permeability": 3e5 if saturation > 1 else 1e4}})
         observation = observation_of(study)
-        part = finite_element_part(study, observation.points, workshop, columns=False).nominal
+        part = finite_element_part(study, observation.points, workshop, columns=False)
         bar = reading_errors(study, observation, part, workshop) if bars else None
-        return observation, observation.apply(exact_part(study, observation.points) + part), bar
+        return observation, observation.apply(
+            exact_part(study, observation.points) + part.nominal), bar
 
     observation, found, bar = readings(2.4, True)
     truth = np.zeros_like(observation.points)
@@ -266,7 +267,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     points = np.vstack([circle(0.06, 8, z, 0.2 + z) for z in (0.0, 0.04, 0.09)])
     workshop = Workshop(getdp, tmp_path, jobs=2)
     observation = observe(study, points, np.ones_like(points, bool))
-    part = finite_element_part(study, points, workshop, columns=False).nominal
+    part = finite_element_part(study, points, workshop, columns=False)
     bar = reading_errors(study, observation, part, workshop)
     assert 1.6 < observed_order(history(tmp_path / "getdp-real")[0]) < 2.5
     dipole, iron = dipole_of(study), law_of(study.iron_ring)
@@ -275,7 +276,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
         theirs, lower, never = (ngsolve_nonlinear.potential_reaction(
             dipole, law, mesh, order, points, (0.4, 0.0, 0.0))
             for order, law in ((3, iron), (2, iron), (2, replace(iron, saturation=200.0))))
-    ours = observation.apply(part)
+    ours = observation.apply(part.nominal)
     theirs, lower, never = (observation.apply(field) for field in (theirs, lower, never))
     bar = bar + np.abs(theirs - lower)
     scale = np.abs(theirs).max()

@@ -1,0 +1,94 @@
+"""The study of sealed cases: a few of them in full, and how they are scored."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from halbach_fe.study import read_study
+from tests.conftest import ROOT
+
+SCRIPT = ROOT / "studies" / "diagnosis" / "run.py"
+FEW = {"offset_z": 28, "arm_sag": 47, "none": 143, "coil": 160}
+"""Numbers of cases: two single effects, nothing, and one outside the catalogue."""
+
+
+@pytest.fixture(scope="module")
+def study():
+    spec = importlib.util.spec_from_file_location("sealed_cases", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # for its dataclasses
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_few_cases(study, tmp_path):
+    names = {case.seed: case.name for case in study.cases(2, 20, 20, 12)}
+    assert all(key in names[seed] for key, seed in FEW.items())
+    subprocess.run([sys.executable, SCRIPT, "-o", tmp_path, "--only", *map(str, FEW.values())],
+                   check=True, timeout=1800)
+    cases = {key: json.loads((tmp_path / "cases" / f"{names[seed]}.json").read_text())
+             for key, seed in FEW.items()}
+    for key in ("offset_z", "arm_sag"):
+        assert cases[key]["named"][0][0] == key
+        assert cases[key]["chi2_before"] > 1.3
+        assert 0.85 < cases[key]["chi2_after"] < 1.15  # 700 held-out readings: 5 %
+    assert not cases["none"]["named"]
+    assert not cases["none"]["unknown"]
+    assert cases["coil"]["unknown"]
+    rates = json.loads((tmp_path / "summary.json").read_text())["rates"]
+    assert rates["single_cases"] == 2
+    assert rates["naming_rate_single"] == 1
+    assert rates["control_naming_rate_shuffled_labels"] < 1
+    assert (tmp_path / "sealed_cases.html").stat().st_size > 50_000
+
+
+def result(hidden=(), named=(), outside="", unknown=None, probabilities=None, best=None):
+    return {"case": "-".join(hidden) or outside or "none", "hidden": list(hidden),
+            "outside": outside, "named": [list(one) for one in named], "unknown": unknown,
+            "best": dict.fromkeys(hidden, 20.0) if best is None else best, "disagrees": False,
+            "probabilities": probabilities or {}, "fringe_T": [1e-3, 1e-4], "chi2_before": 3.0,
+            "chi2_after": 1.0}
+
+
+def test_rates_count_what_they_say(study, tmp_path):
+    results = [
+        result(["gain_z"], [["gain_z", "offset_z"]], probabilities={"gain_z": 0.99, "none": 0.01}),
+        result(["planar_hall"], [["planar_hall_y"]], best={"planar_hall_y": 9.0}),
+        result(["arm_sag"], [["background"]], probabilities={"background": 0.99, "arm_sag": 0.01}),
+        result(["z_scale"], best={"z_scale": 1.0}),  # cannot be seen: does not count
+        result(["iron_ring"], [["iron_ring"]]),
+        result(["gain_x", "arm_sag"], [["arm_sag"], ["gain_x"]]),
+        result(["gain_x", "z_scale"], [["gain_x"]]),
+        result(), result(named=[["offset_x"]]), result(), result(unknown="field"),
+        result(outside="coil", unknown="field"), result(outside="ripple")]
+    rates = study.summary(results)
+    assert rates["single_cases"] == 4
+    assert rates["naming_rate_single"] == 0.75
+    assert rates["naming_rate_pairs"] == 0.5
+    assert rates["false_alarm_rate"] == 0.5
+    assert rates["unknown_rate"] == 0.5
+    assert rates["iron_fringe_reduction"] == pytest.approx(10)
+    assert rates["others_named_per_case"] == pytest.approx(1 / 6)
+    rows = study.reliability(results)
+    sure = rows[-1]
+    assert sure["statements"] == 2
+    assert sure["happened"] == 0.5  # one of two that were stated with 0.99
+    study.report(read_study(ROOT / "studies" / "diagnosis" / "study.toml"), results, tmp_path)
+    for name in ("confusion.png", "reliability.png", "gap.png", "sealed_cases.html"):
+        assert (tmp_path / name).exists()
+
+
+def test_every_effect_that_can_be_hidden_is_in_a_case(study):
+    cases = study.cases(1, 20, 20, 12)
+    assert {name for one in cases for name in one.hidden} == set(study.CAN_BE_HIDDEN)
+    assert len(cases) >= 100
+    assert len({one.seed for one in cases}) == len(cases)
+    truth = np.random.default_rng(0).random(5)
+    assert np.isnan(study.rate([]))
+    assert study.rate(truth > 2) == 0
