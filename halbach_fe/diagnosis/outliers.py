@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as linalg
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial import KDTree
 
 from halbach_fe.blocks import Floats, Ints
@@ -45,6 +46,11 @@ ROBUST = 6
 CAUCHY = 2.385
 """Times the scale, at which a neighbour weighs half (P. W. Holland and R. E. Welsch, Communications
 in Statistics A6 (1977) 813)."""
+
+CLOSE = 4
+"""Nearest neighbours that are no outliers too, but by chance."""
+
+CHANCE = 1e-4
 
 MAD = 1.4826
 """Standard deviation over the median of the magnitude, of normal numbers."""
@@ -185,7 +191,21 @@ def find_outliers(
             off[one.rows] = one.odd_ones(now, before[one.rows], largest)
         if (off == before).all() or off.mean() > MOST:
             break
+    off &= ~_crowded(off, neighbourhoods)
     return off if off.mean() <= MOST else np.zeros(len(residual), bool)
+
+
+def _crowded(off: NDArray[np.bool_], neighbourhoods: Sequence[_Neighbourhood]) -> NDArray[np.bool_]:
+    """Tell which readings are off together with their neighbours, more often than chance has it:
+    something is there.
+    """
+    beside = np.zeros(len(off), int)
+    for one in neighbourhoods:
+        beside[one.rows] = off[one.rows[one.nearest[:, :CLOSE]]].sum(axis=1)
+    pairs = beside[off].sum()
+    expected = CLOSE * off.sum() * off.mean()
+    crowded = off & (beside > 0)
+    return crowded if stats.poisson.sf(pairs - 1, expected) < CHANCE else np.zeros_like(off)
 
 
 @dataclass(frozen=True)

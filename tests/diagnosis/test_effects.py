@@ -51,7 +51,7 @@ def test_signatures_are_derivatives(name, scene):
         signature = effect.signature(scene, place)
         assert signature.shape == (len(effect.parameters), len(POINTS), 3)
         for number, parameter in enumerate(effect.parameters):
-            step = parameter.sd * (1 if effect.certain else STEP)
+            step = parameter.sd * (1 if effect.certain or effect.discrete else STEP)
             if name in LARGE:
                 step /= 10
             values = step * np.eye(len(effect.parameters))[number]
@@ -62,6 +62,19 @@ def test_signatures_are_derivatives(name, scene):
             # negative controls: the wrong sign, another component
             assert np.abs(change + step * signature[number]).max() > size
             assert np.abs(change - step * signature[number][:, [1, 2, 0]]).max() > 0.5 * size
+
+
+def test_refinements_are_derivatives(scene):
+    effect = EFFECTS["neighbour_magnet"]
+    place = effect.places(STUDY)[3]
+    values = np.array([1.0, 0.3, -0.02])
+    refined = effect.refine(scene, place, values.tolist())
+    for number, step in enumerate((1e-3, 1e-5), start=1):
+        there, here = (shown(effect.apply(STUDY, place, one.tolist()))
+                       for one in (values + step * np.eye(3)[number], values))
+        change = (there - here) / step
+        assert np.abs(change - refined[number - 1]).max() < 1e-2 * np.abs(change).max()
+        assert np.abs(change - refined[2 - number]).max() > 0.5 * np.abs(change).max()
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
