@@ -3,12 +3,13 @@
 # make verify-calibration  are the posteriors as sure as they may be?
 # make verify-diagnosis    are hidden effects found, and only those?
 # make study-faser           the published profile, and the synthetic twin of the whole campaign
+# make study-faser-diagnosis what the model lacks, by the published profile
 # make study-linear-3d       the paper's linear validation: 576 magnetizations from a map of the bore
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo verify-diagnosis study-faser study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
+.PHONY: demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -22,6 +23,9 @@ verify-diagnosis: setup-test
 
 study-faser: demo
 	.venv/bin/python studies/faser/twin.py -o results/faser-twin
+
+study-faser-diagnosis: setup
+	.venv/bin/python studies/faser/diagnose.py -o results/faser-diagnosis
 
 study-linear-3d: setup
 	.venv/bin/python studies/linear-3d/run.py -o results/linear-3d

@@ -254,7 +254,8 @@ def diagnose(
             say(f"outliers: {len(outliers)}; without them")
             read = excluding(read, outliers)
             update = updated("without-outliers")
-        search = look(read, start, update, times, solver, effects, named, signatures,
+        known = (first[0] if first else update).prior.mean
+        search = look(read, start, update, known, times, solver, effects, named, signatures,
                       workshop.progress or (lambda done, total: None))
         first = first or (update, search)
         numerical = None if named else numerical_of(update)
@@ -314,15 +315,16 @@ def applied(study: Study, named: Sequence[Named]) -> Study:
 
 
 def look(
-    read: Study, start: Sequence[Named], update: Update, times: Floats, solver: Solver,
-    effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
+    read: Study, start: Sequence[Named], update: Update, known: Floats, times: Floats,
+    solver: Solver, effects: Sequence[Effect], named: Sequence[Named], signatures: Signatures,
     progress: Progress = lambda done, total: None,
 ) -> Search:
     """Compare all effects at the point where some are in the model already.
 
     The residual is that of the study ``read`` without them: what they do is added back, by their
     signatures at this point. Other effects keep the ``signatures`` that they had first, with those
-    in the model with which the search ``start``s.
+    in the model with which the search ``start``s. ``known`` are the magnetizations (parameters,) in
+    A/m that the prior expects without any effects.
     """
     rows = np.flatnonzero(~update.held_out)
     noise = update.errors.part(rows)
@@ -338,7 +340,13 @@ def look(
                         - update.response.matrix @ update.prior.mean)
     residual = training
     study = applied(read, start)
-    scene, bare = (_scene_of(one, update, times, solver) for one in (update.study, study))
+
+    def scene_of(other: Study) -> Scene:
+        points = probe_points(other.instrument, update.observation.map_points)
+        return Scene(other, points, times, lambda one: solver(one, points),
+                     known.reshape(-1, other.dimension))
+
+    scene, bare = scene_of(update.study), scene_of(study)
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
     kept = marginal.remove(response)
     information, score = response.T @ kept, kept.T @ training
@@ -364,7 +372,7 @@ def look(
             amounts = np.pad(present.values, (0, len(_scale(effect)) - len(present.values)))
             amounts[0] = 1.0
             seen = whitened(update.observation.read(_whole(
-                present.hypothesis, amounts, _scene_of(others, update, times, solver))))
+                present.hypothesis, amounts, scene_of(others))))
             residual = residual + seen @ amounts
         else:
             seen = whitened(update.observation.read(effect.signature(scene, place)))
@@ -443,11 +451,6 @@ def _whole(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:
     refined = effect.refine(scene, place, values)
     there = scene.solve(effect.apply(scene.study, place, values)) - scene.solved
     return np.concatenate([(there - np.tensordot(amounts[1:], refined, 1))[None], refined])
-
-
-def _scene_of(study: Study, update: Update, times: Floats, solver: Solver) -> Scene:
-    points = probe_points(study.instrument, update.observation.map_points)
-    return Scene(study, points, times, lambda other: solver(other, points))
 
 
 def remembering(workshop: Workshop) -> Solver:

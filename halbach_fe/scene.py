@@ -15,7 +15,7 @@ import numpy as np
 from halbach_fe.blocks import Floats, MagnetBlock, blocks_of
 from halbach_fe.exact_field import block_gradients, unit_fields
 from halbach_fe.external import external_field
-from halbach_fe.study import BlockException, Study
+from halbach_fe.study import MU_0, BlockException, Study
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,15 @@ class Scene:
         Of each reading, from 0 to 1.
     solve : callable
         Study to the field (n, 3) in T of its nominal magnet at the points, by finite elements.
+    known : ndarray, shape (blocks, D), in A/m, or None
+        Magnetizations as they were measured before the magnet was built; None: the nominal ones.
     """
 
     study: Study
     points: Floats
     time: Floats
     solve: Callable[[Study], Floats]
+    known: Floats | None = None
 
     @cached_property
     def blocks(self) -> tuple[MagnetBlock, ...]:
@@ -66,6 +69,26 @@ class Scene:
     def solved(self) -> Floats:
         """B (n, 3) in T of the nominal magnet by finite elements."""
         return self.solve(self.study)
+
+    def known_field(self, number: int) -> Floats:
+        """B (n, 3) in T of a block as it was measured; what is there or not as a whole must be
+        known better than a tolerance.
+        """
+        return self.field_with(number, self.magnetizations[number])
+
+    @cached_property
+    def magnetizations(self) -> Floats:
+        """Of the blocks, as measured or else nominal, (blocks, D) in A/m."""
+        size = self.study.dimension
+        return np.array([block.magnetization[:size] for block in self.blocks]
+                        ) if self.known is None else self.known
+
+    def field_with(self, number: int, magnetization: Floats) -> Floats:
+        """B (n, 3) in T of a block with a magnetization (D,) in A/m."""
+        block, size = self.blocks[number], len(magnetization)
+        (unit,) = unit_fields((block,), self.points)
+        return np.asarray(unit[:, :, :size] @ (
+            MU_0 * block.recoil_tensor[:size, :size] @ magnetization))
 
     def block_fields_of(self, study: Study) -> Floats:
         """B (blocks, n, 3) in T of each nominal block of another study."""

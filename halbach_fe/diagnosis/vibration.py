@@ -43,6 +43,9 @@ ROOM = 3.0
 MOST_READINGS = 3000
 """That are compared; of more, some at random."""
 
+NEGLIGIBLE = 1e-2
+"""Sum over all readings, in variances of the noise of one, that no explanation needs."""
+
 SUSPICIOUS = 2.0
 """Standard deviations of chi2 below which there is nothing to explain, and nothing is computed."""
 
@@ -137,6 +140,7 @@ def judge_vibration(
         Standard deviation in m of the vibration with which all was whitened.
     """
     moved = sparse.csr_array(displacement @ displacement.T)
+    root = _compressed(root)
 
     def log_evidence(sd: float, factor: float = 1.0) -> float:
         total = Noise(sparse.csr_array(factor**2 * (
@@ -163,3 +167,11 @@ def judge_vibration(
     top = int(np.argmax(found))
     near = AMPLITUDES_M[[max(top - 1, 0), min(top + 1, len(found) - 1)]]
     return Vibration(factor, best(log_evidence, *near.tolist()))
+
+
+def _compressed(root: Floats) -> Floats:
+    """A root (n, k) of fewer columns, of the same covariance but for what is far below the noise:
+    many things do nearly the same to the readings.
+    """
+    values, vectors = np.linalg.eigh(root.T @ root)
+    return np.asarray(root @ vectors[:, values > NEGLIGIBLE])

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from halbach_fe.blocks import Floats
+import numpy as np
+
+from halbach_fe.blocks import Floats, as_meant, blocks_of
 from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
+from halbach_fe.exact_field import unit_fields
 from halbach_fe.scene import Scene
 from halbach_fe.study import BlockException, Study
 
@@ -24,8 +27,11 @@ class BlockDemagnetized(Effect):
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
-        (block,) = blocks_at(scene, place)
-        return -scene.block_fields[block][None]
+        (number,) = blocks_at(scene, place)
+        block = scene.blocks[number]
+        whole = blocks_of(as_meant(scene.study))[number].remanence  # whatever it has lost already
+        (unit,) = unit_fields((block,), scene.points)
+        return -whole * (unit @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -28,7 +28,7 @@ class BlockMissing(Effect):
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
         (block,) = blocks_at(scene, place)
-        return (self.factor - 1) * scene.block_fields[block][None]
+        return (self.factor - 1) * scene.known_field(block)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

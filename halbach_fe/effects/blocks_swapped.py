@@ -8,7 +8,6 @@ import numpy as np
 
 from halbach_fe.blocks import Floats, blocks_of, position_angle_deg
 from halbach_fe.effects.base import Effect, Parameter, Place, with_exceptions
-from halbach_fe.exact_field import unit_fields
 from halbach_fe.scene import Scene
 from halbach_fe.study import BlockException, Study
 from halbach_fe.symmetry import turn_matrix
@@ -59,14 +58,15 @@ class BlocksSwapped(Effect):
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""
-        pairs = {(place.ring, place.slot), place.other}
-        before = [block for block in scene.blocks if (block.ring, block.slot) in pairs]
-        after = [block for block in blocks_of(self.apply(scene.study, place, [1.0]))
-                 if (block.ring, block.slot) in pairs]
+        where = [(block.ring, block.slot) for block in scene.blocks]
+        here, there = where.index((place.ring, place.slot)), where.index(place.other)
+        size, array = scene.study.dimension, scene.study.array
         total = np.zeros_like(scene.points)
-        for old, new, unit in zip(before, after, unit_fields(before, scene.points), strict=True):
-            total += unit @ (np.array(new.easy_axis) * new.remanence
-                             - np.array(old.easy_axis) * old.remanence)
+        for to, source in ((here, there), (there, here)):
+            turn = turn_matrix(np.radians(position_angle_deg(array, where[to][1])
+                                          - position_angle_deg(array, where[source][1])))
+            total += scene.field_with(to, turn[:size, :size] @ scene.magnetizations[source]
+                                      - scene.magnetizations[to])
         return total[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

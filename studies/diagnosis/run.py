@@ -200,6 +200,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
     clean = [one for one in results if not one["hidden"] and not one["outside"]]
     outside = [one for one in results if one["outside"]]
     right = [one for one in single + pairs if all(named(one, name) for name in one["hidden"])]
+    iron = [one for one in results if one["hidden"] == ["iron_ring"]]
     labels = np.random.default_rng(0).permutation([one["hidden"][0] for one in single])
     return {
         "naming_rate_single": rate(named(one, one["hidden"][0]) for one in single),
@@ -208,14 +209,16 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
                                   for one in pairs),
         "pair_cases": len(pairs),
         "others_named_per_case": float(np.mean([wrong(one) for one in single + pairs] or [0])),
+        "effects_cases": len(single + pairs),
         "false_alarm_rate": rate(bool(one["named"] or one["unknown"]) for one in clean),
         "clean_cases": len(clean),
         "unknown_rate": rate(one["unknown"] is not None for one in outside),
         "outside_cases": len(outside),
-        "iron_fringe_reduction": float(np.median([
-            np.divide(*one["fringe_T"]) for one in results if one["hidden"] == ["iron_ring"]]
-            or [np.nan])),
+        "iron_fringe_reduction": float(np.median([np.divide(*one["fringe_T"]) for one in iron]
+                                                 or [np.nan])),
+        "iron_cases": len(iron),
         "heldout_recovered_rate": rate(BACK[0] <= one["chi2_after"] <= BACK[1] for one in right),
+        "recovered_of": len(right),
         "control_naming_rate_shuffled_labels": rate(
             named(one, label) for one, label in zip(single, labels, strict=True)),
         "control_false_alarm_rate_without_blocks": rate(
