@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from halbach_fe.blocks import blocks_of
+from halbach_fe.blocks import blocks_of, mountings
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Place
 from halbach_fe.exact_field import field_of
@@ -62,6 +64,31 @@ def test_signatures_are_derivatives(name, scene):
             # negative controls: the wrong sign, another component
             assert np.abs(change + step * signature[number]).max() > size
             assert np.abs(change - step * signature[number][:, [1, 2, 0]]).max() > 0.5 * size
+
+
+@pytest.mark.parametrize("loss", [0.4, 1.0, 2.0])
+def test_what_a_block_has_lost_is_no_part_of_the_derivative(scene, loss):
+    """Or a search for the loss of a block upside down goes astray."""
+    effect = EFFECTS["block_demagnetized"]
+    place = effect.places(STUDY)[5]
+    there = replace(scene, study=effect.apply(STUDY, place, [loss]))
+    assert effect.signature(there, place) == pytest.approx(effect.signature(scene, place))
+
+
+@pytest.mark.parametrize("name", ["block_missing", "block_flipped", "blocks_swapped"])
+def test_whole_blocks_count_as_they_were_measured(scene, name, generator):
+    effect = EFFECTS[name]
+    place = effect.places(STUDY)[5]
+    nominal = scene.magnetizations
+    known = nominal * (1 + 0.02 * generator.standard_normal((len(nominal), 1)))
+    signature = effect.signature(replace(scene, known=known), place)[0]
+    mountings_of = mountings(effect.apply(STUDY, place, [1.0]))
+    mounted = np.array([matrix @ known[number] for number, matrix in mountings_of])
+    change = sum(scene.field_with(number, mounted[number] - known[number])
+                 for number in range(len(known)))
+    assert signature == pytest.approx(change, abs=1e-12)
+    assert np.abs(signature - effect.signature(scene, place)[0]).max() > 1e-3 * np.abs(
+        change).max()  # negative control: nominal blocks
 
 
 def test_refinements_are_derivatives(scene):

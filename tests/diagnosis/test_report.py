@@ -101,6 +101,7 @@ def test_the_page_of_what_is_unknown(flat, tmp_path):
     page = (tmp_path / "diagnosis.html").read_text()
     assert 'class="warning"' in page
     assert "tells a field from the sensors" in page
+    assert "not to be believed" in page
 
 
 def test_numbers_for_people(flat):
