@@ -55,12 +55,15 @@ class Campaign:
     blocks : BlockTable
     truth : dict
         As plain data.
+    without_noise : ndarray, shape (n, 3)
+        The readings of the map, as they would be without it.
     """
 
     readings: xr.Dataset
     held_out: xr.Dataset | None
     blocks: BlockTable
     truth: dict[str, object]
+    without_noise: Floats
 
 
 def simulate(
@@ -111,12 +114,12 @@ def simulate(
         truth["blocks_with_effects"] = magnetizations(magnet)
     seal = {"source": "synthetic", "study": study.name, "halbach_fe": version_of("halbach-fe"),
             "truth_sha256": hashlib.sha256(truth_text(truth).encode()).hexdigest()}
-    unit = instrument.field_unit
+    unit, exact = instrument.field_unit, readings[:len(points)].copy()
     readings += unit * np.nan_to_num(sigma) * noise.standard_normal(readings.shape)
     maps = [_map(study, recorded[part], readings[part], unit * sigma[part], seal)
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
-    return Campaign(maps[0], maps[1] if len(others) else None, table, truth)
+    return Campaign(maps[0], maps[1] if len(others) else None, table, truth, exact)
 
 
 def measured(
