@@ -136,12 +136,12 @@ def finite_element_part(
         return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, blocks_of(study),
                              lambda number: np.zeros((len(points), 3, size)))
     route = choose_route(study, points)
-    near = simpler(study)
-    if study.solver.route == "auto" and route == "scalar_potential" and suits(near, points):
-        return _about(near, study, points, workshop, columns)
     if not columns:
         nominal = _solve_nominal(study, points, workshop, route)
         return ElementFields(np.nan, nominal, nominal, blocks_of(study), _not_solved)
+    near = simpler(study)
+    if study.solver.route == "auto" and route == "scalar_potential" and suits(near, points):
+        return _about(near, study, points, workshop)
     # in a cross-section there is little to save, and iron saturates where the field is
     placed = study.solver.symmetry and size == 3 and not is_nonlinear(study)
     symmetry = symmetry_of(study) if placed else no_symmetry(study)
@@ -181,7 +181,7 @@ def simpler(study: Study) -> Study:
 
 
 def _about(
-    near: Study, study: Study, points: Floats, workshop: Workshop, columns: bool
+    near: Study, study: Study, points: Floats, workshop: Workshop
 ) -> ElementFields:
     """The nominal array on a 3D mesh, and single blocks as they react in a simpler array, which
     azimuthal modes can do.
@@ -190,7 +190,7 @@ def _about(
     reaction is some per cent of their field. What such a mesh is off is known of the simpler array,
     and taken to be the same here.
     """
-    base = finite_element_part(near, points, workshop, columns)
+    base = finite_element_part(near, points, workshop)
     nominal, same_mesh = (
         _solve_nominal(one, points, replace(workshop, folder=workshop.folder / name),
                        "scalar_potential")
