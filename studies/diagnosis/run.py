@@ -166,8 +166,10 @@ def fringe(
     that was updated with the readings of the bore alone.
     """
     end = magnet_half_length(study)
-    update = infer(study.model_copy(update={"inference": study.inference.model_copy(update={
-        "held_out": HeldOut(z_ranges_m=((-FAR_M, -end), (end, FAR_M)))})}), readings, workshop, blocks)
+    kept = HeldOut(z_ranges_m=((-FAR_M, -end), (end, FAR_M)))
+    update = infer(study.model_copy(update={
+        "inference": study.inference.model_copy(update={"held_out": kept})}),
+        readings, workshop, blocks)
     truth = update.observation.read(exact["B_T"].values)[update.held_out]
     return float(np.sqrt(np.mean((update.prediction_posterior.mean[update.held_out] - truth)**2)))
 
