@@ -284,6 +284,13 @@ def neighbour_magnet(magnet: Magnet, site: Site, distance: float) -> Magnet:
     return replace(magnet, copies=(*magnet.copies, Copy(float(shift))))
 
 
+def _draw_neighbour(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    """Beyond the map: no probe is moved into another magnet."""
+    gap = signed(generator, 0.5, 2.0) * site.outer
+    end = site.z_max if gap > 0 else -site.z_min
+    return (float(gap + np.sign(gap) * max(end - site.half_length, 0.0)),)
+
+
 def ferromagnetic_object(
     magnet: Magnet, site: Site, x: float, y: float, z: float, volume: float
 ) -> Magnet:
@@ -383,8 +390,7 @@ EFFECTS = (
                float(value) for value in size(generator, 5e-5, 5e-4)
                * np.array(direction(generator, site.dimension))), background),
     Effect("neighbour_magnet", "field", (Parameter("distance", M),),
-           lambda site, generator: (site.outer * signed(generator, 0.7, 2.5),), neighbour_magnet,
-           needs=("3d",)),
+           _draw_neighbour, neighbour_magnet, needs=("3d",)),
     Effect("ferromagnetic_object", "field",
            (*(Parameter(name, M) for name in "xyz"), Parameter("volume", "m^3")), _draw_object,
            ferromagnetic_object, needs=("3d",)),
