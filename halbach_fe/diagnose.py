@@ -55,7 +55,7 @@ from halbach_fe.instrument import map_time, probe_points
 from halbach_fe.routes import solve_nominal
 from halbach_fe.scene import Scene
 from halbach_fe.solve import Progress, Workshop
-from halbach_fe.study import Study
+from halbach_fe.study import FIELD_KEYS, Study
 from halbach_fe.update import Update, infer
 
 MOST_ROUNDS = 8
@@ -458,7 +458,7 @@ def remembering(workshop: Workshop) -> Solver:
     known: dict[tuple[str, bytes], Floats] = {}
 
     def solve(study: Study, points: Floats) -> Floats:
-        key = study.model_dump_json(), points.tobytes()
+        key = study.model_dump_json(include=FIELD_KEYS), points.tobytes()
         if key not in known:
             known[key] = solve_nominal(study, points, workshop)
         return known[key]

@@ -33,7 +33,7 @@ from halbach_fe.routes import (
     finite_element_part,
 )
 from halbach_fe.solve import Workshop
-from halbach_fe.study import COMPONENTS, MU_0, Study, curve_of
+from halbach_fe.study import COMPONENTS, FIELD_KEYS, MU_0, Study, curve_of
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,7 @@ def verify_superposition(
 
 def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
     """Digest of all that the matrix depends on."""
-    relevant = study.model_dump(
-        mode="json", include={
-            "dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"})
+    relevant = study.model_dump(mode="json", include=FIELD_KEYS)
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
     curve = curve_of(study)  # a steel's name says nothing of its numbers
     if curve is not None:

@@ -600,6 +600,10 @@ class Solver(_Model):
     symmetry: bool = True
 
 
+FIELD_KEYS = {"dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"}
+"""All that a solved field depends on."""
+
+
 class Study(_Model):
     """A magnet, how it is discretized, how it is measured, and what is known beforehand."""
 
