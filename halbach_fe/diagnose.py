@@ -344,7 +344,7 @@ def look(
     def scene_of(other: Study) -> Scene:
         points = probe_points(other.instrument, update.observation.map_points)
         return Scene(other, points, times, lambda one: solver(one, points),
-                     known.reshape(-1, other.dimension))
+                     known=known.reshape(-1, other.dimension))
 
     scene, bare = scene_of(update.study), scene_of(study)
     there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}

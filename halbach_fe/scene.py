@@ -7,7 +7,7 @@ matters little to a search, and nothing to the effect once it is in the model.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -38,7 +38,7 @@ class Scene:
     points: Floats
     time: Floats
     solve: Callable[[Study], Floats]
-    known: Floats | None = None
+    known: Floats | None = field(default=None, kw_only=True)
 
     @cached_property
     def blocks(self) -> tuple[MagnetBlock, ...]:
