@@ -39,7 +39,6 @@ from halbach_fe.diagnosis.selection import (
     FOUND,
     Candidate,
     Found,
-    best_factors,
     gains,
     log_evidence,
     probabilities,
@@ -164,8 +163,9 @@ class Diagnosis:
         What they leave unexplained, if anything.
     probabilities : dict
         Of each effect, and of none, if at most one is missing.
-    best_factors : dict
-        Largest log Bayes factor of each effect at any place, over nothing.
+    evidence : Evidence
+    candidates : tuple of Candidate
+        From which all that is said of the study as it was follows.
     groups_before, groups_after : list of Group
         Where readings disagree.
     left_out_before, left_out_after : ndarray, shape (n,)
@@ -187,7 +187,8 @@ class Diagnosis:
     named: tuple[Named, ...]
     unknown: Unknown | None
     probabilities: dict[str, float]
-    best_factors: dict[str, float]
+    evidence: Evidence
+    candidates: tuple[Candidate, ...]
     groups_before: list[Group]
     groups_after: list[Group]
     left_out_before: Floats
@@ -279,7 +280,7 @@ def diagnose(
     return Diagnosis(
         read=read, before=first[0], after=update, named=named, unknown=rest,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
-        best_factors=best_factors(first[1].evidence, first[1].candidates),
+        evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),

@@ -231,9 +231,17 @@ def probabilities(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[s
     return found
 
 
-def best_factors(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[str, float]:
-    """Largest log Bayes factor of each effect at any place, over nothing."""
+def best_factors(
+    evidence: Evidence, candidates: Sequence[Candidate], others: Sequence[Sequence[str]] = ()
+) -> dict[str, float]:
+    """Largest log Bayes factor of each effect at any place, over nothing, or beside others: of each
+    group of names the one candidate that is best by itself.
+    """
+    alone = gains(evidence, candidates)
+    beside = [max((k for k, one in enumerate(candidates) if one.effect in names),
+                  key=lambda k: alone[k]) for names in others]
+    factors = gains(with_candidates(evidence, [candidates[k] for k in beside]), candidates)
     found: dict[str, float] = {}
-    for candidate, factor in zip(candidates, gains(evidence, candidates), strict=True):
+    for candidate, factor in zip(candidates, factors, strict=True):
         found[candidate.effect] = max(found.get(candidate.effect, -np.inf), float(factor))
     return found

@@ -15,7 +15,7 @@ import multiprocessing
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from halbach_fe.campaign.extras import needed
 from halbach_fe.campaign.simulate import simulate
 from halbach_fe.cli import common
 from halbach_fe.diagnose import Diagnosis, Solver, diagnose, remembering
+from halbach_fe.diagnosis.selection import best_factors
 from halbach_fe.effects import catalogue
 from halbach_fe.errors import CheckFailedError, HalbachError
 from halbach_fe.extent import magnet_half_length
@@ -129,7 +130,8 @@ def run_case(
         readings = readings.assign(B_T=readings["B_T"] + added)
     found = diagnose(study, readings, workshop, campaign.blocks, solver=solver)
     result = {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
-              "truth": campaign.truth["effects"], **outcome(found)}
+              "truth": campaign.truth["effects"], **outcome(found),
+              "best": own_factors(found, case.hidden)}
     if case.hidden == ("iron_ring",):
         exact = readings.assign(B_T=(readings["B_T"].dims, campaign.without_noise))
         result["fringe_T"] = [fringe(one, readings, exact, replace(
@@ -154,7 +156,7 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
         "named": named + [list(one.found.effects) for one in found.named],
         "factors": [one.found.log_bayes_factor for one in found.named],
         "unknown": None if found.unknown is None else found.unknown.kind,
-        "probabilities": found.probabilities, "best": found.best_factors,
+        "probabilities": found.probabilities,
         "disagrees": found.before.prior_conflict > found.before.conflict_limit,
         "chi2_before": chi2["before"][0], "chi2_after": chi2["after"][0], "rounds": found.rounds}
 
@@ -174,6 +176,19 @@ def fringe(
     return float(np.sqrt(np.mean((update.prediction_posterior.mean[update.held_out] - truth)**2)))
 
 
+def own_factors(found: Diagnosis, hidden: Sequence[str]) -> dict[str, float]:
+    """Log Bayes factor of each hidden effect that has a signature, beside the other hidden ones."""
+    there = {one.effect for one in found.candidates}
+    known = {name: sorted(set(known_as(name)) & there) for name in hidden}
+    known = {name: names for name, names in known.items() if names}
+    factors = {}
+    for name, names in known.items():
+        others = [known[other] for other in known if other != name]
+        beside = best_factors(found.evidence, found.candidates, others)
+        factors[name] = max(beside[one] for one in names)
+    return factors
+
+
 def known_as(name: str) -> list[str]:
     """Names in the catalogue of what the campaign hides: that, or one of each sensor."""
     return [effect.name for effect in catalogue()
@@ -184,10 +199,9 @@ def detectable(result: dict[str, Any], name: str) -> bool:
     """Whether readings can tell of an effect at all: by its own evidence, or, of what has none
     because it is no signature, by their disagreement.
     """
-    factors = [result["best"][one] for one in known_as(name) if one in result["best"]]
-    if not factors:
+    if name not in result["best"]:
         return bool(result["named"] or result["disagrees"])
-    return bool(max(factors) > DETECTABLE)
+    return bool(result["best"][name] > DETECTABLE)
 
 
 def named(result: dict[str, Any], name: str) -> bool:
@@ -248,8 +262,11 @@ def truly_there(result: dict[str, Any]) -> set[str]:
 
 
 def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
-    """How often effects are there to which some probability is given, where one at most is."""
-    single = [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]]
+    """How often effects are there to which some probability is given, where one at most is; what no
+    reading can tell of does not count.
+    """
+    single = [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]
+              and all(detectable(one, name) for name in one["hidden"])]
     stated = [(probability, name in truly_there(one))
               for one in single for name, probability in one["probabilities"].items()]
     probability, there = (np.array(one, float) for one in zip(*stated, strict=True))

@@ -73,8 +73,8 @@ def case(inferred):
         one = Named(Hypothesis(effect, at), np.array(values), np.array(values) / 10, found)
         return Diagnosis(
             read=update.study, before=update, after=update, named=(one,), unknown=None,
-            probabilities={},
-            best_factors={}, groups_before=[], groups_after=[], left_out_before=np.zeros(0),
+            probabilities={}, evidence=None, candidates=(), groups_before=[], groups_after=[],
+            left_out_before=np.zeros(0),
             left_out_after=np.zeros(0), rounds=1), data
     return make
 

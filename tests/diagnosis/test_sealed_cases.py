@@ -59,7 +59,7 @@ def result(hidden=(), named=(), outside="", unknown=None, probabilities=None, be
 def test_rates_count_what_they_say(study, tmp_path):
     results = [
         result(["gain_z"], [["gain_z", "offset_z"]], probabilities={"gain_z": 0.99, "none": 0.01}),
-        result(["planar_hall"], [["planar_hall_y"]], best={"planar_hall_y": 9.0}),
+        result(["planar_hall"], [["planar_hall_y"]], best={"planar_hall": 9.0}),
         result(["arm_sag"], [["background"]], probabilities={"background": 0.99, "arm_sag": 0.01}),
         result(["z_scale"], best={"z_scale": 1.0}),  # cannot be seen: does not count
         result(["iron_ring"], [["iron_ring"]]),
