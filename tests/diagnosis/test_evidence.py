@@ -8,7 +8,13 @@ from scipy import stats
 
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.residuals import groups, left_out
-from halbach_fe.diagnosis.selection import Candidate, gains, log_evidence, select
+from halbach_fe.diagnosis.selection import (
+    Candidate,
+    best_factors,
+    gains,
+    log_evidence,
+    select,
+)
 
 
 @pytest.fixture
@@ -136,6 +142,19 @@ def test_several_effects_are_found_together(seed):
 def test_twins_are_named_together():
     (found,) = select(*hidden({0: 1.0}))
     assert set(found.effects) == {"effect 0", "effect 19"}
+
+
+def test_factors_beside_others_are_what_is_left_for_an_effect():
+    evidence, candidates = hidden({0: 1.0, 3: 1.0})
+    alone = best_factors(evidence, candidates)
+    beside = best_factors(evidence, candidates, [["effect 0", "effect 5"]])
+    assert alone["effect 0"] > 20
+    assert alone["effect 19"] > 20
+    assert beside["effect 19"] < 3  # its twin is there
+    assert beside["effect 3"] > 20
+    pair = [candidates[0], candidates[3]]
+    assert beside["effect 3"] == pytest.approx(
+        log_evidence(evidence, pair) - log_evidence(evidence, pair[:1]), abs=1.0)
 
 
 def test_one_large_effect_is_not_two(monkeypatch):
