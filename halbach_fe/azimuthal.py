@@ -92,6 +92,7 @@ class _Ring:
     rank: int
     along: list[float]
     across: list[float]
+    axial: list[float]
 
 
 @dataclass(frozen=True)
@@ -181,22 +182,24 @@ def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _nominal_waves(study: Study, highest: int) -> Floats:
-    """Nominal remanence as waves, (modes, 2, rings, 2) in T: by what goes into cos(m theta) and
-    sin(m theta), ring, and along or across the blocks' probes_of.
+    """Nominal remanence as waves, (modes, 2, rings, 3) in T: by what goes into cos(m theta) and
+    sin(m theta), ring, and along or across the blocks' middles, or along z.
 
-    A block at angle t with remanence A along and C across its middle has the potential
-    A psi_along cos(m (theta - t)) + C psi_across sin(m (theta - t)).
+    A block at angle t with remanence A along and C across its middle, and Z along z, has the
+    potential (A psi_along + Z psi_axial) cos(m (theta - t)) + C psi_across sin(m (theta - t)).
     """
     m = np.arange(highest + 1)
-    found = np.zeros((highest + 1, 2, study.array.rings, 2))
+    found = np.zeros((highest + 1, 2, study.array.rings, 3))
     for block in blocks_of(study):
         middle = _middle(study, block)
-        x, y = block.remanence * np.array(block.easy_axis[:2])
+        x, y, axial = block.remanence * np.array(block.easy_axis)
         along = np.cos(middle) * x + np.sin(middle) * y
         across = np.cos(middle) * y - np.sin(middle) * x
         cosine, sine = np.cos(m * middle), np.sin(m * middle)
-        found[:, 0, block.ring - 1] += np.column_stack([along * cosine, -across * sine])
-        found[:, 1, block.ring - 1] += np.column_stack([along * sine, across * cosine])
+        found[:, 0, block.ring - 1] += np.column_stack(
+            [along * cosine, -across * sine, axial * cosine])
+        found[:, 1, block.ring - 1] += np.column_stack(
+            [along * sine, across * cosine, axial * sine])
     # a remanence across the middle, the same all round, has no charges; and there is no sin(0)
     found[0, 1] = 0
     found[0, :, :, 1] = 0
@@ -211,8 +214,8 @@ def _rings(case: _Case) -> list[_Ring]:
     blocks = blocks_of(case.study)[::case.study.array.blocks_per_ring]
     return [_Ring(block.recoil_permeability,
                   case.solved.index(ring) + 1 if ring in case.solved else 0,
-                  case.weights[:, :, ring, 0].ravel().tolist(),
-                  case.weights[:, :, ring, 1].ravel().tolist())
+                  *(case.weights[:, :, ring, component].ravel().tolist()
+                    for component in range(3)))
             for ring, block in enumerate(blocks)]
 
 

@@ -176,3 +176,13 @@ def test_blocks_react_as_in_a_regular_array(short_dipole, workshop):
     generator = np.random.default_rng(0)
     change = 0.01 * generator.standard_normal((32, 3))
     assert rms(np.einsum("knij,kj->ni", ours - theirs, change)) < 0.3 * rms(parts.error)
+
+
+@pytest.mark.parametrize("across", [None, 1.12])
+def test_a_turned_block_adds_up_too(short_dipole, workshop, across):
+    """It has a remanence along z, which is part of the nominal array; 1.7e-4 without."""
+    changes = {} if across is None else {"array__recoil_permeability_across": across}
+    study = short_dipole(array__exceptions=[
+        {"ring": 1, "slot": 5, "rotation_deg": [0.3, 0.2, 1.0]}], **changes)
+    built = response(study, observe(study, POINTS, np.ones(POINTS.shape, bool)), workshop)
+    assert built.superposition_error < 1e-10
