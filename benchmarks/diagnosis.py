@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 from benchmarks.note import Note
@@ -22,6 +23,9 @@ def run(note: Note) -> None:
     if not SUMMARY.exists():
         raise StudyError(f"There is no {SUMMARY}. Run make verify-diagnosis first.")
     rates = json.loads(SUMMARY.read_text(encoding="utf-8"))["rates"]
+    unknown = [name for name in COUNTED if math.isnan(rates[name])]
+    if unknown:
+        raise StudyError(f"{SUMMARY} lacks {', '.join(unknown)}. Run all of make verify-diagnosis.")
     for name, count in COUNTED.items():
         note(f"diagnosis.{name}", rates[name], "ratio",
              f"sealed cases of make verify-diagnosis, {rates[count]:.0f} of this kind")

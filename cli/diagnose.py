@@ -8,14 +8,20 @@ from __future__ import annotations
 
 import argparse
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Effect
 from halbach_fe.field_map import read_map
-from halbach_fe.study import read_study
+from halbach_fe.study import Study, read_study
+
+if TYPE_CHECKING:
+    from halbach_fe.diagnose import Diagnosis
+    from halbach_fe.next_measurement import Separation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,14 +52,8 @@ def effects_of(text: str) -> list[Effect]:
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose, write everything, print what was found."""
     from halbach_fe.diagnose import diagnose
-    from halbach_fe.diagnosed import summary, write_study, write_summary
+    from halbach_fe.diagnosed import summary
     from halbach_fe.next_measurement import separations
-    from halbach_fe.report.diagnosis import (  # matplotlib loads only when needed
-        change_table,
-        found_table,
-        verdict,
-        write_report,
-    )
 
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     text = arguments.study.read_text(encoding="utf-8")
@@ -62,15 +62,33 @@ def run(arguments: argparse.Namespace) -> int:
     with common.workshop(arguments) as workshop:
         found = diagnose(study, data, workshop, blocks, arguments.effects, unseen, common.say)
         next_ones = separations(found, data, workshop, arguments.effects)
-    write_summary(found, next_ones, arguments.output)
-    write_report(found, next_ones, arguments.output)
-    write_study(text, study, found, arguments.output)
+    write(found, next_ones, study, text, arguments.output)
     if arguments.json:
         common.print_json(summary(found, next_ones))
         return 0
+    tell(found, arguments.output)
+    return 0
+
+
+def write(
+    found: Diagnosis, next_ones: Sequence[Separation], study: Study, text: str, folder: Path,
+    assumptions: Sequence[str] = (),
+) -> None:
+    """Write summary, report and the study, whose file is ``text``, with what it lacked."""
+    from halbach_fe.diagnosed import write_study, write_summary
+    from halbach_fe.report.diagnosis import write_report  # matplotlib loads only when needed
+
+    write_summary(found, next_ones, folder)
+    write_report(found, next_ones, folder, assumptions)
+    write_study(text, study, found, folder)
+
+
+def tell(found: Diagnosis, folder: Path) -> None:
+    """Print what was found."""
+    from halbach_fe.report.diagnosis import change_table, found_table, verdict
+
     common.say(" ".join(verdict(found)))
     if found.anything:
         common.print_table(found_table(found), "What the study lacks")
     common.print_table(change_table(found), "The model before and after")
-    common.say(f"Report: {arguments.output / 'diagnosis.html'}")
-    return 0
+    common.say(f"Report: {folder / 'diagnosis.html'}")

@@ -26,8 +26,8 @@ STEP_M = 5e-4
 
 class IronRingEffect(Effect):
     """A coaxial tube of soft iron as long as the magnet; the place is its inner and outer radius,
-    from which those that fit best are looked for. It is linear: where it saturates, a thinner
-    tube is as strong as one farther out, which the readings can hardly tell apart.
+    from which those that fit best are looked for. It is linear: for one that saturates a
+    thicker tube farther out is found, and no saturating one is looked for.
     """
 
     name = "iron_ring"

@@ -31,7 +31,7 @@ class IronSaturation(Effect):
         return [Place()] if ring is not None and ring.curve is None else []
 
     def signature(self, scene: Scene, place: Place) -> Floats:
-        """See `Effect.signature`; both on the same kind of mesh, whose errors cancel so."""
+        """See `Effect.signature`; both on the same mesh."""
         solid = scene.study.solver.model_copy(update={"route": SOLID})
         before = scene.study if scene.study.dimension == 2 else scene.study.model_copy(
             update={"solver": solid})

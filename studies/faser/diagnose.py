@@ -15,11 +15,10 @@ import sys
 from run import HERE, assumptions, options, profile_to_map, with_step
 
 from halbach_fe.cli import common
+from halbach_fe.cli.diagnose import tell, write
 from halbach_fe.diagnose import diagnose
-from halbach_fe.diagnosed import write_study, write_summary
 from halbach_fe.field_map import read_map
 from halbach_fe.next_measurement import separations
-from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_report
 from halbach_fe.study import read_study
 
 
@@ -33,15 +32,10 @@ def run(arguments: argparse.Namespace) -> int:
         found = diagnose(study, data, workshop, say=common.say)
         next_ones = separations(found, data, workshop)
     assumed = assumptions(found.before, arguments.z_step_m)
-    write_summary(found, next_ones, arguments.output)
-    write_report(found, next_ones, arguments.output, assumed)
-    write_study(arguments.study.read_text(encoding="utf-8"), study, found, arguments.output)
+    text = arguments.study.read_text(encoding="utf-8")
+    write(found, next_ones, study, text, arguments.output, assumed)
     common.say("Assumed:\n" + "\n".join(f"- {one}" for one in assumed))
-    common.say(" ".join(verdict(found)))
-    if found.anything:
-        common.print_table(found_table(found), "What the model lacks, if the assumptions hold")
-    common.print_table(change_table(found), "The model before and after")
-    common.say(f"Report: {arguments.output / 'diagnosis.html'}")
+    tell(found, arguments.output)
     return 0
 
 

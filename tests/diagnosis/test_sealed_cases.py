@@ -38,7 +38,8 @@ def test_a_few_cases(study, tmp_path):
     for key in ("offset_z", "arm_sag"):
         assert cases[key]["named"][0][0] == key
         assert cases[key]["chi2_before"] > 1.3
-        assert 0.85 < cases[key]["chi2_after"] < 1.15  # 700 held-out readings: 5 %
+        # 1440 held-out readings: four standard deviations
+        assert 0.85 < cases[key]["chi2_after"] < 1.15
     assert not cases["none"]["named"]
     assert not cases["none"]["unknown"]
     assert cases["coil"]["unknown"]
@@ -90,6 +91,4 @@ def test_every_effect_that_can_be_hidden_is_in_a_case(study):
     assert {name for one in cases for name in one.hidden} == set(study.CAN_BE_HIDDEN)
     assert len(cases) >= 100
     assert len({one.seed for one in cases}) == len(cases)
-    truth = np.random.default_rng(0).random(5)
     assert np.isnan(study.rate([]))
-    assert study.rate(truth > 2) == 0
