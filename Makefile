@@ -37,7 +37,7 @@ study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
 
 test: setup-test
-	.venv/bin/python -m pytest -n auto --dist loadfile
+	.venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test

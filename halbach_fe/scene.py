@@ -46,9 +46,15 @@ class Scene:
         return blocks_of(self.study)
 
     @cached_property
+    def unit_fields(self) -> Floats:
+        """B (blocks, n, 3, 3) in T of each block for a remanence of 1 T along x, y, z."""
+        return np.array(list(unit_fields(self.blocks, self.points)))
+
+    @cached_property
     def block_fields(self) -> Floats:
         """B (blocks, n, 3) in T of each nominal block."""
-        return self.block_fields_of(self.study)
+        return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
+                         for block, unit in zip(self.blocks, self.unit_fields, strict=True)])
 
     @cached_property
     def block_gradients(self) -> Floats:
@@ -86,8 +92,7 @@ class Scene:
     def field_with(self, number: int, magnetization: Floats) -> Floats:
         """B (n, 3) in T of a block with a magnetization (D,) in A/m."""
         block, size = self.blocks[number], len(magnetization)
-        (unit,) = unit_fields((block,), self.points)
-        return np.asarray(unit[:, :, :size] @ (
+        return np.asarray(self.unit_fields[number, :, :, :size] @ (
             MU_0 * block.recoil_tensor[:size, :size] @ magnetization))
 
     def block_fields_of(self, study: Study) -> Floats:

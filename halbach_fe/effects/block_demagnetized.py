@@ -8,7 +8,6 @@ import numpy as np
 
 from halbach_fe.blocks import Floats, as_meant, blocks_of
 from halbach_fe.effects.base import Effect, Parameter, Place, blocks_at, each_block, with_exceptions
-from halbach_fe.exact_field import unit_fields
 from halbach_fe.scene import Scene
 from halbach_fe.study import BlockException, Study
 
@@ -30,8 +29,7 @@ class BlockDemagnetized(Effect):
         (number,) = blocks_at(scene, place)
         block = scene.blocks[number]
         whole = blocks_of(as_meant(scene.study))[number].remanence  # whatever it has lost already
-        (unit,) = unit_fields((block,), scene.points)
-        return -whole * (unit @ np.array(block.easy_axis))[None]
+        return -whole * (scene.unit_fields[number] @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

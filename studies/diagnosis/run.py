@@ -231,7 +231,9 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
     outside = [one for one in results if one["outside"]]
     right = [one for one in single + pairs if all(named(one, name) for name in one["hidden"])]
     iron = [one for one in results if "fringe_T" in one]
-    labels = np.roll([one["hidden"][0] for one in single], 1)  # nobody's own, unless drawn twice
+    true = np.array([one["hidden"][0] for one in single])
+    shuffled = [(one, label) for one, label, own in zip(single, np.roll(true, 1), true, strict=True)
+                if label != own]
     return {
         "naming_rate_single": rate(named(one, one["hidden"][0]) for one in single),
         "single_cases": len(single),
@@ -249,8 +251,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
         "iron_cases": len(iron),
         "heldout_recovered_rate": rate(BACK[0] <= one["chi2_after"] <= BACK[1] for one in right),
         "recovered_of": len(right),
-        "control_naming_rate_shuffled_labels": rate(
-            named(one, label) for one, label in zip(single, labels, strict=True)),
+        "control_naming_rate_shuffled_labels": rate(named(one, label) for one, label in shuffled),
         "control_false_alarm_rate_without_blocks": rate(
             one["without_blocks"] for one in clean if "without_blocks" in one)}
 
