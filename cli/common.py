@@ -148,7 +148,9 @@ def print_json(value: object) -> None:
 
 
 def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
-    """Print rows of text on stdout."""
+    """Print rows of text on stdout, if there are any."""
+    if not rows:
+        return
     console = Console(width=None if sys.stdout.isatty() else 140)
     table = Table(title=title or None, title_justify="left")
     for number, name in enumerate(rows[0]):
