@@ -23,6 +23,7 @@ from halbach_fe.next_measurement import ENOUGH, Separation
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
+from halbach_fe.report.view import of_update
 from halbach_fe.update import ALL_READINGS
 
 FIGURES = {
@@ -134,7 +135,7 @@ def write_report(
     write_page(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, verdict=verdict(diagnosis), assumptions=assumptions,
-        shown=dict(zip(drawn, pictures, strict=True)),
+        shown=dict(zip(drawn, pictures, strict=True)), view=of_update(diagnosis.after),
         found=[{"what": one.title, "where": one.place, "how much": one.amount,
                 "log Bayes factor": one.factor, "kind": one.kind} for one in others(diagnosis)]
         + [_entry(one, titles) for one in diagnosis.named],

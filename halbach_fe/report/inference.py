@@ -19,6 +19,7 @@ from halbach_fe.report.prediction import (
     relative_error,
     residuals,
 )
+from halbach_fe.report.view import of_update
 from halbach_fe.update import Update
 
 NOTHING = "–"
@@ -84,7 +85,8 @@ def write_report(
     write_page(
         folder / "report.html", "inference.html.j2", save(figures, folder), update=update,
         rows=score_table(update, published), assumptions=assumptions, array=array,
-        remanence=blocks_of(update.study)[0].remanence, conflict=_conflict(update))
+        remanence=blocks_of(update.study)[0].remanence, conflict=_conflict(update),
+        view=of_update(update))
 
 
 def _conflict(update: Update) -> str:

@@ -1,0 +1,218 @@
+"""A view of the magnet in three dimensions, to turn and point at, inside a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import plotly.graph_objects as go
+import plotly.io
+from markupsafe import Markup
+from scipy.spatial import Delaunay
+
+from halbach_fe.blocks import Floats, Ints, MagnetBlock, blocks_of, outline_contains, turn_of
+from halbach_fe.report.page import IRON, MEASURED
+from halbach_fe.study import Study
+from halbach_fe.update import Update
+
+ARC_POINTS = 5
+SIGNED, UNSIGNED = "RdBu_r", "Cividis"
+"""Scales that every kind of colour vision can read."""
+
+ARROW, HEAD = 0.7, 0.35
+"""Length of an arrow over the thickness of a block, and of its head over its own."""
+
+FLAT = 0.2
+"""Height of a cross-section over its radius."""
+
+MOST_POINTS = 10_000
+"""Of a map; more would make the page slow."""
+
+LARGE = 4.0
+"""Residuals over their standard deviations from which the colour is the same."""
+
+FROM_AHEAD, FROM_ASIDE = {"x": 0.3, "y": 0.3, "z": 1.9}, {"x": 1.4, "y": 1.0, "z": 1.2}
+
+IDENTITY = "magnet-view"
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a page knows of the blocks.
+
+    Attributes
+    ----------
+    magnetization : ndarray, shape (blocks, D), in A/m
+        Drawn as arrows.
+    deviation, sd : ndarray, shape (blocks,), or None
+        Along the easy axis, from nominal, as a fraction of it: the colour; None before a
+        measurement.
+    """
+
+    magnetization: Floats
+    deviation: Floats | None = None
+    sd: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Measured points: positions (n, 3) in m and residuals (n,) over their standard deviations."""
+
+    points: Floats
+    standardized: Floats
+
+
+def of_update(update: Update) -> Markup:
+    """The view of an update: the posterior, and what it leaves of each reading."""
+    size = update.study.dimension
+    nominal = update.response.nominal.reshape(-1, size)
+    easy = nominal / np.linalg.norm(nominal, axis=1)[:, None]
+    length = np.einsum("ij,ij->i", nominal, easy)
+    mean = update.posterior.mean.reshape(-1, size)
+    along = np.einsum("ij,ijk->ik", easy, update.posterior.root.reshape(*easy.shape, -1))
+    known = Known(mean, np.einsum("ij,ij->i", mean - nominal, easy) / length,
+                  np.linalg.norm(along, axis=1) / length)
+    scores = update.standardized(update.prediction_posterior)
+    return magnet_view(update.study, known, _by_point(update.observation.positions, scores))
+
+
+def _by_point(positions: Floats, scores: Floats) -> Residuals:
+    """Of all readings at a point the one that is farthest off; of too many points these first."""
+    points, inverse = np.unique(positions.round(9), axis=0, return_inverse=True)
+    order = np.argsort(np.abs(scores))
+    worst = np.zeros(len(points))
+    worst[inverse.ravel()[order]] = scores[order]
+    if len(points) > MOST_POINTS:
+        kept = np.sort(np.argsort(-np.abs(worst))[:MOST_POINTS // 2])
+        evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
+        chosen = np.union1d(kept, evenly)
+        points, worst = points[chosen], worst[chosen]
+    return Residuals(points, worst)
+
+
+def magnet_view(study: Study, known: Known, residuals: Residuals | None = None) -> Markup:
+    """A part of a page, with all that it needs."""
+    figure = go.Figure([_blocks(study, known), *_arrows(study, known)])
+    if study.iron_ring is not None:
+        figure.add_trace(_iron(study))
+    if residuals is not None:
+        figure.add_trace(_readings(residuals))
+    figure.update_layout(
+        height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
+        scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
+               "yaxis": {"title": {"text": "y in m"}}, "zaxis": {"title": {"text": "z in m"}},
+               "camera": {"eye": FROM_AHEAD if study.dimension == 2 else FROM_ASIDE,
+                          "up": {"x": 0, "y": 1, "z": 0}}})
+    return Markup(plotly.io.to_html(
+        figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY,
+        config={"displaylogo": False, "responsive": True}))
+
+
+def _blocks(study: Study, known: Known) -> go.Mesh3d:
+    """All blocks as one surface, each with vertices of its own, which carry its words."""
+    vertices, triangles, owner = [], [], []
+    first = 0
+    blocks = blocks_of(study)
+    for number, block in enumerate(blocks):
+        corners, faces = prism(block, _height(study))
+        vertices.append(corners)
+        triangles.append(faces + first)
+        owner += [number] * len(corners)
+        first += len(corners)
+    points, faces = np.vstack(vertices), np.vstack(triangles)
+    words = [_words(block, known, number) for number, block in enumerate(blocks)]
+    look: dict[str, object] = {"color": "#BBBBBB"}
+    if known.deviation is not None:
+        percent = 100 * known.deviation
+        limit = float(np.abs(percent).max()) or 1.0
+        look = {"intensity": percent[np.array(owner)[faces[:, 0]]], "intensitymode": "cell",
+                "colorscale": SIGNED, "cmin": -limit, "cmax": limit, "colorbar": {
+                    "title": {"text": "posterior change<br>along the easy axis in %"},
+                    "len": 0.45, "y": 0.7}}
+    return go.Mesh3d(
+        x=points[:, 0], y=points[:, 1], z=points[:, 2], i=faces[:, 0], j=faces[:, 1],
+        k=faces[:, 2], text=[words[one] for one in owner], hoverinfo="text", flatshading=True,
+        name="blocks", showlegend=True, lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
+
+
+def _words(block: MagnetBlock, known: Known, number: int) -> str:
+    moment = known.magnetization[number]
+    lines = [f"ring {block.ring}, slot {block.slot}",
+             "M = (" + ", ".join(f"{1e-3 * one:.1f}" for one in moment) + ") kA/m"]
+    if known.deviation is not None and known.sd is not None:
+        lines.append(f"{100 * known.deviation[number]:+.2f} ± {100 * known.sd[number]:.2f} % "
+                     "along the easy axis")
+    return "<br>".join(lines)
+
+
+def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
+    """Corners (n, 3) in m of a block's surface and triangles (m, 3) of it.
+
+    ``height`` is that of a block of infinite length.
+    """
+    flat = np.vstack([edge.at(np.linspace(0, 1, ARC_POINTS)[:-1] if edge.arc else np.zeros(1))[0]
+                      for edge in block.outline])
+    count = len(flat)
+    inside = Delaunay(flat).simplices
+    face = inside[outline_contains(block.outline, flat[inside].mean(axis=1))]
+    low, high = (block.z_min, block.z_max) if np.isfinite(block.z_max) else (
+        -height / 2, height / 2)
+    ring = np.arange(count)
+    ahead = (ring + 1) % count
+    sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
+                       np.column_stack([ring, ahead + count, ring + count])])
+    corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
+    corners = (corners - block.middle) @ turn_of(block.turn).T + block.middle + block.shift
+    return corners, np.vstack([face, face + count, sides])
+
+
+def _height(study: Study) -> float:
+    return FLAT * study.array.outer_radius_m
+
+
+def _arrows(study: Study, known: Known) -> list[go.Scatter3d | go.Cone]:
+    """Directions of magnetization, on the upper faces of the blocks."""
+    blocks = blocks_of(study)
+    middles = np.array([[*(block.middle + block.shift)[:2],
+                         prism(block, _height(study))[0][:, 2].max()] for block in blocks])
+    vectors = np.zeros((len(blocks), 3))
+    vectors[:, :known.magnetization.shape[1]] = known.magnetization
+    vectors *= (ARROW * (study.array.outer_radius_m - study.array.inner_radius_m)
+                / np.linalg.norm(vectors, axis=1).max())
+    gap = np.full_like(middles, np.nan)  # no line from one arrow to the next
+    x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
+    shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
+                          name="magnetization", legendgroup="arrows", hoverinfo="skip")
+    (x, y, z), (u, v, w) = (middles + vectors / 2).T, (HEAD * vectors).T
+    heads = go.Cone(
+        x=x, y=y, z=z, u=u, v=v, w=w, sizemode="raw", anchor="tip", showscale=False,
+        colorscale=[[0, MEASURED], [1, MEASURED]], legendgroup="arrows", hoverinfo="skip")
+    return [shafts, heads]
+
+
+def _iron(study: Study) -> go.Surface:
+    ring = study.iron_ring
+    assert ring is not None
+    blocks = blocks_of(study)
+    length = ring.length_m or (blocks[-1].z_max - blocks[0].z_min)
+    half = (length if np.isfinite(length) else _height(study)) / 2
+    angle = np.linspace(0, 2 * np.pi, 97)
+    radius = np.array([ring.inner_radius_m, ring.outer_radius_m, ring.outer_radius_m,
+                       ring.inner_radius_m, ring.inner_radius_m])[:, None]
+    z = np.array([-half, -half, half, half, -half])[:, None]
+    return go.Surface(
+        x=radius * np.cos(angle), y=radius * np.sin(angle), z=z + 0 * angle, opacity=0.25,
+        showscale=False, colorscale=[[0, IRON], [1, IRON]], name="iron", showlegend=True,
+        hoverinfo="name")
+
+
+def _readings(residuals: Residuals) -> go.Scatter3d:
+    scores = residuals.standardized
+    x, y, z = residuals.points.T
+    return go.Scatter3d(
+        x=x, y=y, z=z, mode="markers", name="measured points", customdata=scores,
+        hovertemplate="(%{x:.4f}, %{y:.4f}, %{z:.4f}) m<br>largest residual "
+                      "%{customdata:+.2f} sd<extra></extra>",
+        marker={"size": 2.5, "color": np.abs(scores), "colorscale": UNSIGNED, "cmin": 0,
+                "cmax": LARGE, "colorbar": {
+                    "title": {"text": "largest residual<br>over its sd"}, "len": 0.45, "y": 0.23}})

@@ -1,0 +1,130 @@
+"""The view of the magnet, opened and clicked in Chromium, offline."""
+
+from __future__ import annotations
+
+import io
+import shutil
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from halbach_fe.blocks import blocks_of
+from halbach_fe.report.view import Known, Residuals, magnet_view, prism
+from halbach_fe.study import read_study
+from tests.conftest import ROOT
+
+STUDIES = ("quadrupole", "mri", "faser")
+
+
+def study_of(name):
+    return read_study(ROOT / "studies" / name / "study.toml")
+
+
+def known_of(study):
+    blocks = blocks_of(study)
+    return Known(np.array([block.magnetization[:study.dimension] for block in blocks]),
+                 np.linspace(-0.02, 0.02, len(blocks)), np.full(len(blocks), 0.004))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api")
+    path = shutil.which("chromium")
+    if path is None:
+        pytest.skip("no chromium here")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=path, args=[
+            "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser, tmp_path):
+    """Open a part of a page; errors in it fail the test."""
+    errors = []
+    context = browser.new_context(offline=True, viewport={"width": 1000, "height": 800})
+    page = context.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+
+    def opened(part):
+        path = tmp_path / "page.html"
+        path.write_text(f"<!doctype html><meta charset=\"utf-8\"><body>{part}</body>", encoding="utf-8")
+        page.goto(path.as_uri())
+        page.wait_for_selector("#magnet-view canvas", timeout=30_000)
+        page.wait_for_function("document.getElementById('magnet-view')._fullLayout")
+        return page
+
+    yield opened
+    context.close()
+    assert not errors
+
+
+def coloured(page):
+    """How many pixels of the picture are of no grey and no pale colour."""
+    page.wait_for_timeout(1500)  # WebGL by software
+    picture = imread(io.BytesIO(page.locator("#magnet-view").screenshot()))[:, :, :3]
+    return int((np.ptp(picture, axis=2) > 0.25).sum())
+
+
+def words(page):
+    """What is shown as the pointer goes over the picture."""
+    box, found = page.locator("#magnet-view").bounding_box(), set()
+    for along in np.linspace(0.3, 0.6, 5):
+        for down in np.linspace(0.35, 0.7, 5):
+            page.mouse.move(box["x"] + along * box["width"], box["y"] + down * box["height"])
+            page.wait_for_timeout(60)
+            found.update(page.evaluate(
+                "[...document.querySelectorAll('#magnet-view g.hovertext')]"
+                ".map(one => one.textContent)"))
+    return found
+
+
+def test_blocks_tell_their_numbers_and_can_be_hidden(page):
+    study = study_of("quadrupole")
+    known = known_of(study)
+    shown = page(magnet_view(study, known, Residuals(np.zeros((1, 3)), np.array([2.5]))))
+    assert coloured(shown) > 20_000
+    found = words(shown)
+    own = [one for one in found if "ring 1, slot" in one]
+    assert own
+    for text in own:
+        slot = int(text.split("slot ")[1].split("M")[0])
+        percent = 100 * known.deviation[slot - 1]
+        assert f"{percent:+.2f} ± 0.40 %" in text
+    shown.locator("#magnet-view .legendtoggle").first.click()
+    shown.wait_for_function("document.getElementById('magnet-view').data[0].visible == 'legendonly'",
+                            timeout=10_000)
+    assert not any("slot" in one for one in words(shown))
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_studies_are_shown(page, name):
+    study = study_of(name)
+    shown = page(magnet_view(study, known_of(study)))
+    whole = coloured(shown)
+    shown.evaluate("Plotly.restyle('magnet-view', {visible: false}, [0])")
+    assert coloured(shown) < 0.2 * whole  # the iron stays
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_surface_of_a_block_is_closed_and_has_its_volume(name):
+    study = study_of(name)
+    for block in blocks_of(study)[:5]:
+        points, faces = prism(block, 0.01)
+        edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        assert (count == 2).all()
+        height = 0.01 if np.isinf(block.z_max) else block.z_max - block.z_min
+        # volume by divergence, of triangles whose orientation is put right by their face
+        area = 0.0
+        low = points[:, 2].min()
+        for face in faces:
+            corners = points[face]
+            if np.ptp(corners[:, 2]) < 1e-12 and abs(corners[0, 2] - low) < 1e-12:
+                (x0, y0), (x1, y1) = corners[1, :2] - corners[0, :2], corners[2, :2] - corners[0, :2]
+                area += abs(x0 * y1 - y0 * x1) / 2
+        # arcs of 22.5 degrees in four chords: 1 - sinc, 2e-3 of the area they bound, both ways
+        assert area * height == pytest.approx(block.area * height, rel=1e-2)
