@@ -11,6 +11,7 @@ from halbach_fe.cli import (
     diagnose,
     doctor,
     infer,
+    new,
     plan,
     prior,
     schema,
@@ -20,9 +21,10 @@ from halbach_fe.cli import (
 )
 from halbach_fe.errors import EXIT_CODES
 
-VERBS = {"solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify, "plan": plan,
-         "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
-         "schema": schema}
+VERBS = {
+    "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
+    "plan": plan, "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
+    "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:
