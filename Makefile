@@ -9,7 +9,7 @@
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -42,6 +42,10 @@ test: setup-test
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test
 	.venv/bin/python -m benchmarks.run
+
+# Pages of docs/, into build/docs.
+docs: setup-test
+	.venv/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
 
 lint: setup-test
 	.venv/bin/ruff check .

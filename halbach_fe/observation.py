@@ -89,7 +89,7 @@ class Observation:
 
     def magnitude(self, field: Floats) -> Floats:
         """Size of a field (n, 3) in T as every reading sees it, whatever its direction or phase:
-        |B| at the point, or the amplitude of the harmonic.
+        ``|B|`` at the point, or the amplitude of the harmonic.
         """
         sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
         single = np.diff(self.analysis.indptr) == 1  # one component at one point

@@ -161,7 +161,7 @@ class Update:
         return 1 + 5 * float(np.sqrt(2 / np.sum(~self.held_out)))
 
     def relative_error(self, prediction: Prediction) -> Floats:
-        """|measured - predicted| / |measured| of every reading; NaN for a reading of exactly 0."""
+        """``|measured - predicted| / |measured|`` of every reading; NaN for one of exactly 0."""
         measured = np.where(self.readings != 0, np.abs(self.readings), np.nan)
         return np.asarray(np.abs(self.readings - prediction.mean) / measured)
 

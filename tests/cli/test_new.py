@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 import re
 
+import numpy as np
 import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.errors import StudyError
 from halbach_fe.new_study import Magnet, new_study, studied
+from halbach_fe.observation import held_out, observe, points_from
 from halbach_fe.study import read_study
 
 MAGNETS = [Magnet(shape=shape, iron_ring=iron, ring_length_m=length, rings=3 if length else 1,
@@ -54,3 +56,14 @@ def test_nothing_is_overwritten_and_nonsense_is_refused(tmp_path, capsys):
     assert main(["new", str(other), "--inner-radius-m", "0.1", "--outer-radius-m", "0.09"]) == 3
     assert "outer_radius_m" in capsys.readouterr().err
     assert not other.exists()
+
+
+@pytest.mark.parametrize("options", [[], ["--ring-length-m", "0.1"]], ids=["2d", "3d"])
+def test_new_study_can_be_measured(tmp_path, options):
+    path = tmp_path / "magnet.toml"
+    assert main(["new", str(path), "--blocks-per-ring", "8", *options]) == 0
+    study = read_study(path)
+    points = points_from(study.observation.positions)
+    readings = observe(study, points, np.ones_like(points, bool))
+    hidden = held_out(study, readings)
+    assert 0 < hidden.sum() < len(hidden) / 1.9

@@ -1,0 +1,95 @@
+"""The reference, written from the code: keys of a study, commands, exit codes, modules."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from pathlib import Path
+
+from halbach_fe.cli import VERBS, parser
+from halbach_fe.errors import EXIT_CODES
+from halbach_fe.study import Study
+
+MODULES = ("study", "field_map", "block_table", "update", "diagnose", "effects.base", "observation",
+           "response", "exact_field", "analytic", "inference.linear", "inference.prior",
+           "inference.noise", "inference.sampling", "diagnosis.evidence", "diagnosis.selection")
+
+
+def write_reference(folder: Path) -> None:
+    """Write all generated pages into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pages = {"study.md": study_page(), "commands.md": commands_page(),
+             "exit-codes.md": exit_codes_page(), "python.md": python_page()}
+    for name, text in pages.items():
+        path = folder / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def study_page() -> str:
+    """Every table and key of a study, from its JSON schema."""
+    schema = Study.model_json_schema()
+    parts = ["# Keys of a study", "Lengths are in m, flux densities in T, angles in degrees; "
+             "unknown keys are errors. `halbach-fe schema` prints the same as JSON schema.",
+             _table("Study", schema)]
+    parts += [_table(name, one) for name, one in schema["$defs"].items()]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(name: str, schema: dict) -> str:
+    rows = ["| key | type | default |", "|---|---|---|"]
+    required = schema.get("required", [])
+    for key, one in schema.get("properties", {}).items():
+        default = "required" if key in required else f"`{one.get('default', 'none')}`"
+        rows.append(f"| `{key}` | {_type(one)} | {default} |")
+    text = inspect.cleandoc(schema.get("description", ""))
+    return "\n\n".join(part for part in (f"## {name}", text, "\n".join(rows)) if part)
+
+
+def _type(schema: dict) -> str:
+    """A JSON schema's type in words."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return f"[{name}](#{name.lower()})"
+    if "const" in schema:
+        return f'`"{schema["const"]}"`'
+    if "enum" in schema:
+        return " or ".join(f"`{one!r}`".replace("'", '"') for one in schema["enum"])
+    for key in ("anyOf", "oneOf"):
+        if key in schema:
+            return " or ".join(_type(one) for one in schema[key] if one.get("type") != "null")
+    if schema.get("type") == "array":
+        if "prefixItems" in schema:
+            return f"{len(schema['prefixItems'])} × {_type(schema['prefixItems'][0])}"
+        return f"list of {_type(schema.get('items', {}))}"
+    limits = [f"{sign} {schema[name]:g}" for name, sign in (
+        ("minimum", "≥"), ("exclusiveMinimum", "\\>"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
+        if name in schema]
+    return " ".join([schema.get("type", "any"), ", ".join(limits)]).strip()
+
+
+def commands_page() -> str:
+    """Help of every verb."""
+    parts = ["# Commands"]
+    actions = next(action for action in parser()._actions
+                   if isinstance(action, argparse._SubParsersAction))
+    for name in VERBS:
+        actions.choices[name].formatter_class = lambda prog: argparse.RawDescriptionHelpFormatter(
+            prog, width=96)
+        parts.append(f"## {name}\n\n```text\n{actions.choices[name].format_help()}```")
+    return "\n\n".join(parts) + "\n"
+
+
+def exit_codes_page() -> str:
+    """What the exit codes mean."""
+    rows = "\n".join(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items())
+    return f"# Exit codes\n\n| code | meaning |\n|---|---|\n{rows}\n"
+
+
+def python_page() -> str:
+    """The modules that a script would use."""
+    parts = ["# Python"]
+    for name in MODULES:
+        full = f"halbach_fe.{name}"
+        parts.append(f"## {full}\n\n```{{eval-rst}}\n.. automodule:: {full}\n   :members:\n```")
+    return "\n\n".join(parts) + "\n"

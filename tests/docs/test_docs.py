@@ -1,0 +1,110 @@
+"""Every block of code in the documentation runs, in the order of its page, and the pages build."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from halbach_fe.cli import VERBS
+from halbach_fe.study import Study
+from tests.conftest import ROOT
+
+DOCS = ROOT / "docs"
+TUTORIAL = DOCS / "tutorial.md"
+PAGES = sorted(path for path in DOCS.rglob("*.md")
+               if path.parent.name != "reference" and path != TUTORIAL)
+FENCE = re.compile(r"^```(?:\{code-block\} )?(\w+)\n(.*?)^```$", re.M | re.S)
+OPTION = re.compile(r"^:(\w+): *(.*)\n", re.M)
+ELSEWHERE = ("make setup-test", ". .venv/bin/activate")
+"""Done by what runs this test."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of code: its language, its text, the file it is, whether it must fail."""
+
+    language: str
+    text: str
+    file: str = ""
+    fails: bool = False
+
+
+def blocks_of(text):
+    for language, body in FENCE.findall(text):
+        options = dict(OPTION.findall(body.partition("\n\n")[0] + "\n")) if body[:1] == ":" else {}
+        code = body.partition("\n\n")[2] if options else body
+        yield Block(language, code, options.get("caption", ""), options.get("class") == "fails")
+
+
+def run_page(text, folder):
+    """Run a page's blocks; AssertionError with what was said if one does not do as it should."""
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "OMP_NUM_THREADS": "1"}
+    for block in blocks_of(text):
+        if block.file:
+            (folder / block.file).write_text(block.text, encoding="utf-8")
+            continue
+        if block.language not in ("sh", "python"):
+            raise AssertionError(f"a block of {block.language} that nobody runs: {block.text}")
+        code = "\n".join(line for line in block.text.splitlines() if line not in ELSEWHERE)
+        command = ["bash", "-e", "-c", code] if block.language == "sh" else [
+            sys.executable, "-W", "error", "-c", code]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True,
+                              timeout=1200)
+        assert (done.returncode != 0) == block.fails, f"{code}\n{done.stdout}\n{done.stderr}"
+        if block.fails:
+            assert "error: Input" in done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_every_block_runs(page, tmp_path):
+    run_page(page.read_text(encoding="utf-8"), tmp_path)
+
+
+def test_tutorial_finds_what_it_says(tmp_path):
+    """Its text names the displacement that it hides, and figures that are these."""
+    text = TUTORIAL.read_text(encoding="utf-8")
+    run_page(text, tmp_path)
+    found = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text())
+    (effect,) = found["effects"]
+    assert effect["effect"] == "mapper_translation"
+    hidden = re.search(r"mapper_translation=([\d.,-]+)", text)[1].split(",")
+    for one, true in zip(effect["parameters"][:2], hidden, strict=False):
+        assert abs(one["value"] - float(true)) < 4 * one["sd"]
+    before, after = (next(row["chi2_per_reading"] for row in found["scores"][when]
+                          if row["part"] == "held out") for when in ("before", "after"))
+    assert round(before) == 7
+    assert after < 1.5
+    better = json.loads((tmp_path / "better" / "summary.json").read_text())
+    assert better
+
+
+def test_a_wrong_block_is_seen(tmp_path):
+    for text in ("```sh\nhalbach-fe solve nothing.toml -o there\n```\n",
+                 "```python\nassert 1 == 2\n```\n", "```ruby\nputs 1\n```\n",
+                 "```{code-block} sh\n:class: fails\n\ntrue\n```\n"):
+        with pytest.raises(AssertionError):
+            run_page(text, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("docs")
+    subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", DOCS,
+                    folder, "-d", folder / ".doctrees"], check=True, timeout=600)
+    return folder
+
+
+def test_reference_has_all_keys_and_verbs(built):
+    study = (built / "reference" / "study.html").read_text(encoding="utf-8")
+    assert all(f">{key}<" in study for key in Study.model_fields)
+    commands = (built / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert all(f'id="{verb}"' in commands for verb in VERBS)
