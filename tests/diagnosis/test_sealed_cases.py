@@ -16,8 +16,8 @@ from tests.conftest import ROOT
 
 SCRIPT = ROOT / "studies" / "diagnosis" / "run.py"
 FEW = {"offset_z": 28, "arm_sag": 47, "none": 143, "coil": 169}
-"""Numbers of cases: two single effects, nothing, and one outside the catalogue, whose field an offset
-and two misalignments add up to."""
+"""Numbers of cases: two single effects, nothing, and one outside the catalogue, whose field an
+offset and two misalignments add up to."""
 
 
 @pytest.fixture(scope="module")
