@@ -41,6 +41,7 @@ from halbach_fe.diagnosis.selection import (
     Found,
     gains,
     log_evidence,
+    prior_log_odds,
     probabilities,
     select,
     tailored,
@@ -405,7 +406,8 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
     points = probe_points(update.study.instrument, observation.map_points)
     scale = float(np.median(update.errors.sd))
     # columns of this search: other places may have been looked at in the one that found them
-    mine = [search.candidates[search.hypotheses.index(one.hypothesis)] for one in named]
+    numbers = [search.hypotheses.index(one.hypothesis) for one in named]
+    mine = [search.candidates[number] for number in numbers]
     held = [column for one in mine for column in one.columns]
     own = [replace(one, columns=tuple(held.index(column) for column in one.columns))
            for one in mine]
@@ -424,19 +426,21 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
         instead.append((alone.log_bayes_factor, kind, alone))
     beside.sort(key=lambda one: -one[0])
     instead.sort(key=lambda one: -one[0])
-    if beside[0][0] + np.log(EFFECT_ODDS) < FOUND:
+    # several effects that happen to add up to one thing pay for each of them
+    odds = log_evidence(both, own) + prior_log_odds(search.candidates)[numbers].sum()
+    alone_better = bool(mine and instead[0][0] + np.log(EFFECT_ODDS) > odds + ALIKE)
+    if not alone_better and beside[0][0] + np.log(EFFECT_ODDS) < FOUND:
         return None
-    alone_better = bool(mine) and instead[0][0] > log_evidence(both, own) + FOUND
     (factor, kind, best), (second, *_) = instead if alone_better else beside
     size = scale * np.linalg.norm(np.tensordot(best.mean, kinds[kind].fields, 1), axis=1)
     source = None
     if kind == "field":
         others = [] if alone_better else mine
-        odds = gains(with_candidates(search.evidence, others), search.candidates)
+        factors = gains(with_candidates(search.evidence, others), search.candidates)
         dipoles = [number for number, one in enumerate(search.hypotheses)
                    if one.effect.name == "ferromagnetic_object"]
         if dipoles:
-            source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
+            source = search.hypotheses[max(dipoles, key=lambda k: factors[k])].place.at_m
     return Unknown("either" if factor - second < ALIKE else kind, factor,
                    alone_better or not mine, float(size.max()),
                    tuple(points[int(np.argmax(size))].tolist()), source)

@@ -170,7 +170,7 @@ def tube(iron):
     return iron and {"inner_radius_m": 0.19, "outer_radius_m": 0.2, **iron}
 
 
-@pytest.mark.parametrize("iron", IRONS)
+@pytest.mark.parametrize("iron", ["none", "linear", "steel"])
 def test_reaction_in_2d(dipole, workshop, iron):
     """15 mT, or 19 mT with iron. Measured 2e-6 to 7e-6 T apart; the error of these GetDP meshes of
     5 mm is of that size.
