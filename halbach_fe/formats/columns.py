@@ -1,7 +1,8 @@
 """Tables of columns: commas, semicolons, tabs or spaces, with a header or without.
 
-Lines before the first one of numbers are preface. Its header is the last line there, commented or
-not, that has a name for each column and says what two of them are; a line of units may follow it.
+Lines before the first one of numbers, or mostly numbers, are preface. Its header is the last line
+there, commented or not, that has a name for each column and says what two of them are; a line of
+units may follow it.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from halbach_fe.formats.text import (
     comments_of,
     delimiter_of,
     is_comment,
-    is_numeric,
     lines_of,
+    numbers_among,
     rows_of,
     uncommented,
 )
@@ -45,19 +46,41 @@ def read_lines(lines: Sequence[Line], declared: Declared, where: str) -> Table:
     start = _first_numbers(lines, declared, where)
     delimiter = delimiter_of(lines[start][1], declared)
     count = len(cells_of(lines[start][1], delimiter))
-    values = rows_of(lines[start:], count, delimiter, declared, where)
+    values, texts = rows_of(lines[start:], count, delimiter, declared, where)
+    _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
     columns = _header(lines[:start], count, delimiter, where)
-    return Table(columns, values, where, comments=comments_of(lines[:start]))
+    return Table(columns, values, where, comments=comments_of(lines[:start]), texts=texts)
 
 
 def _first_numbers(lines: Sequence[Line], declared: Declared, where: str) -> int:
+    """Index of the first line of numbers, or mostly numbers if the next one is like it."""
+    before: tuple[int, int] | None = None  # a line of mostly numbers, and how many cells it has
     for index, (_, line) in enumerate(lines):
-        if not is_comment(line) and is_numeric(cells_of(line, delimiter_of(line, declared)),
-                                               declared.decimal_comma):
+        if is_comment(line):
+            continue
+        cells = cells_of(line, delimiter_of(line, declared))
+        found = numbers_among(cells, declared.decimal_comma)
+        if 2 * found > len(cells) and before and before[1] == len(cells):
+            return before[0]
+        if found == len(cells):
             return index
-    hint = next((found for _, line in lines for mark in (";", "\t", None)
-                 for cell in cells_of(line, mark) if (found := comma_hint(cell))), "")
+        before = (index, len(cells)) if 2 * found > len(cells) else None
+    hint = next((comma for _, line in lines for mark in (";", "\t", None)
+                 for cell in cells_of(line, mark) if (comma := comma_hint(cell))), "")
     raise MeasurementError(must_be("content", where, "a table with lines of numbers", "none", hint))
+
+
+def _refuse_lost_rows(
+    preface: Sequence[Line], count: int, delimiter: str | None, declared: Declared, where: str
+) -> None:
+    """A line as long as a row, with some numbers, may be a reading and not a preface."""
+    for position, line in preface:
+        cells = cells_of(line, delimiter)
+        if not is_comment(line) and len(cells) == count and numbers_among(
+                cells, declared.decimal_comma):
+            raise MeasurementError(must_be(
+                f"line {position}", where, "either a reading or a header",
+                f"'{line.strip()[:60]}'", "If it is neither, begin it with #."))
 
 
 def _header(

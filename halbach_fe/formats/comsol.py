@@ -29,7 +29,6 @@ from halbach_fe.formats.text import (
     delimiter_of,
     lines_of,
     number,
-    rows_of,
     uncommented,
 )
 
@@ -126,7 +125,11 @@ def _listed_points(
     count = len(_values(lines[:1], declared, where))
     if count != 3:
         raise _not_three(where, f"{count} columns")
-    return rows_of(lines, 3, delimiter_of(lines[0][1], declared), declared, where)
+    for position, line in lines:
+        if len(line.split(delimiter_of(line, declared))) != 3:
+            raise MeasurementError(must_be(f"line {position}", where, "3 values", "others",
+                                           "Is the file cut short?"))
+    return _values(lines, declared, where).reshape(-1, 3)
 
 
 def _not_three(where: str, received: str) -> MeasurementError:

@@ -52,14 +52,14 @@ def read(raw: bytes, declared: Declared, where: str) -> Table:
         raise MeasurementError(must_be("first line", where, "the three counts of an Opera table",
                                        f"'{lines[0][1].strip()[:40]}'"))
     columns, length_unit, start = _columns(lines, where)
-    values = rows_of(lines[start:], len(columns), None, declared, where)
+    values, texts = rows_of(lines[start:], len(columns), None, declared, where)
     grid = [int(text) for text in counts.groups()[:3]]
     listed = len(set(grid)) == 1 and len(values) == grid[0]
     if len(values) != grid[0] * grid[1] * grid[2] and not listed:
         raise MeasurementError(must_be(
             "content", where, f"{grid[0]} x {grid[1]} x {grid[2]} points, as its first line says",
             str(len(values)), "Is the file cut short?"))
-    return Table(columns, values, where, length_unit=length_unit)
+    return Table(columns, values, where, length_unit=length_unit, texts=texts)
 
 
 def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[Name, ...], str, int]:

@@ -6,7 +6,7 @@ What is missing is asked for, all of it at once; nothing is guessed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -17,6 +17,7 @@ from halbach_fe.field_map import MAX_FIELD_T, field_map
 from halbach_fe.formats import names, units
 from halbach_fe.formats.declared import Declared
 from halbach_fe.formats.names import Name
+from halbach_fe.formats.text import Line, comma_hint
 from halbach_fe.study import MAX_LENGTH_M
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
@@ -43,6 +44,8 @@ class Table:
     anchor : str
         What the file counts its positions from, if that is not known to be the magnet's centre.
     comments : str
+    texts : mapping of int to (int, str)
+        Columns that are not all numbers: line and text of the first that is none.
     """
 
     columns: tuple[Name, ...]
@@ -52,6 +55,7 @@ class Table:
     field_unit: str = ""
     anchor: str = ""
     comments: str = ""
+    texts: dict[int, Line] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -87,17 +91,21 @@ def to_map(table: Table, declared: Declared) -> Imported:
             "content", table.where, "complete", f"a file that does not say {'; '.join(missing)}",
             "Give the options; nothing is guessed from the size of the numbers."))
     for name, column in used.items():
+        if column in table.texts:
+            line, cell = table.texts[column]
+            raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
+                                           f"'{cell[:40]}'", comma_hint(cell)))
         if (np.abs(table.values[:, column]) > MAX_NUMBER).any():
             raise MeasurementError(must_be(name, table.where, f"below {MAX_NUMBER:g}", "more"))
     si = {name: units.in_si(table.values[:, column], unit_of[name])
           for name, column in used.items()}
     count = len(table.values)
     si |= {name: np.full(count, value) for name, value in declared.at.items()}
-    points, field = _cartesian(si, table.where)
+    points, flux_density = _cartesian(si, table.where)
     if declared.origin_m is not None:
         points = points + declared.origin_m
-    blank = np.isnan(field).all(axis=1)
-    data = _checked(points[~blank], field[~blank], table.where)
+    blank = np.isnan(flux_density).all(axis=1)
+    data = _checked(points[~blank], flux_density[~blank], table.where)
     if table.comments:
         data.attrs["comments"] = table.comments
     lengths = {unit for name, unit in unit_of.items() if unit in units.LENGTHS}
@@ -257,18 +265,18 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
 
 
-def _checked(points: Floats, field: Floats, where: str) -> xr.Dataset:
+def _checked(points: Floats, flux_density: Floats, where: str) -> xr.Dataset:
     """The map; MeasurementError if it is none of a permanent magnet."""
     if not len(points):
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
-    largest, farthest = float(np.nanmax(np.abs(field))), float(np.abs(points).max())
+    largest, farthest = float(np.nanmax(np.abs(flux_density))), float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:
         raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
                                        f"{largest:g} T", "Is the unit right?"))
     if not farthest <= 10 * MAX_LENGTH_M:
         raise MeasurementError(must_be("positions", where, f"within {10 * MAX_LENGTH_M:g} m",
                                        f"{farthest:g} m", "Is the unit right?"))
-    return field_map(points, field)
+    return field_map(points, flux_density)
 
 
 def _contradiction(table: Table, what: str, file: str, user: str) -> MeasurementError:

@@ -93,26 +93,35 @@ def number(cell: str, decimal_comma: bool = False) -> float:
     return value
 
 
-def is_numeric(cells: Sequence[str], decimal_comma: bool = False) -> bool:
-    """Whether cells are numbers or empty, at least one a number."""
+def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:
+    """How many cells are numbers; all of them if the others are empty."""
+    values = [_number_or_none(cell, decimal_comma) for cell in cells]
+    found = sum(value is not None and not np.isnan(value) for value in values)
+    return len(cells) if found and None not in values else found
+
+
+def _number_or_none(cell: str, decimal_comma: bool) -> float | None:
     try:
-        values = [number(cell, decimal_comma) for cell in cells]
+        return number(cell, decimal_comma)
     except ValueError:
-        return False
-    return not np.isnan(values).all()
+        return None
 
 
 def rows_of(
     lines: Sequence[Line], columns: int, delimiter: str | None, declared: Declared, where: str
-) -> Floats:
-    """Numbers (rows, columns) of lines; comments among them are skipped.
+) -> tuple[Floats, dict[int, Line]]:
+    """Numbers (rows, columns) of lines, NaN for other text; comments among them are skipped.
+
+    Also, of each column with other text (a time, the name of a scan), where it comes first: such
+    a column is of no use.
 
     Raises
     ------
     MeasurementError
-        With the first line that has another length, or something else than numbers.
+        With the first line that has another length.
     """
     rows: list[list[float]] = []
+    texts: dict[int, Line] = {}
     for position, line in lines:
         if is_comment(line):
             continue
@@ -120,15 +129,14 @@ def rows_of(
         if len(cells) != columns:
             raise MeasurementError(must_be(f"line {position}", where, f"{columns} values",
                                            str(len(cells)), "Is the file cut short?"))
-        try:
-            rows.append([number(cell, declared.decimal_comma) for cell in cells])
-        except ValueError as error:
-            raise MeasurementError(must_be(
-                f"line {position}", where, "made of numbers", f"'{str(error)[:40]}'",
-                comma_hint(str(error)))) from None
+        row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
+        for column, value in enumerate(row):
+            if value is None:
+                texts.setdefault(column, (position, cells[column]))
+        rows.append([np.nan if value is None else value for value in row])
     if not rows:
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
-    return np.array(rows)
+    return np.array(rows), texts
 
 
 def comma_hint(cell: str) -> str:

@@ -74,6 +74,22 @@ def test_columns_in_another_order_and_others_beside_them(tmp_path):
     assert found.imported.ignored == ("n", "time", "|B|")
 
 
+def test_columns_of_text(tmp_path):
+    """Times and names of scans beside the numbers do no harm, unless they are what is needed."""
+    header = "Map of 2024 05 01 12 30 h\nscan;time;" + ";".join(MM_MT) + "\n"
+    body = [f"s{n};12:30:{n:02d};{line}" for n, line in enumerate(rows(";").splitlines())]
+    found = imported(tmp_path, header + "\n".join(body))
+    assert same(found)
+    assert found.imported.ignored == ("scan", "time")
+    spoilt = [*body[:7], body[7].rpartition(";")[0] + ";OVERLOAD", *body[8:]]
+    assert "Bz in line 10 of map" in said(tmp_path, header + "\n".join(spoilt))
+    lost = ["s;12:30;" + ";".join(["OVERLOAD"] * 5 + ["7"]), *body]
+    assert "'s;12:30;OVERLOAD;" in said(tmp_path, header + "\n".join(lost))
+    without = imported(tmp_path, "\n".join(body), columns=(
+        "-", "-", "x", "y", "z", "Bx", "By", "Bz"), length_unit="mm", field_unit="mT")
+    assert same(without)  # no row is lost for a header
+
+
 def test_declared_columns_and_units(tmp_path):
     text = rows(order=[2, 1, 0, 5, 4, 3])
     declared = {"length_unit": "mm", "field_unit": "mT"}
