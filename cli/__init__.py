@@ -10,6 +10,8 @@ from halbach_fe.cli import (
     common,
     diagnose,
     doctor,
+    export,
+    import_map,
     infer,
     new,
     plan,
@@ -23,8 +25,8 @@ from halbach_fe.errors import EXIT_CODES
 
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
-    "plan": plan, "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
-    "schema": schema}
+    "plan": plan, "prior": prior, "simulate-measurement": simulate_measurement,
+    "import-map": import_map, "export": export, "doctor": doctor, "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -96,7 +96,7 @@ def read_map(path: str | Path) -> xr.Dataset:
         data = _read_hdf5(path)
     else:
         data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
-    _check(data, path)
+    check_readings(data, path)
     data.encoding["source"] = str(path)
     return data
 
@@ -360,8 +360,8 @@ def finite(cell: str, what: str, where: str, hint: str = "") -> float:
     return value
 
 
-def _check(data: xr.Dataset, path: Path) -> None:
-    """Refuse what cannot be a reading."""
+def check_readings(data: xr.Dataset, path: Path) -> None:
+    """Refuse what cannot be a reading: raise MeasurementError with the first in the map."""
     where = f"map {path}"
     if not data.sizes["point"]:
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))

@@ -12,6 +12,7 @@ magnetization at the working point.
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 import types
 from pathlib import Path
@@ -27,6 +28,7 @@ from halbach_fe.materials import Curve
 
 MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
+MAX_POINTS = 1_000_000
 
 # The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
 Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
@@ -49,6 +51,7 @@ SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Axes = tuple[SignedAxis, SignedAxis, SignedAxis]
 FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
+GridCount = Annotated[int, Field(ge=1, le=10_000)]
 PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
@@ -376,7 +379,7 @@ class LinePositions(_Model):
     kind: Literal["line"]
     start_m: Point
     end_m: Point
-    count: Annotated[int, Field(ge=1, le=1_000_000)]
+    count: Annotated[int, Field(ge=1, le=MAX_POINTS)]
 
 
 class CirclePositions(_Model):
@@ -404,6 +407,29 @@ class CirclePositions(_Model):
         return self
 
 
+class GridPositions(_Model):
+    """A regular grid of ``count`` points along x, y and z, from ``start_m`` to ``end_m``, both
+    included; one point along an axis needs equal limits. z changes fastest, x slowest.
+    """
+
+    kind: Literal["grid"]
+    start_m: Point
+    end_m: Point
+    count: tuple[GridCount, GridCount, GridCount]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> GridPositions:
+        for axis, start, end, count in zip(COMPONENTS, self.start_m, self.end_m, self.count,
+                                           strict=True):
+            if end < start or (count > 1) != (end > start):
+                raise ValueError(
+                    f"{count} points from {axis} = {start} to {end} make no sense; one point "
+                    "needs equal limits, several need start_m < end_m")
+        if math.prod(self.count) > MAX_POINTS:
+            raise ValueError(f"a grid may have {MAX_POINTS} points, not {math.prod(self.count)}")
+        return self
+
+
 class PointPositions(_Model):
     """A list of points."""
 
@@ -412,7 +438,7 @@ class PointPositions(_Model):
 
 
 Positions = Annotated[
-    LinePositions | CirclePositions | PointPositions, Field(discriminator="kind")
+    LinePositions | CirclePositions | GridPositions | PointPositions, Field(discriminator="kind")
 ]
 
 

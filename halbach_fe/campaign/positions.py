@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.campaign.bodies import Floats
-from halbach_fe.observation import points_from
+from halbach_fe.observation import grid_axes, on_grid, points_from
 from halbach_fe.study import Positions
 
 
 def between(positions: Positions) -> Floats:
     """Points (n, 3) in m half a step between a study's own; none if it has one only.
 
-    On circles that is half a step in the angle and along z, on lines half a step, and each of
-    single points is moved half of the way to the nearest of the others.
+    On circles that is half a step in the angle and along z, on lines half a step, on grids half a
+    step along each axis that has several points, and each of single points is moved half of the
+    way to the nearest of the others.
     """
     points = points_from(positions)
     if positions.kind == "circles":
@@ -23,6 +24,9 @@ def between(positions: Positions) -> Floats:
         circle = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
         return np.vstack([radius * circle + [0, 0, height]
                           for radius in positions.radius_m for height in between_z])
+    if positions.kind == "grid" and len(points) > 1:
+        return on_grid([(axis[:-1] + axis[1:]) / 2 if len(axis) > 1 else axis
+                        for axis in grid_axes(positions)])
     if positions.kind == "line" or len(points) < 2:
         return (points[:-1] + points[1:]) / 2
     distance = np.linalg.norm(points[:, None] - points, axis=2)

@@ -309,6 +309,11 @@ def test_held_out_points_are_between(short_dipole):
     line = short_dipole(observation__positions={
         "kind": "line", "start_m": [0, 0, 0], "end_m": [0, 0, 0.3], "count": 4})
     np.testing.assert_allclose(between(line.observation.positions)[:, 2], [0.05, 0.15, 0.25])
+    grid = short_dipole(observation__positions={
+        "kind": "grid", "start_m": [0, 0.01, -0.1], "end_m": [0.02, 0.01, 0.1],
+        "count": [2, 1, 3]})
+    np.testing.assert_allclose(between(grid.observation.positions),
+                               [[0.01, 0.01, -0.05], [0.01, 0.01, 0.05]])
     some = short_dipole(observation__positions={
         "kind": "points", "points_m": [[0, 0, 0], [0, 0, 0.01], [0.05, 0, 0]]})
     np.testing.assert_allclose(between(some.observation.positions), [[0, 0, 0.005], [0.025, 0, 0]])

@@ -65,6 +65,18 @@ def test_circles_of_several_radii(dipole, generator):
         observe(study, np.delete(points, 60, axis=0), np.ones((95, 3), bool))
 
 
+def test_grid_of_points(dipole):
+    """z changes fastest and x slowest; another order is told apart."""
+    positions = dipole(observation__positions={
+        "kind": "grid", "start_m": [0, -0.02, 0.5], "end_m": [0.01, 0.02, 0.5],
+        "count": [2, 3, 1]}).observation.positions
+    points = points_from(positions)
+    expected = [[0, -0.02, 0.5], [0, 0, 0.5], [0, 0.02, 0.5],
+                [0.01, -0.02, 0.5], [0.01, 0, 0.5], [0.01, 0.02, 0.5]]
+    np.testing.assert_allclose(points, expected, atol=1e-17)
+    assert not np.allclose(points[np.lexsort(points.T)], expected)  # x fastest
+
+
 def test_fourier_needs_full_circles_of_the_radius(dipole):
     study = dipole(observation=FOURIER)
     full = np.ones((24, 3), bool)

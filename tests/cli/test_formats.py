@@ -1,0 +1,75 @@
+"""Maps in and out, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from halbach_fe.cli import main
+from halbach_fe.field_map import field_map, points_of, read_map, write_map
+from tests.cli.test_cli import refused
+from tests.unit.test_import_map import FIELD, MM_MT, POINTS, rows
+
+
+def test_import_and_export(tmp_path, capsys):
+    hall, found, table = tmp_path / "hall.txt", tmp_path / "map.csv", tmp_path / "map.TABLE"
+    hall.write_text("n " + " ".join(MM_MT) + "\n" + "".join(
+        f"{n} {line}\n" for n, line in enumerate(rows().splitlines())))
+    assert main(["import-map", str(hall), "-o", str(found), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["map"] == str(found)
+    assert (shown["format"], shown["readings"], shown["ignored_columns"]) == ("columns", 24, ["n"])
+    assert (shown["length_units"], shown["field_units"]) == (["mm"], ["mT"])
+    np.testing.assert_allclose([shown["from_m"], shown["to_m"]],
+                               [POINTS.min(axis=0), POINTS.max(axis=0)])
+    assert main(["export", str(found), "--format", "geant4", "-o", str(table)]) == 0
+    assert main(["import-map", str(table), "-o", str(tmp_path / "again.h5")]) == 0
+    shown = capsys.readouterr()
+    assert "Read as opera" in shown.out
+    assert "BMOD/HMOD" in shown.out
+    again = read_map(tmp_path / "again.h5")
+    np.testing.assert_allclose(points_of(again), POINTS, atol=1e-12)
+    np.testing.assert_allclose(again["B_T"], FIELD, atol=1e-9)
+    assert not np.allclose(again["B_T"], FIELD[:, ::-1])
+
+
+def test_columns_that_are_declared(tmp_path):
+    hall = tmp_path / "hall.txt"
+    hall.write_text("0,5;100\n1,5;200\n")
+    assert main(["import-map", str(hall), "-o", str(tmp_path / "map.csv"), "--columns", "z,B",
+                 "--component", "x", "--at", "x=0,y=-0.01", "--length-unit", "cm", "--field-unit",
+                 "G", "--decimal-comma", "--origin-m=-1,0,0.5"]) == 0
+    found = read_map(tmp_path / "map.csv")
+    np.testing.assert_allclose(points_of(found), [[-1, -0.01, 0.505], [-1, -0.01, 0.515]])
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.01, 0.02])
+
+
+def test_refusals(tmp_path, capsys):
+    hall, out = tmp_path / "hall.txt", tmp_path / "out" / "map.csv"
+    hall.write_text(rows())
+    code, sentence = refused(["import-map", hall, "-o", out], capsys)
+    assert (code, out.parent.exists()) == (4, False)
+    for option in ("--columns", "--length-unit", "--field-unit"):
+        assert option in sentence
+    code, sentence = refused(["import-map", tmp_path / "none", "-o", out], capsys)
+    assert (code, "No such file" in sentence) == (4, True)
+    hall.write_text(" ".join(MM_MT) + "\n" + rows())
+    code, _ = refused(["import-map", hall, "-o", tmp_path / "map.xls"], capsys)
+    assert (code, list(tmp_path.iterdir())) == (8, [hall])
+    write_map(field_map(POINTS[1:], FIELD[1:]), tmp_path / "map.csv")
+    code, sentence = refused(["export", tmp_path / "map.csv", "--format", "bdsim", "-o",
+                              tmp_path / "map.dat"], capsys)
+    assert (code, 'kind = "grid"' in sentence) == (4, True)
+    assert not (tmp_path / "map.dat").exists()
+
+
+@pytest.mark.parametrize("wrong", [
+    ["--at", "w=0"], ["--at", "x=nan"], ["--at", "x"], ["--origin-m", "1,2"],
+    ["--length-unit", "feet"], ["--component", "r"]])
+def test_wrong_options(tmp_path, capsys, wrong):
+    with pytest.raises(SystemExit) as caught:
+        main(["import-map", "hall.txt", "-o", str(tmp_path / "map.csv"), *wrong])
+    assert caught.value.code == 2
+    assert "usage:" in capsys.readouterr().err
