@@ -31,7 +31,7 @@ MOST_POINTS = 10_000
 LARGE = 4.0
 """Residuals over their standard deviations from which the colour is the same."""
 
-FROM_AHEAD, FROM_ASIDE = {"x": 0.3, "y": 0.3, "z": 1.9}, {"x": 1.4, "y": 1.0, "z": 1.2}
+FROM_AHEAD, FROM_ASIDE = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z": 1.2}
 
 IDENTITY = "magnet-view"
 
@@ -55,11 +55,47 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """Measured points: positions (n, 3) in m and residuals (n,) over their standard deviations."""
+class Points:
+    """Points of a map, coloured by a number of each.
 
-    points: Floats
-    standardized: Floats
+    Attributes
+    ----------
+    positions : ndarray, shape (n, 3), in m
+    values : ndarray, shape (n,)
+    name, title : str
+        Of the points, and of the scale of colours.
+    words : str
+        What is said of a point, with %{customdata} for its value.
+    limits : tuple of float
+        Of the scale; of magnitudes, where values have a sign.
+    """
+
+    positions: Floats
+    values: Floats
+    name: str
+    title: str
+    words: str
+    limits: tuple[float, float]
+
+
+def residuals(positions: Floats, standardized: Floats) -> Points:
+    """Measured points: positions (n, 3) in m and residuals (n,) over their standard deviations."""
+    return Points(positions, standardized, "measured points", "largest residual<br>over its sd",
+                  "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
+
+
+def field_points(positions: Floats, flux_density: Floats) -> Points:
+    """Points (n, 3) in m of a computed field B (n, 3) in T, coloured by its magnitude."""
+    size = np.linalg.norm(flux_density, axis=1)
+    return Points(positions, size, "points", "|B| in T", "|B| = %{customdata:.5g} T",
+                  (float(size.min()), float(size.max())))
+
+
+def of_nominal(study: Study, positions: Floats, flux_density: Floats) -> Markup:
+    """The view of a nominal magnet and its field B (n, 3) in T at positions (n, 3) in m."""
+    known = Known(np.array([block.magnetization[:study.dimension] for block in blocks_of(study)]))
+    few = np.linspace(0, len(positions) - 1, min(len(positions), MOST_POINTS)).astype(int)
+    return magnet_view(study, known, field_points(positions[few], flux_density[few]))
 
 
 def of_update(update: Update) -> Markup:
@@ -76,7 +112,7 @@ def of_update(update: Update) -> Markup:
     return magnet_view(update.study, known, _by_point(update.observation.positions, scores))
 
 
-def _by_point(positions: Floats, scores: Floats) -> Residuals:
+def _by_point(positions: Floats, scores: Floats) -> Points:
     """Of all readings at a point the one that is farthest off; of too many points these first."""
     points, inverse = np.unique(positions.round(9), axis=0, return_inverse=True)
     order = np.argsort(np.abs(scores))
@@ -87,16 +123,16 @@ def _by_point(positions: Floats, scores: Floats) -> Residuals:
         evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
         chosen = np.union1d(kept, evenly)
         points, worst = points[chosen], worst[chosen]
-    return Residuals(points, worst)
+    return residuals(points, worst)
 
 
-def magnet_view(study: Study, known: Known, residuals: Residuals | None = None) -> Markup:
+def magnet_view(study: Study, known: Known, points: Points | None = None) -> Markup:
     """A part of a page, with all that it needs."""
     figure = go.Figure([_blocks(study, known), *_arrows(study, known)])
     if study.iron_ring is not None:
         figure.add_trace(_iron(study))
-    if residuals is not None:
-        figure.add_trace(_readings(residuals))
+    if points is not None:
+        figure.add_trace(_markers(points))
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
         scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
@@ -206,13 +242,12 @@ def _iron(study: Study) -> go.Surface:
         hoverinfo="name")
 
 
-def _readings(residuals: Residuals) -> go.Scatter3d:
-    scores = residuals.standardized
-    x, y, z = residuals.points.T
+def _markers(points: Points) -> go.Scatter3d:
+    x, y, z = points.positions.T
+    low, high = points.limits
     return go.Scatter3d(
-        x=x, y=y, z=z, mode="markers", name="measured points", customdata=scores,
-        hovertemplate="(%{x:.4f}, %{y:.4f}, %{z:.4f}) m<br>largest residual "
-                      "%{customdata:+.2f} sd<extra></extra>",
-        marker={"size": 2.5, "color": np.abs(scores), "colorscale": UNSIGNED, "cmin": 0,
-                "cmax": LARGE, "colorbar": {
-                    "title": {"text": "largest residual<br>over its sd"}, "len": 0.45, "y": 0.23}})
+        x=x, y=y, z=z, mode="markers", name=points.name, customdata=points.values,
+        hovertemplate=f"(%{{x:.4f}}, %{{y:.4f}}, %{{z:.4f}}) m<br>{points.words}<extra></extra>",
+        marker={"size": 2.5, "color": np.abs(points.values), "colorscale": UNSIGNED, "cmin": low,
+                "cmax": high, "colorbar": {"title": {"text": points.title}, "len": 0.45,
+                                           "y": 0.23}})

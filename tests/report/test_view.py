@@ -10,7 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from halbach_fe.blocks import blocks_of
-from halbach_fe.report.view import Known, Residuals, magnet_view, prism
+from halbach_fe.report.view import Known, magnet_view, prism, residuals
 from halbach_fe.study import read_study
 from tests.conftest import ROOT
 
@@ -86,7 +86,7 @@ def words(page):
 def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     study = study_of("quadrupole")
     known = known_of(study)
-    shown = page(magnet_view(study, known, Residuals(np.zeros((1, 3)), np.array([2.5]))))
+    shown = page(magnet_view(study, known, residuals(np.zeros((1, 3)), np.array([2.5]))))
     assert coloured(shown) > 20_000
     found = words(shown)
     own = [one for one in found if "ring 1, slot" in one]
