@@ -8,6 +8,7 @@ from importlib import metadata
 
 from halbach_fe.cli import (
     common,
+    completion,
     diagnose,
     doctor,
     export,
@@ -26,7 +27,8 @@ from halbach_fe.errors import EXIT_CODES
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
     "plan": plan, "prior": prior, "simulate-measurement": simulate_measurement,
-    "import-map": import_map, "export": export, "doctor": doctor, "schema": schema}
+    "import-map": import_map, "export": export, "doctor": doctor, "schema": schema,
+    "completion": completion}
 
 
 def parser() -> argparse.ArgumentParser:

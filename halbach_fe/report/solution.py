@@ -57,7 +57,8 @@ def write_report(solution: Solution, folder: Path) -> None:
     """Write report.html, self-contained, and its figures as PNG into ``folder``."""
     figures = {
         "geometry.png": (_geometry(solution.study), "The blocks of a ring with their "
-                         "magnetization, the iron if there is any, and the circles of the study (dotted)"),
+                         "magnetization, the iron if there is any, and the circles of the study "
+                         "(dotted)"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
     multipoles, circle = multipole_rows(solution)

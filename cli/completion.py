@@ -1,0 +1,28 @@
+"""Print a script that completes halbach-fe's commands and options in a shell.
+
+For bash:
+
+    halbach-fe completion bash > ~/.local/share/bash-completion/completions/halbach-fe
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import shtab
+
+SHELLS = ("bash", "zsh", "tcsh")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which shell."""
+    parser.add_argument("shell", choices=SHELLS, help="which one")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the script."""
+    from halbach_fe.cli import parser  # which knows this verb
+
+    sys.stdout.write(shtab.complete(parser(), shell=arguments.shell) + "\n")
+    return 0
