@@ -113,17 +113,8 @@ def _geometry(study: Study) -> Figure:
 
 def _field(solution: Solution) -> Figure:
     """Components along z, or around the circle, or by number of the point; errors below."""
-    points = solution.points
-    if np.ptp(points[:, 2]) > 0:
-        place, label = 1e3 * points[:, 2], "z in mm"
-        seen = 1e3 * solution.observation.positions[:, 2]
-    elif np.hypot(points[:, 0], points[:, 1]).min() > 0:
-        place, label = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360, "angle in degrees"
-        x, y, _ = solution.observation.positions.T
-        seen = np.degrees(np.arctan2(y, x)) % 360
-    else:
-        place, label, seen = np.arange(len(points)) + 1.0, "point", np.arange(
-            len(solution.readings)) + 1.0
+    place, label = _places(solution.points)
+    seen, _ = _places(solution.observation.positions)
     figure, (top, bottom) = axes_along(2, [2, 1])
     order = np.argsort(place, kind="stable")
     for component, colour, column in zip(COMPONENTS, COLOURS, solution.flux_density.T, strict=True):
@@ -134,3 +125,13 @@ def _field(solution: Solution) -> Figure:
     bottom.set_ylabel("error bar in T")
     bottom.set_xlabel(label)
     return figure
+
+
+def _places(points: Floats) -> tuple[Floats, str]:
+    """Where points (n, 3) in m stand in the figure, and what that is."""
+    x, y, z = points.T
+    if np.ptp(z) > 0:
+        return 1e3 * z, "z in mm"
+    if np.hypot(x, y).min() > 0:
+        return np.degrees(np.arctan2(y, x)) % 360, "angle in degrees"
+    return np.arange(len(points)) + 1.0, "number of the point"
