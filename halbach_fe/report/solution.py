@@ -133,5 +133,5 @@ def _places(points: Floats) -> tuple[Floats, str]:
     if np.ptp(z) > 0:
         return 1e3 * z, "z in mm"
     if np.hypot(x, y).min() > 0:
-        return np.degrees(np.arctan2(y, x)) % 360, "angle in degrees"
+        return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
     return np.arange(len(points)) + 1.0, "number of the point"
