@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 from benchmarks.note import Note
@@ -23,7 +22,7 @@ def run(note: Note) -> None:
     if not SUMMARY.exists():
         raise StudyError(f"There is no {SUMMARY}. Run make verify-diagnosis first.")
     rates = json.loads(SUMMARY.read_text(encoding="utf-8"))["rates"]
-    unknown = [name for name in COUNTED if math.isnan(rates[name])]
+    unknown = [name for name in COUNTED if rates[name] is None]
     if unknown:
         raise StudyError(f"{SUMMARY} lacks {', '.join(unknown)}. Run all of make verify-diagnosis.")
     for name, count in COUNTED.items():

@@ -133,6 +133,8 @@ class Unknown:
         Over the named effects alone.
     alone : bool
         Whether it is the better explanation by itself: no effect is named then.
+    as_well : bool
+        Whether it is no worse than several named effects together, in place of which it could be.
     largest_T : float
         Of it at any training reading.
     at_m : tuple of float
@@ -144,6 +146,7 @@ class Unknown:
     kind: Literal["field", "instrument", "either"]
     log_bayes_factor: float
     alone: bool
+    as_well: bool
     largest_T: float
     at_m: tuple[float, ...]
     source_m: tuple[float, ...] | None
@@ -421,28 +424,32 @@ def unknown(search: Search, update: Update, named: Sequence[Named]) -> Unknown |
             np.hstack([search.columns[:, held], smooth]), search.residual)
         added = range(len(held), both.information.shape[0])
         rest = judge(with_candidates(both, own).only(added), terms.fineness)
-        alone = judge(both.only(added), terms.fineness)
+        only = judge(both.only(added), terms.fineness)
         beside.append((rest.log_bayes_factor, kind, rest))
-        instead.append((alone.log_bayes_factor, kind, alone))
+        instead.append((only.log_bayes_factor, kind, only))
     beside.sort(key=lambda one: -one[0])
     instead.sort(key=lambda one: -one[0])
+    outside = float(np.log(EFFECT_ODDS))
+    remains = beside[0][0] + outside >= FOUND
     # several effects that happen to add up to one thing pay for each of them
     odds = log_evidence(both, own) + prior_log_odds(search.candidates)[numbers].sum()
-    alone_better = bool(mine and instead[0][0] + np.log(EFFECT_ODDS) > odds + ALIKE)
-    if not alone_better and beside[0][0] + np.log(EFFECT_ODDS) < FOUND:
+    ahead = instead[0][0] + outside - odds if mine else -np.inf
+    alone = bool(ahead > ALIKE)
+    as_well = bool(len(mine) > 1 and abs(ahead) <= ALIKE and not remains)
+    if not (remains or alone or as_well):
         return None
-    (factor, kind, best), (second, *_) = instead if alone_better else beside
+    (factor, kind, best), (second, *_) = instead if alone or as_well else beside
     size = scale * np.linalg.norm(np.tensordot(best.mean, kinds[kind].fields, 1), axis=1)
     source = None
     if kind == "field":
-        others = [] if alone_better else mine
+        others = [] if alone or as_well else mine
         factors = gains(with_candidates(search.evidence, others), search.candidates)
         dipoles = [number for number, one in enumerate(search.hypotheses)
                    if one.effect.name == "ferromagnetic_object"]
         if dipoles:
             source = search.hypotheses[max(dipoles, key=lambda k: factors[k])].place.at_m
     return Unknown("either" if factor - second < ALIKE else kind, factor,
-                   alone_better or not mine, float(size.max()),
+                   alone or not mine, as_well, float(size.max()),
                    tuple(points[int(np.argmax(size))].tolist()), source)
 
 

@@ -70,9 +70,11 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 f"{after.prior_conflict:.3g})."]
     if unknown is not None:
         x, y, z = (f"{1e3 * one:.0f}" for one in unknown.at_m)
+        start = ("As well it could be one thing outside the catalogue in place of all of them"
+                 if unknown.as_well else "Something outside the catalogue "
+                 + ("remains" if diagnosis.named else "is missing"))
         said.append(
-            f"Something outside the catalogue {'remains' if diagnosis.named else 'is missing'}: "
-            f"{UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
+            f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
             f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
             f"{unknown.log_bayes_factor:.0f}).")
         if unknown.source_m is not None:

@@ -270,7 +270,7 @@ def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
               and all(detectable(one, name) for name in one["hidden"])]
     stated = [(probability, name in truly_there(one))
               for one in single for name, probability in one["probabilities"].items()]
-    probability, there = (np.array(one, float) for one in zip(*stated, strict=True))
+    probability, there = np.array(stated, float).reshape(-1, 2).T
     rows = []
     for low, high in itertools.pairwise(STATED):
         some = (probability >= low) & (probability < high)
@@ -333,8 +333,9 @@ def sentence(one: dict[str, Any]) -> str:
 def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[str, float]:
     """Write rates, table and page; print and return the rates."""
     rates, stated = summary(results), reliability(results)
+    known = {name: None if np.isnan(value) else value for name, value in rates.items()}
     write_text(folder / "summary.json", json.dumps(
-        {"rates": rates, "reliability": stated}, indent=1) + "\n")
+        {"rates": known, "reliability": stated}, indent=1, allow_nan=False) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
                         if len(one["hidden"]) == 1 for names in one["named"] or [[NONE]])
     write_sealed_cases(study, results, rates, stated, confusion, folder)

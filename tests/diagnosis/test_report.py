@@ -82,9 +82,11 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
 
 def test_verdicts(flat):
     found, _ = flat
-    unknown = Unknown("either", 40.0, False, 2e-4, (0.05, 0.0, 0.0), None)
+    unknown = Unknown("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
     assert "nothing" not in " ".join(verdict(found))
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
+    tie = replace(unknown, as_well=True)
+    assert "As well it could be one thing" in " ".join(verdict(replace(found, unknown=tie)))
     nothing = replace(found, named=(), after=found.before)
     assert "no effect of the catalogue" in verdict(nothing)[0]
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
@@ -96,7 +98,7 @@ def test_verdicts(flat):
 
 def test_the_page_of_what_is_unknown(flat, tmp_path):
     found, _ = flat
-    unknown = Unknown("either", 40.0, True, 2e-4, (0.05, 0.0, 0.0), None)
+    unknown = Unknown("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
     write_report(replace(found, named=(), after=found.before, unknown=unknown), [], tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert 'class="warning"' in page
