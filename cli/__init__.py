@@ -14,15 +14,18 @@ from halbach_fe.cli import (
     plan,
     prior,
     schema,
+    shim,
     simulate_measurement,
     solve,
+    sort,
+    tolerance,
     verify,
 )
 from halbach_fe.errors import EXIT_CODES
 
 VERBS = {"solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify, "plan": plan,
-         "prior": prior, "simulate-measurement": simulate_measurement, "doctor": doctor,
-         "schema": schema}
+         "prior": prior, "shim": shim, "sort": sort, "tolerance": tolerance,
+         "simulate-measurement": simulate_measurement, "doctor": doctor, "schema": schema}
 
 
 def parser() -> argparse.ArgumentParser:
