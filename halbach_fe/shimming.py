@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Literal
 
 import numpy as np
@@ -224,12 +224,19 @@ class _Bench:
         return self.mounts.carried(to, turn)[:, :self.size, :self.size]
 
     def coefficients(self, moves: Sequence[Move]) -> tuple[Complexes, Complexes]:
-        """Mean and root of C after some moves, exactly; the columns of the root that each move
-        adds come behind those of the moves before.
+        """Mean and root of C after some moves, exactly."""
+        return reduce(self.moved, moves, self.start)
+
+    def moved(
+        self, before: tuple[Complexes, Complexes], move: Move
+    ) -> tuple[Complexes, Complexes]:
+        """Mean and root of C after one more move; the columns that it adds to the root come
+        behind those that were there.
         """
-        mean, root = self.start
-        fresh = []
-        for one in (placement for move in moves for placement in move.placements):
+        mean, root = before
+        width = self.start[1].shape[1]
+        root, fresh = root[:, :width], [root[:, width:]]
+        for one in move.placements:
             columns = self.columns[:, one.to]
             carried = columns @ self.carried(np.array([one.to]), np.array([one.turn]))[0]
             mean = mean + carried @ self.loose_mean[one.block] - columns @ self.mean[one.to]
@@ -240,6 +247,14 @@ class _Bench:
     def multipoles(self, moves: Sequence[Move]) -> Multipoles:
         """Multipoles after some moves."""
         return self.model.known(*self.coefficients(moves))
+
+    def gains(
+        self, chosen: Sequence[Move], further: Sequence[Move]
+    ) -> list[tuple[float, float]]:
+        """What each further move would gain, and its standard deviation; see `gain`."""
+        state = self.coefficients(chosen)
+        now = self.model.known(*state)
+        return [gain(now, self.model.known(*self.moved(state, move))) for move in further]
 
 
 @dataclass(frozen=True)
@@ -330,12 +345,20 @@ def taken_out(update: Update) -> tuple[Floats, Floats, Floats]:
     before = update.prior
     turns = linalg.block_diag(*_turn_covariance(
         before.mean.reshape(-1, study.dimension), sd))
-    share = turns @ linalg.pinvh(before.covariance)
+    share = _times_inverse(turns, before.covariance)
     rest = _root(turns - share @ turns)
     whole = np.eye(len(share)) - share
     return (after.mean - share @ (after.mean - before.mean),
             np.hstack([whole @ after.root, -rest]),
             np.hstack([after.root, np.zeros_like(rest)]))
+
+
+def _times_inverse(matrix: Floats, covariance: Floats) -> Floats:
+    """Matrix times the inverse of a covariance, or, of a missing block, its pseudo-inverse."""
+    try:
+        return np.asarray(linalg.cho_solve(linalg.cho_factor(covariance), matrix.T).T)
+    except linalg.LinAlgError:
+        return np.asarray(matrix @ linalg.pinvh(covariance))
 
 
 def _turn_covariance(vectors: Floats, sd: float) -> Floats:
@@ -475,7 +498,7 @@ def _greedy(
                      for move in _best(bench, field, one, chosen, SHORTLIST)]
         if not shortlist:
             return chosen, "nothing"
-        gains = [gain(now, bench.multipoles([*chosen, move])) for move in shortlist]
+        gains = bench.gains(chosen, shortlist)
         best = int(np.argmax([expected for expected, _ in gains]))
         if gains[best][0] <= GAIN_SDS * gains[best][1]:
             return chosen, "uncertainty"
@@ -531,7 +554,7 @@ def _steps(
     now = bench.multipoles([])
     done: list[Move] = []
     while left and not goal.met(now):
-        gains = [gain(now, bench.multipoles([*done, move])) for move in left]
+        gains = bench.gains(done, left)
         best = int(np.argmax([expected for expected, _ in gains]))
         done.append(left.pop(best))
         now = bench.multipoles(done)
