@@ -14,6 +14,7 @@ import numpy as np
 
 from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
+from halbach_fe.errors import StudyError
 from halbach_fe.field_map import read_map
 from halbach_fe.multipoles import multipole_model, text_table
 from halbach_fe.shimming import shim
@@ -49,6 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
         write_shim,
     )
 
+    if arguments.stock and not arguments.replace:
+        raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
+                         "replaced; instead it is alone. Add --replace.")
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     stock = read_blocks(arguments.stock) if arguments.stock else None

@@ -230,6 +230,9 @@ def multipole_model(study: Study, reference: Reference, workshop: Workshop) -> M
     if not orders:
         raise StudyError(must_be("--orders", f"study {study.name}",
                                  "those of unwanted multipoles", "the main one only"))
+    if study.dimension == 2 and reference.z_m is not None:
+        raise StudyError(must_be("--at-z-m", f"study {study.name}", "left out, since it is 2D",
+                                 f"{reference.z_m:g}"))
     radius = _radius(study, reference)
     integrated = study.dimension == 3 and reference.z_m is None
     bare = study.model_copy(update={"instrument": Instrument()})

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.multipoles import plain, text_table
@@ -123,6 +124,8 @@ def _moves(shim: Shim) -> Figure:
         where = np.array(shim.mounts.places, float)
         axis.plot(*where.T, ".", color="#cccccc", ms=3)
         axis.set(xlabel="ring", ylabel="slot")
+        for numbers in (axis.xaxis, axis.yaxis):
+            numbers.set_major_locator(MaxNLocator(integer=True))
     for number, step in enumerate(shim.steps, start=1):
         _draw(axis, where[[one.to for one in step.move.placements]], step, str(number))
     return figure

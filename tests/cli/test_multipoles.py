@@ -146,6 +146,9 @@ def test_tolerance(made, tmp_path, capsys):
 @pytest.mark.parametrize(("arguments", "code", "said"), [
     (["tolerance", "{study}", "--reference-radius-m", "70"], 3, "millimetres"),
     (["tolerance", "{study}", "--orders", "1"], 3, "unwanted multipoles"),
+    (["tolerance", "{study}", "--at-z-m", "0.1"], 3, "since it is 2D"),
+    (["shim", "{study}", "--measurements", "{folder}/map.csv", "--stock", "{folder}/blocks.csv"],
+     3, "--replace"),
     (["sort", "{study}", "{folder}/map.csv"], 4, "header"),
     (["shim", "{study}", "--measurements", "{folder}/map.csv", "--replace", "1", "--stock",
       "{folder}/nothing.csv"], 4, "nothing.csv")])
