@@ -1,9 +1,9 @@
 """Which of the measured blocks should go into which slot, before the magnet is assembled.
 
-The multipoles are sums over the slots of what a block does there. From a random order, the
-exchange of two blocks of one type, or of one with a block left over, that lowers ``sum |c_n|^2``
-most is made again and again; the best of several random starts counts. All exchanges are tried at
-once, by columns that are computed once.
+The multipoles are sums over the slots of what a block does there. From a random order, slot after
+slot makes the exchange with another of its type, or with a block left over, that lowers
+``sum |c_n|^2`` most, until none lowers it; the best of several random starts counts. All exchanges
+of a slot are tried at once, by columns that are computed once.
 """
 
 from __future__ import annotations
@@ -180,45 +180,43 @@ def _as_placed(table: BlockTable, study: Study) -> Ints | None:
 
 
 def _descent(bench: _Bench, order: Ints, tolerance: float) -> tuple[Ints, float]:
-    """The order with the best exchanges made, until none gains more than the tolerance; and its
-    sum of squares.
+    """The order with the best exchange made for one slot after another, until none gains more than
+    the tolerance; and its sum of squares.
     """
     order = order.copy()
-    now = bench.total(order)
-    while True:
-        gains, exchange = 0.0, None
-        for number in np.unique(bench.slot_types):
-            slots = np.flatnonzero(bench.slot_types == number)
-            found = _best_exchange(bench, order, slots, number, now)
-            if found[0] > gains:
-                gains, exchange = found[0], found[1:]
-        if exchange is None or gains <= tolerance:
-            return order, float(now @ now)
-        slot, block, other = exchange
-        if other is not None:
-            order[other] = order[slot]
-        order[slot] = block
-        now = bench.total(order)
+    now, idle, slot = bench.total(order), 0, 0
+    peers = [np.flatnonzero(bench.slot_types == number) for number in bench.slot_types]
+    while idle < len(order):
+        gain, block, other = _best_exchange(bench, order, slot, peers[slot], now)
+        if gain > tolerance:
+            if other is not None:
+                order[other] = order[slot]
+            order[slot] = block
+            now, idle = bench.total(order), 0
+        else:
+            idle += 1
+        slot = (slot + 1) % len(order)
+    return order, float(now @ now)
 
 
 def _best_exchange(
-    bench: _Bench, order: Ints, slots: Ints, number: int, now: Floats
-) -> tuple[float, int, int, int | None]:
-    """What the best exchange of one type gains; a slot, its new block, and the slot that gets its
-    old one, None if that is left over.
+    bench: _Bench, order: Ints, slot: int, peers: Ints, now: Floats
+) -> tuple[float, int, int | None]:
+    """What the best exchange of a slot's block gains; its new block, and the slot that gets the old
+    one, None if that is left over.
     """
-    blocks = order[slots]
-    spare = np.setdiff1d(np.flatnonzero(bench.types == number), blocks)
-    there = bench.unwanted[blocks, slots]
-    moved = bench.unwanted[blocks[None, :], slots[:, None]] - there[:, None]  # of j in i
-    both = moved + moved.swapaxes(0, 1)
-    new = bench.unwanted[spare[None, :], slots[:, None]] - there[:, None]
-    changes = np.concatenate([both, new], axis=1)
-    falls = -(2 * changes @ now + np.einsum("ijk,ijk->ij", changes, changes))
-    i, j = (int(n) for n in np.unravel_index(np.argmax(falls), falls.shape))
-    if j < len(slots):
-        return float(falls[i, j]), int(slots[i]), int(blocks[j]), int(slots[j])
-    return float(falls[i, j]), int(slots[i]), int(spare[j - len(slots)]), None
+    own, others = order[slot], order[peers]
+    spare = np.setdiff1d(np.flatnonzero(bench.types == bench.slot_types[slot]), others)
+    unwanted = bench.unwanted
+    both = (unwanted[others, slot] + unwanted[own, peers] - unwanted[own, slot]
+            - unwanted[others, peers])
+    changes = np.vstack([both, unwanted[spare, slot] - unwanted[own, slot]])
+    falls = -(2 * changes @ now + np.einsum("ik,ik->i", changes, changes))
+    falls[:len(peers)][peers == slot] = -np.inf  # the block with itself
+    best = int(np.argmax(falls))
+    if best < len(peers):
+        return float(falls[best]), int(others[best]), int(peers[best])
+    return float(falls[best]), int(spare[best - len(peers)]), None
 
 
 def _known(study: Study, bench: _Bench, order: Ints) -> Multipoles:

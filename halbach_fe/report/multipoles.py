@@ -27,7 +27,8 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, o
 def reference_text(model: MultipoleModel) -> str:
     """Where multipoles are taken, for people."""
     where = ("of the field integrated along z" if model.integrated
-             else f"at z = {model.z:g} m" if model.z is not None else "of the cross-section")
+             else f"at z = {model.z:g} m (Fourier coefficients of B_r)" if model.z is not None
+             else "of the cross-section")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
             f"of 1e-4 of the main one (order {model.main}); b normal, a skew, along axes in which "
             "the nominal main multipole is normal.")
