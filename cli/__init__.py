@@ -18,17 +18,20 @@ from halbach_fe.cli import (
     plan,
     prior,
     schema,
+    shim,
     simulate_measurement,
     solve,
+    sort,
+    tolerance,
     verify,
 )
 from halbach_fe.errors import EXIT_CODES
 
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
-    "plan": plan, "prior": prior, "simulate-measurement": simulate_measurement,
-    "import-map": import_map, "export": export, "doctor": doctor, "schema": schema,
-    "completion": completion}
+    "plan": plan, "prior": prior, "shim": shim, "sort": sort, "tolerance": tolerance,
+    "simulate-measurement": simulate_measurement, "import-map": import_map, "export": export,
+    "doctor": doctor, "schema": schema, "completion": completion}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -21,7 +21,11 @@ from rich.table import Table
 
 from halbach_fe.errors import HalbachError, HalbachWarning
 from halbach_fe.getdp import find_getdp
+from halbach_fe.multipoles import DEFAULT_ORDERS, Reference
 from halbach_fe.solve import Workshop
+
+MAX_ORDER = 100
+"""Of a multipole: beyond, nothing is left of it in the bore."""
 
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,6 +78,59 @@ def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """--json."""
     parser.add_argument("--json", action="store_true", help="print results as JSON")
+
+
+def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where multipoles are taken, which, and how small they should be."""
+    parser.add_argument("--reference-radius-m", type=positive_number, metavar="R",
+                        help="reference radius of the multipoles (default: that of the study's "
+                        "circle, or two thirds of the bore)")
+    parser.add_argument("--orders", type=orders, default=DEFAULT_ORDERS, metavar="N..M",
+                        help="orders of unwanted multipoles, 1 the dipole, as 2..10 or 3,5,7; the "
+                        "magnet's own does not count (default: 1..10)")
+    parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
+                        help="in 3D: multipoles of the circle at Z, in place of the field "
+                        "integrated along z")
+    parser.add_argument("--limit-units", type=positive_number, metavar="U",
+                        help="largest unwanted multipole allowed, in units of 1e-4 of the main one")
+
+
+def reference(arguments: argparse.Namespace) -> Reference:
+    """What `add_multipole_arguments` was given."""
+    return Reference(arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
+
+
+def add_seed_argument(parser: argparse.ArgumentParser) -> None:
+    """--seed."""
+    parser.add_argument("--seed", type=positive, default=1, metavar="N",
+                        help="of all random numbers (default: %(default)s)")
+
+
+def orders(text: str) -> tuple[int, ...]:
+    """Parse orders of multipoles: ``2..10``, ``3,5,7``, or both."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("..")
+        found += range(int(first), int(last or first) + 1)
+    if not found or min(found) < 1 or max(found) > MAX_ORDER:
+        raise argparse.ArgumentTypeError(f"must be orders from 1 to {MAX_ORDER}, not {text}")
+    return tuple(sorted(set(found)))
+
+
+def count(text: str) -> int:
+    """Parse a whole number of at least 0."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, not {value}")
+    return value
+
+
+def finite_number(text: str) -> float:
+    """Parse a number."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be finite, not {text}")
+    return value
 
 
 def positive(text: str) -> int:

@@ -330,6 +330,13 @@ def magnetization_angle_deg(array: Array, slot: int) -> float:
     return array.first_magnetization_angle_deg + turn
 
 
+def facing_angle_deg(array: Array, slot: int) -> float:
+    """Angle about z that the faces of block ``slot`` (from 1) follow."""
+    if array.block.shape == "cuboid" and array.block.orientation == "magnetization":
+        return magnetization_angle_deg(array, slot)
+    return position_angle_deg(array, slot)
+
+
 def ring_limits(study: Study) -> list[tuple[float, float]]:
     """z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
     array = study.array
@@ -425,8 +432,7 @@ def _outline(array: Array, slot: int) -> Outline:
     half_width, half_depth = block.width_m / 2, (outer - inner) / 2
     local = np.array([(-half_depth, -half_width), (half_depth, -half_width),
                       (half_depth, half_width), (-half_depth, half_width)])
-    facing = (middle if block.orientation == "position"
-              else np.radians(magnetization_angle_deg(array, slot)))
+    facing = np.radians(facing_angle_deg(array, slot))
     centre = (inner + outer) / 2 * np.array([np.cos(middle), np.sin(middle)])
     return _edges(local @ _turn(facing).T + centre)
 

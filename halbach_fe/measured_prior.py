@@ -15,6 +15,7 @@ the blocks of one type are samples of a normal distribution.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from halbach_fe.blocks import (
     MagnetBlock,
     as_meant,
     blocks_of,
+    facing_angle_deg,
     mountings,
     position_angle_deg,
 )
@@ -38,7 +40,7 @@ from halbach_fe.inference.samples import (
     measured_prior,
     predictive_covariance,
 )
-from halbach_fe.study import Study
+from halbach_fe.study import Array, Study
 from halbach_fe.symmetry import turn_matrix
 
 DIRECTIONS = ("along", "across", "z")
@@ -136,7 +138,8 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
     """The same of a magnet whose blocks were mounted as meant."""
     blocks, size = blocks_of(study), study.dimension
     slots = types_of(study)
-    _check_places(study, table, slots)
+    _check_types(study, table, slots)
+    _check_complete(study, table)
     index = _block_of_rows(study, table, slots)
     conversion = _conversions(study, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
@@ -155,7 +158,8 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(study, blocks, slots)
+        _check_alike(study, slots, position_angle_deg,
+                     "Give ring and slot of every measured block.")
         slot_of = np.array([block.slot for block in blocks])
         for label, samples in members.items():
             _check_samples(table, label, samples)
@@ -175,6 +179,55 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
             "ring and slot of every block.", HalbachWarning, stacklevel=2)
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     return MeasuredPrior(gaussian, nominal, placed, types)
+
+
+def loose_blocks(study: Study, table: BlockTable) -> tuple[Floats, Floats]:
+    """What a table tells of blocks that are not mounted yet, wherever in their type's slots.
+
+    Returns
+    -------
+    mean : ndarray, shape (rows, d), in A/m
+        Along the axes of the block's faces: x radially outward, y azimuthal, z, but of cuboids
+        that follow their magnetization x along that. A row without a place has its moment as
+        mounted in the first slot of its type.
+    root : ndarray, shape (rows, d, d), in A/m
+        Of the covariance of each, the calibration of the coil not included.
+
+    Raises
+    ------
+    MeasurementError
+        If the table does not fit the study.
+    StudyError
+        If the blocks of a type are not alike in the study.
+    """
+    study = as_meant(study)
+    blocks, slots, size = blocks_of(study), types_of(study), study.dimension
+    _check_types(study, table, slots)
+    _check_alike(study, slots, facing_angle_deg, "Make them types of their own.")
+    index = _block_of_rows(study, table, slots)
+    conversion = _conversions(study, table, blocks, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    frames = np.array([_frame(block) for block in blocks])[index]
+    _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
+    own = np.array([turn_matrix(-np.radians(facing_angle_deg(study.array, blocks[i].slot)))
+                    for i in index])
+    roots = own @ conversion * table.sigma[:, None, None]
+    return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
+
+
+def as_mounted(study: Study, table: BlockTable, places: Ints) -> Floats:
+    """Moments (rows, 3) in A m^2 in the own axes of slots (rows,), from 0, ring by ring, that are
+    not those of the table: blocks keep their faces where a slot has them.
+    """
+    array, index = study.array, _block_of_rows(study, table, types_of(study))
+
+    def aside(place: int) -> float:
+        slot = place % array.blocks_per_ring + 1
+        return facing_angle_deg(array, slot) - position_angle_deg(array, slot)
+
+    turns = np.array([turn_matrix(np.radians(aside(new) - aside(old)))
+                      for new, old in zip(places.tolist(), index.tolist(), strict=True)])
+    return np.einsum("nij,nj->ni", turns, table.moment)
 
 
 def _tested(
@@ -200,12 +253,11 @@ def _frame(block: MagnetBlock) -> Floats:
     return axes * float(np.linalg.norm(block.magnetization))
 
 
-def _of_block(study: Study, block: MagnetBlock, tensor: Floats) -> Floats:
-    """``mu^-1 (1 + (mu - 1) N)`` from a block's own axes to the array's, (3, 3)."""
+def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
+    """``mu^-1 (1 + (mu - 1) N)`` from axes turned about z to the array's, (3, 3)."""
     mu = block.recoil_tensor
-    turn = turn_matrix(np.radians(position_angle_deg(study.array, block.slot)))
     inside = np.eye(3) + (mu - np.eye(3)) @ tensor
-    return np.asarray(np.linalg.solve(mu, inside) @ turn)
+    return np.asarray(np.linalg.solve(mu, inside) @ turn_matrix(np.radians(angle_deg)))
 
 
 def _conversions(
@@ -230,8 +282,9 @@ def _conversions(
         real.append(block)
     volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
     tensors = demagnetizing_tensors(real)
-    return np.array([_of_block(study, block, tensor) / volume for block, tensor, volume
-                     in zip(real, tensors, volumes, strict=True)])
+    return np.array([
+        _of_block(block, tensor, position_angle_deg(study.array, block.slot)) / volume
+        for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
 
 
 def _at_reference_temperature(study: Study, table: BlockTable) -> Floats:
@@ -249,8 +302,8 @@ def _at_reference_temperature(study: Study, table: BlockTable) -> Floats:
     return np.asarray(table.moment / factor[:, None])
 
 
-def _check_places(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
-    """Types and places must be those of the study; if some blocks have one, all must be there."""
+def _check_types(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
+    """Types and places must be those of the study."""
     array = study.array
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
         if label not in slots:
@@ -267,6 +320,11 @@ def _check_places(study: Study, table: BlockTable, slots: dict[str, tuple[int, .
             raise MeasurementError(must_be(
                 f"type of block {serial}", table.source, f"that of its slot {slot}",
                 f"'{label}', which belongs to slot {', '.join(map(str, slots[label]))}"))
+
+
+def _check_complete(study: Study, table: BlockTable) -> None:
+    """If some blocks have a place, all must be there."""
+    array = study.array
     wanted = {(ring, slot) for ring in range(1, array.rings + 1)
               for slot in range(1, array.blocks_per_ring + 1)}
     missing = sorted(wanted - set(table.places))
@@ -318,16 +376,18 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    study: Study, blocks: tuple[MagnetBlock, ...], slots: dict[str, tuple[int, ...]]
+    study: Study, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float], hint: str
 ) -> None:
-    """Blocks of one type must be the same block, as seen from their own axes: a moment must mean
-    the same deviation from the nominal magnetization.
+    """Blocks of one type must be the same block, as seen from their own axes, which are turned by
+    ``axes`` of their slot: a moment must mean the same deviation from the nominal magnetization.
     """
+    blocks = blocks_of(study)
     finite = [replace(block, z_min=0.0, z_max=1.0) if study.dimension == 2 else block
               for block in blocks]
     tensors = demagnetizing_tensors(finite)
-    seen = np.array([np.linalg.solve(_frame(block), _of_block(study, block, tensor)) / block.volume
-                     for block, tensor in zip(finite, tensors, strict=True)])
+    seen = np.array([
+        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(study.array, block.slot)))
+        / block.volume for block, tensor in zip(finite, tensors, strict=True)])
     for label, own in slots.items():
         first, *others = [number for number, block in enumerate(blocks) if block.slot in own]
         for number in others:
@@ -336,4 +396,4 @@ def _check_alike(
                     f"`prior.types.{label}`", f"study {study.name}",
                     "blocks that are alike from their own axes",
                     f"{blocks[first].name} and {blocks[number].name}, of another magnetization, "
-                    "permeability or shape", "Give ring and slot of every measured block."))
+                    "permeability or shape", hint))

@@ -68,3 +68,20 @@ def block_prior(
     if common_mode_sd > 0:
         root[:, -1] = common_mode_sd * nominal
     return Gaussian(nominal, root)
+
+
+def turned(vectors: Floats, sd: float) -> Floats:
+    """What turns of blocks do to their magnetizations: roots (n, d, axes) of the covariance.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (n, d), in A/m
+        In a cross-section (d = 2) blocks turn about z only.
+    sd : float
+        Of the turn about each axis, in rad.
+    """
+    whole = np.zeros((len(vectors), 3))
+    whole[:, :vectors.shape[1]] = vectors
+    axes = np.eye(3)[2:] if vectors.shape[1] == 2 else np.eye(3)
+    changes = np.cross(axes, whole[:, None])  # (n, axes, 3)
+    return np.asarray(sd * changes[:, :, :vectors.shape[1]].swapaxes(1, 2))

@@ -18,7 +18,8 @@ ORDER = ["errors", "analytic", "materials", "study", "study_file", "blocks", "sy
          "measured_prior", "solve", "azimuthal", "routes", "observation", "discretization",
          "response", "nonlinear", "update", "sampled",
          "scene", "effects", "diagnosis", "diagnose", "next_measurement", "diagnosed",
-         "planning", "sensitivity", "verification", "campaign", "report", "cli"]
+         "planning", "sensitivity", "verification", "multipoles",
+         "remounting", "shimming", "sorting", "tolerance", "campaign", "report", "cli"]
 
 # A synthetic campaign tests the model of the field, so it must not come from it.
 CAMPAIGN = (None, "campaign", "errors", "materials", "study", "field_map", "block_table",

@@ -1,0 +1,77 @@
+"""Choose blocks to swap, turn or replace so that unwanted multipoles become small.
+
+From the posterior of the block magnetizations, as `halbach-fe infer` finds it. Writes shim.json,
+shim.html and its figures, and study.shimmed.toml, the study with the blocks where they then are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.cli import common
+from halbach_fe.errors import StudyError
+from halbach_fe.field_map import read_map
+from halbach_fe.multipoles import multipole_model, text_table
+from halbach_fe.shimming import shim
+from halbach_fe.study import read_study
+from halbach_fe.update import infer
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
+                        help="measured field map (CSV or HDF5)")
+    parser.add_argument("--blocks", type=Path, metavar="CSV",
+                        help="moments of the single blocks, in place of the study's prior")
+    common.add_multipole_arguments(parser)
+    parser.add_argument("--swaps", type=common.count, default=8, metavar="N",
+                        help="swaps of two blocks at most (default: %(default)s)")
+    parser.add_argument("--turns", type=common.count, default=8, metavar="N",
+                        help="blocks turned in their places at most (default: %(default)s)")
+    parser.add_argument("--replace", type=common.count, default=0, metavar="N",
+                        help="blocks replaced by nominal ones, or of the stock, at most "
+                        "(default: %(default)s)")
+    parser.add_argument("--stock", type=Path, metavar="CSV",
+                        help="table of measured blocks that may replace others")
+    common.add_seed_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Infer, choose, write everything, print moves and multipoles."""
+    from halbach_fe.report.shimming import (  # matplotlib loads when needed
+        move_table,
+        shim_summary,
+        write_shim,
+    )
+
+    if arguments.stock and not arguments.replace:
+        raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
+                         "replaced; instead it is alone. Add --replace.")
+    study, data = read_study(arguments.study), read_map(arguments.measurements)
+    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    stock = read_blocks(arguments.stock) if arguments.stock else None
+    with common.workshop(arguments) as workshop:
+        update = infer(study, data, workshop, blocks)
+        model = multipole_model(study, common.reference(arguments), replace(
+            workshop, folder=arguments.output / "multipoles"))
+    found = shim(update, model, np.random.default_rng(arguments.seed), {
+        "swap": arguments.swaps, "turn": arguments.turns, "replace": arguments.replace},
+        arguments.limit_units, stock)
+    if update.prior_conflict > update.conflict_limit:
+        common.say("warning: prior and map conflict, so that error bars mean little: something is "
+                   "missing from the model (halbach-fe diagnose).")
+    write_shim(found, update, arguments.study.read_text(encoding="utf-8"), arguments.output)
+    if arguments.json:
+        common.print_json(shim_summary(found, update))
+    else:
+        common.print_table(move_table(found), "Moves")
+        common.print_table(text_table(before=found.before, after=found.after),
+                           "Multipoles in units of 1e-4")
+        common.say(f"Report: {arguments.output / 'shim.html'}")
+    return 0

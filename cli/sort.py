@@ -1,0 +1,49 @@
+"""Assign measured blocks to slots so that unwanted multipoles become small.
+
+Within each type of block, before the magnet is assembled; there may be more blocks than slots.
+Writes blocks.sorted.csv, sort.json, sort.html and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.cli import common
+from halbach_fe.multipoles import multipole_model
+from halbach_fe.sorting import sort_blocks
+from halbach_fe.study import read_study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("blocks", type=Path, metavar="BLOCKS",
+                        help="table of measured blocks (CSV); ring and slot may be missing")
+    common.add_multipole_arguments(parser)
+    common.add_seed_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Sort, write everything, print the multipoles."""
+    from halbach_fe.report.sorting import (  # matplotlib loads when needed
+        order_table,
+        sort_summary,
+        write_sorted,
+    )
+
+    study, table = read_study(arguments.study), read_blocks(arguments.blocks)
+    with common.workshop(arguments) as workshop:
+        model = multipole_model(study, common.reference(arguments), workshop)
+    with common.progress_bar("sorting") as show:
+        found = sort_blocks(study, table, model, np.random.default_rng(arguments.seed), show)
+    write_sorted(found, arguments.limit_units, arguments.output)
+    if arguments.json:
+        common.print_json(sort_summary(found, arguments.limit_units))
+    else:
+        common.print_table(order_table(found), "Multipoles in units of 1e-4")
+        common.say(f"Report: {arguments.output / 'sort.html'}")
+    return 0

@@ -1,0 +1,56 @@
+"""Draw magnets from the study's prior: what multipoles to expect, and how many are good enough.
+
+Writes tolerance.json, tolerance.html and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.block_table import read_blocks
+from halbach_fe.cli import common
+from halbach_fe.measured_prior import prior_from_blocks
+from halbach_fe.multipoles import multipole_model
+from halbach_fe.study import read_study
+from halbach_fe.tolerance import assembled_prior, tolerance
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--blocks", type=Path, metavar="CSV",
+                        help="moments of the single blocks, in place of the study's prior")
+    common.add_multipole_arguments(parser)
+    parser.add_argument("--draws", type=common.positive, default=10_000, metavar="N",
+                        help="magnets to draw (default: %(default)s)")
+    common.add_seed_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw, write everything, print the quantiles."""
+    from halbach_fe.report.tolerance import (  # matplotlib loads when needed
+        quantile_table,
+        tolerance_summary,
+        write_tolerance,
+    )
+
+    study = read_study(arguments.study)
+    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    with common.workshop(arguments) as workshop:
+        model = multipole_model(study, common.reference(arguments), workshop)
+    prior = (prior_from_blocks(study, blocks).gaussian if blocks
+             else assembled_prior(study, model.nominal))
+    found = tolerance(model, study, prior, arguments.draws, np.random.default_rng(arguments.seed),
+                      arguments.limit_units)
+    write_tolerance(found, arguments.output)
+    if arguments.json:
+        common.print_json(tolerance_summary(found))
+    else:
+        common.print_table(quantile_table(found), "Multipoles |c_n| in units of 1e-4")
+        if found.share is not None:
+            common.say(f"{100 * found.share:.3g} % of the magnets are within the limit.")
+        common.say(f"Report: {arguments.output / 'tolerance.html'}")
+    return 0
