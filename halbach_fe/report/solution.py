@@ -134,4 +134,4 @@ def _places(points: Floats) -> tuple[Floats, str]:
         return 1e3 * z, "z in mm"
     if np.hypot(x, y).min() > 0:
         return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
-    return np.arange(len(points)) + 1.0, "number of the point"
+    return np.arange(1.0, len(points) + 1), "number of the point"
