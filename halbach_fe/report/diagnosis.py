@@ -17,7 +17,7 @@ from halbach_fe.diagnosed import (
     where,
 )
 from halbach_fe.diagnosis.residuals import DISCOVERIES, Group
-from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND
+from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND, MOST
 from halbach_fe.effects import catalogue
 from halbach_fe.next_measurement import ENOUGH, Separation
 from halbach_fe.report import diagnosis_figures as figures
@@ -63,6 +63,9 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
+        if len(diagnosis.named) == MOST:
+            said.append(f"These are {MOST} effects, as many as are looked for: so many at once are a "
+                        "fit rather than a diagnosis, and some of them stand for something else.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
         start = "Nothing else is missing: then" if said else "Nothing is missing:"
         return [*said, f"{start} the map agrees with the study within noise (chi² per reading "

@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.blocks import blocks_of
 from halbach_fe.diagnose import Unknown, diagnose
 from halbach_fe.diagnosed import amounts, human_unit, note, where
-from halbach_fe.diagnosis.selection import Candidate
+from halbach_fe.diagnosis.selection import MOST, Candidate
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Parameter, Place
 from halbach_fe.exact_field import field_of
@@ -87,6 +87,9 @@ def test_verdicts(flat):
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
     tie = replace(unknown, as_well=True)
     assert "As well it could be one thing" in " ".join(verdict(replace(found, unknown=tie)))
+    many = verdict(replace(found, named=found.named[:1] * MOST))
+    assert "a fit rather than a diagnosis" in " ".join(many)
+    assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
     nothing = replace(found, named=(), after=found.before)
     assert "no effect of the catalogue" in verdict(nothing)[0]
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
