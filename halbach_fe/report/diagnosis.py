@@ -64,8 +64,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
         if len(diagnosis.named) == MOST:
-            said.append(f"These are {MOST} effects, as many as are looked for: so many at once are a "
-                        "fit rather than a diagnosis, and some of them stand for something else.")
+            said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
+                        "a fit rather than a diagnosis, and some stand for something else.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
         start = "Nothing else is missing: then" if said else "Nothing is missing:"
         return [*said, f"{start} the map agrees with the study within noise (chi² per reading "
