@@ -25,6 +25,9 @@ from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
 from halbach_fe.update import ALL_READINGS
 
+UNUSUAL = 20.0
+"""Prior standard deviations: what nobody would expect of a magnet that was built with care."""
+
 FIGURES = {
     "groups": (figures.groups, "Chi² per reading of groups of readings, each foretold by all "
                "others; filled where chance is no explanation"),
@@ -63,6 +66,12 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
+        unusual = [f"{_title(one.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
+                   for one in diagnosis.named if (ratio := _over_usual(one)) > UNUSUAL]
+        if unusual:
+            said.append("Far larger than is usual (the prior's standard deviation): "
+                        f"{', '.join(unusual)}. Unless a ruler confirms it, take that for a sign "
+                        "of something else.")
         if len(diagnosis.named) == MOST:
             said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
                         "a fit rather than a diagnosis, and some stand for something else.")
@@ -96,6 +105,13 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
         if after.prior_conflict > after.conflict_limit and unknown is None:
             said.append("That is still too much: they are not all that is wrong.")
     return said
+
+
+def _over_usual(named: Named) -> float:
+    """The largest amplitude over its prior standard deviation; of what is there or not, none."""
+    first = int(named.hypothesis.effect.certain or named.hypothesis.effect.discrete)
+    return max((abs(value) / parameter.sd for value, parameter in zip(
+        named.values[first:], named.parameters[first:], strict=True)), default=0.0)
 
 
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:

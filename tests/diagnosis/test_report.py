@@ -87,6 +87,11 @@ def test_verdicts(flat):
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
     tie = replace(unknown, as_well=True)
     assert "As well it could be one thing" in " ".join(verdict(replace(found, unknown=tie)))
+    (one,) = found.named
+    usual = max(abs(one.values) / [parameter.sd for parameter in one.parameters])
+    huge = replace(one, values=one.values * 30 / usual)
+    assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
+    assert "ruler" not in " ".join(verdict(found))
     many = verdict(replace(found, named=found.named[:1] * MOST))
     assert "a fit rather than a diagnosis" in " ".join(many)
     assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
