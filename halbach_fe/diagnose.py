@@ -494,6 +494,9 @@ def _found(read: Study, search: Search, points: Floats) -> tuple[Named, ...]:
 
 def _possible(study: Study, named: Sequence[Named], points: Floats) -> bool:
     """Tell whether a study can have effects of their amplitudes."""
+    if any(value < parameter.least for one in named
+           for value, parameter in zip(one.values, one.parameters, strict=True)):
+        return False
     try:
         changed = Study.model_validate(applied(study, named).model_dump())
         inside = points_in_material(changed, probe_points(changed.instrument, points))

@@ -31,6 +31,9 @@ WIDE_FROM = float(np.sqrt(np.log(WIDE) * 2 / (1 - WIDE**-2)))
 EFFECT_ODDS = 1 / 50
 """Prior odds of each effect being there."""
 
+MOST = 6
+"""Effects that are looked for: of so many at once, some stand for something else."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -146,7 +149,7 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
 
 
 def select(
-    evidence: Evidence, candidates: Sequence[Candidate], most: int = 6,
+    evidence: Evidence, candidates: Sequence[Candidate], most: int = MOST,
     barred: Collection[int] = (),
 ) -> list[Found]:
     """Find missing effects one after the other; drop those that later ones make needless.

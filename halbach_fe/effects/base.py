@@ -16,11 +16,14 @@ from halbach_fe.study import COMPONENTS, BlockException, Instrument, Study
 
 @dataclass(frozen=True)
 class Parameter:
-    """An amplitude of an effect: its name, unit, and prior standard deviation about 0."""
+    """An amplitude of an effect: its name, unit, prior standard deviation about 0, and the smallest
+    one that there can be.
+    """
 
     name: str
     unit: str
     sd: float
+    least: float = -np.inf
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ class RadialGap(Effect):
     name = "radial_gap"
     title = "common radial displacement of the blocks"
     kind = "field"
-    parameters = (Parameter("gap", "m", 2e-4),)
+    parameters = (Parameter("gap", "m", 2e-4, least=0.0),)  # inwards they would meet
 
     def signature(self, scene: Scene, place: Place) -> Floats:
         """See `Effect.signature`."""

@@ -27,7 +27,7 @@ class RecoilPermeability(Effect):
         """See `Effect.apply`."""
         value = study.array.recoil_permeability + float(values[0])
         across = study.array.recoil_permeability_across
-        return with_array(with_remanence(study), recoil_permeability=max(1.0, value),
+        return with_array(with_remanence(study), recoil_permeability=value,
                           recoil_permeability_across=across)
 
 

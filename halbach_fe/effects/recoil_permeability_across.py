@@ -19,7 +19,7 @@ class RecoilPermeabilityAcross(RecoilPermeability):
         """See `Effect.apply`."""
         array = study.array
         there = array.recoil_permeability_across or array.recoil_permeability
-        return with_array(study, recoil_permeability_across=max(1.0, there + float(values[0])))
+        return with_array(study, recoil_permeability_across=there + float(values[0]))
 
 
 EFFECTS = (RecoilPermeabilityAcross(),)

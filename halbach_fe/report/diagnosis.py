@@ -17,7 +17,7 @@ from halbach_fe.diagnosed import (
     where,
 )
 from halbach_fe.diagnosis.residuals import DISCOVERIES, Group
-from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND
+from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND, MOST
 from halbach_fe.effects import catalogue
 from halbach_fe.next_measurement import ENOUGH, Separation
 from halbach_fe.report import diagnosis_figures as figures
@@ -25,6 +25,9 @@ from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
 from halbach_fe.report.view import of_update
 from halbach_fe.update import ALL_READINGS
+
+UNUSUAL = 20.0
+"""Prior standard deviations: what nobody would expect of a magnet that was built with care."""
 
 FIGURES = {
     "groups": (figures.groups, "Chi² per reading of groups of readings, each foretold by all "
@@ -64,6 +67,15 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
+        unusual = [f"{_title(one.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
+                   for one in diagnosis.named if (ratio := _over_usual(one)) > UNUSUAL]
+        if unusual:
+            said.append("Far larger than is usual (the prior's standard deviation): "
+                        f"{', '.join(unusual)}. Unless a ruler confirms it, take that for a sign "
+                        "of something else.")
+        if len(diagnosis.named) == MOST:
+            said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
+                        "a fit rather than a diagnosis, and some stand for something else.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
         start = "Nothing else is missing: then" if said else "Nothing is missing:"
         return [*said, f"{start} the map agrees with the study within noise (chi² per reading "
@@ -94,6 +106,13 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
         if after.prior_conflict > after.conflict_limit and unknown is None:
             said.append("That is still too much: they are not all that is wrong.")
     return said
+
+
+def _over_usual(named: Named) -> float:
+    """The largest amplitude over its prior standard deviation; of what is there or not, none."""
+    first = int(named.hypothesis.effect.certain or named.hypothesis.effect.discrete)
+    return max((abs(value) / parameter.sd for value, parameter in zip(
+        named.values[first:], named.parameters[first:], strict=True)), default=0.0)
 
 
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from halbach_fe.blocks import blocks_of
-from halbach_fe.diagnose import diagnose
+from halbach_fe.diagnose import Hypothesis, Named, _possible, diagnose
+from halbach_fe.diagnosis.selection import Candidate, Found
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Place
 from halbach_fe.effects.blocks_swapped import BlocksSwapped
 from halbach_fe.exact_field import field_of
 from halbach_fe.field_map import field_map, points_of
 from halbach_fe.study import parse_study
-from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured
+from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
 
 
 class Restless(BlocksSwapped):
@@ -50,9 +51,12 @@ def test_a_search_among_pairs_of_blocks(name, workshop, generator):
     assert np.isfinite(found.left_out_after).all()
 
 
-def test_impossible_amplitudes_are_no_explanation(workshop, generator):
-    """Blocks that are wider than their sectors: what that does is not called a gap."""
-    gap = next(effect for effect in catalogue() if effect.name == "azimuthal_gap")
+@pytest.mark.parametrize("name", ["azimuthal_gap", "radial_gap"])
+def test_impossible_amplitudes_are_no_explanation(workshop, generator, name):
+    """Blocks that are wider than their sectors, or nearer to the axis than their neighbours let
+    them: what that does is not called a gap.
+    """
+    gap = next(effect for effect in catalogue() if effect.name == name)
     study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | {
         "outer_radius_m": 0.15, "block": {"shape": "sector"}}})
     nominal = field_of(blocks_of(study), CIRCLES)
@@ -64,3 +68,11 @@ def test_impossible_amplitudes_are_no_explanation(workshop, generator):
     (named,) = diagnose(tight, narrower, workshop, effects=[gap]).named
     assert named.values == pytest.approx([3e-4], abs=4 * named.sd[0])
     assert diagnose(tight, wider, workshop, effects=[gap]).named == ()
+
+
+def test_no_recoil_permeability_is_below_one():
+    effect = next(one for one in catalogue() if one.name == "recoil_permeability_across")
+    for value, there in ((0.1, True), (-0.1, False)):
+        named = Named(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
+                      Found(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
+        assert _possible(with_array(recoil_permeability=1.05), [named], CIRCLES) == there

@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.blocks import blocks_of
 from halbach_fe.diagnose import Unknown, diagnose
 from halbach_fe.diagnosed import amounts, human_unit, note, where
-from halbach_fe.diagnosis.selection import Candidate
+from halbach_fe.diagnosis.selection import MOST, Candidate
 from halbach_fe.effects import catalogue
 from halbach_fe.effects.base import Parameter, Place
 from halbach_fe.exact_field import field_of
@@ -87,6 +87,14 @@ def test_verdicts(flat):
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
     tie = replace(unknown, as_well=True)
     assert "As well it could be one thing" in " ".join(verdict(replace(found, unknown=tie)))
+    (one,) = found.named
+    usual = max(abs(one.values) / [parameter.sd for parameter in one.parameters])
+    huge = replace(one, values=one.values * 30 / usual)
+    assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
+    assert "ruler" not in " ".join(verdict(found))
+    many = verdict(replace(found, named=found.named[:1] * MOST))
+    assert "a fit rather than a diagnosis" in " ".join(many)
+    assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
     nothing = replace(found, named=(), after=found.before)
     assert "no effect of the catalogue" in verdict(nothing)[0]
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
