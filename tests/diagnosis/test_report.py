@@ -92,6 +92,8 @@ def test_verdicts(flat):
     huge = replace(one, values=one.values * 30 / usual)
     assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
     assert "ruler" not in " ".join(verdict(found))
+    assert "come to rest" in " ".join(verdict(replace(found, at_rest=False)))
+    assert "come to rest" not in " ".join(verdict(found))
     many = verdict(replace(found, named=found.named[:1] * MOST))
     assert "a fit rather than a diagnosis" in " ".join(many)
     assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
