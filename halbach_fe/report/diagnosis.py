@@ -169,7 +169,8 @@ def write_report(
                  if (texts := [one.text for one in error.alternatives])]
         + [_class(one, titles) for one in diagnosis.named if rivals(one)],
         structure=figures.structure(diagnosis),
-        further=[_next(one, separations, titles) for one in diagnosis.named if rivals(one)],
+        further=[_next(one, own, titles) for one in diagnosis.named
+                 if (own := [two for two in separations if two.named == one.hypothesis])],
         ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
                 "discoveries": DISCOVERIES},
         advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else "",
@@ -232,10 +233,9 @@ def _either(parts: Sequence[str]) -> str:
 
 
 def _next(
-    named: Named, separations: Sequence[Separation], titles: dict[str, str],
+    named: Named, own: Sequence[Separation], titles: dict[str, str],
 ) -> dict[str, object]:
     """What would separate an effect from its rivals, in words and numbers."""
-    own = [one for one in separations if one.named == named.hypothesis]
     choices = {choice.name: choice.title for one in own for choice in one.options}
     return {
         "what": _title(named.hypothesis.effect.name, titles),

@@ -73,6 +73,8 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     (row,) = found_table(found)
     assert row["it could be"] == ", ".join(dict.fromkeys(
         candidate.effect for candidate, _ in one.found.alternatives))
+    write_report(found, [], tmp_path)  # nothing would tell
+    assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
     alone = replace(one, found=replace(one.found, alternatives=()))
     write_report(replace(found, named=(alone,)), [], tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
