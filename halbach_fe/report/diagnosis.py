@@ -173,7 +173,9 @@ def write_report(
                  if (own := [two for two in separations if two.named == one.hypothesis])],
         ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
                 "discoveries": DISCOVERIES},
-        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else "",
+        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else
+        "None of the measurements that are known here would tell them apart." if any(
+            rivals(one) for one in diagnosis.named) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
