@@ -62,7 +62,9 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.numerical:
         return said
     if diagnosis.named:
-        said.append("The map is explained by: " + "; ".join(
+        fits = diagnosis.at_rest and after.prior_conflict <= after.conflict_limit
+        start = "The map is explained by" if fits else "The catalogue comes nearest with"
+        said.append(f"{start}: " + "; ".join(
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
