@@ -183,6 +183,8 @@ class Diagnosis:
         Of the probe, if the readings show it.
     numerical : Numerical or None
         The solver's own error, if it explains the misfit; then nothing else is looked for.
+    at_rest : bool
+        Whether the last round changed nothing.
     """
 
     read: Study
@@ -202,6 +204,7 @@ class Diagnosis:
     outliers: tuple[Outlier, ...] = ()
     vibration: Vibration | None = None
     numerical: Numerical | None = None
+    at_rest: bool = True
 
     @property
     def study(self) -> Study:
@@ -241,7 +244,7 @@ def diagnose(
     solver = solver or remembering(replace(_room(workshop, "signatures"), progress=None))
     times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
     first: tuple[Update, Search] | None = None
-    named, vibration = start, None
+    named, vibration, at_rest = start, None, True
     outliers: tuple[Outlier, ...] = ()
     numerical: Numerical | None = None
 
@@ -274,7 +277,8 @@ def diagnose(
             signatures.clear()  # whitened by the noise that it was
             continue
         found = _found(read, search, update.observation.map_points)
-        if _settled(named, found):
+        at_rest = _settled(named, found)
+        if at_rest:
             break
         named = found
     assert first is not None
@@ -289,7 +293,8 @@ def diagnose(
         groups_after=_groups(update, search.marginal, search.training),
         left_out_before=left_out(first[1].marginal, first[1].training),
         left_out_after=left_out(search.marginal, search.training), rounds=number + 1,
-        gross=gross, outliers=outliers, vibration=vibration, numerical=numerical)
+        gross=gross, outliers=outliers, vibration=vibration, numerical=numerical,
+        at_rest=at_rest)
 
 
 def _read_right(

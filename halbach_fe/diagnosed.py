@@ -256,7 +256,7 @@ def summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dic
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
-        "rounds": diagnosis.rounds,
+        "rounds": diagnosis.rounds, "at_rest": diagnosis.at_rest,
         "verdict": "numerical" if diagnosis.numerical else
         "unknown" if diagnosis.unknown and not diagnosis.anything else
         "unexplained" if not diagnosis.named and not diagnosis.unknown and conflicting else

@@ -63,7 +63,9 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.numerical:
         return said
     if diagnosis.named:
-        said.append("The map is explained by: " + "; ".join(
+        fits = diagnosis.at_rest and after.prior_conflict <= after.conflict_limit
+        start = "The map is explained by" if fits else "The catalogue comes nearest with"
+        said.append(f"{start}: " + "; ".join(
             _named(one, titles) for one in diagnosis.named) + ".")
         said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
                  f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
@@ -73,6 +75,9 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             said.append("Far larger than is usual (the prior's standard deviation): "
                         f"{', '.join(unusual)}. Unless a ruler confirms it, take that for a sign "
                         "of something else.")
+        if not diagnosis.at_rest:
+            said.append(f"After {diagnosis.rounds} rounds the search had not come to rest: other "
+                        "effects explain the map as badly.")
         if len(diagnosis.named) == MOST:
             said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
                         "a fit rather than a diagnosis, and some stand for something else.")
@@ -167,10 +172,13 @@ def write_report(
                  if (texts := [one.text for one in error.alternatives])]
         + [_class(one, titles) for one in diagnosis.named if rivals(one)],
         structure=figures.structure(diagnosis),
-        further=[_next(one, separations, titles) for one in diagnosis.named if rivals(one)],
+        further=[_next(one, own, titles) for one in diagnosis.named
+                 if (own := [two for two in separations if two.named == one.hypothesis])],
         ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
                 "discoveries": DISCOVERIES},
-        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else "",
+        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else
+        "None of the measurements that are known here would tell them apart." if any(
+            rivals(one) for one in diagnosis.named) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
@@ -230,10 +238,9 @@ def _either(parts: Sequence[str]) -> str:
 
 
 def _next(
-    named: Named, separations: Sequence[Separation], titles: dict[str, str],
+    named: Named, own: Sequence[Separation], titles: dict[str, str],
 ) -> dict[str, object]:
     """What would separate an effect from its rivals, in words and numbers."""
-    own = [one for one in separations if one.named == named.hypothesis]
     choices = {choice.name: choice.title for one in own for choice in one.options}
     return {
         "what": _title(named.hypothesis.effect.name, titles),

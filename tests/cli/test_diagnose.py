@@ -304,7 +304,8 @@ def test_the_readme_says_what_is_in_the_file():
     nothing = SimpleNamespace(
         before=update, after=update, gross=(), outliers=(), named=(), vibration=None,
         numerical=None, unknown=None, anything=False, probabilities={}, groups_before=[],
-        groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1)
+        groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1,
+        at_rest=True)
     assert keys == list(summary(nothing))
     assert all(f"`{name}`" in section for name in PLAUSIBLE)
     rows = [line.split("|") for line in section.splitlines()

@@ -73,6 +73,8 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     (row,) = found_table(found)
     assert row["it could be"] == ", ".join(dict.fromkeys(
         candidate.effect for candidate, _ in one.found.alternatives))
+    write_report(found, [], tmp_path)  # nothing would tell
+    assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
     alone = replace(one, found=replace(one.found, alternatives=()))
     write_report(replace(found, named=(alone,)), [], tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
@@ -92,6 +94,8 @@ def test_verdicts(flat):
     huge = replace(one, values=one.values * 30 / usual)
     assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
     assert "ruler" not in " ".join(verdict(found))
+    assert "come to rest" in " ".join(verdict(replace(found, at_rest=False)))
+    assert "come to rest" not in " ".join(verdict(found))
     many = verdict(replace(found, named=found.named[:1] * MOST))
     assert "a fit rather than a diagnosis" in " ".join(many)
     assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
