@@ -62,6 +62,9 @@ MOST_ROUNDS = 8
 SETTLED = 0.2
 """Of an amplitude's standard deviation: less between rounds is no change."""
 
+ON_AXIS_M = 1e-6
+"""Distance from the axis below which a point has no angle."""
+
 Say = Callable[[str], None]
 Solver = Callable[[Study, Floats], Floats]
 Signatures = dict[tuple[str, Place], Floats]
@@ -134,7 +137,7 @@ class Unknown:
     alone : bool
         Whether it is the better explanation by itself: no effect is named then.
     as_well : bool
-        Whether it is no worse than several named effects together, in place of which it could be.
+        Whether it is about as good as several named effects together, in place of which it may be.
     largest_T : float
         Of it at any training reading.
     at_m : tuple of float
@@ -561,7 +564,9 @@ def _groups(update: Update, marginal: Marginal, residual: Floats) -> list[Group]
     window = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, 11)
     members = {
         "z": [f"{edges[k]:.3f} ... {edges[k + 1]:.3f} m" for k in window],
-        "angle": [f"{30 * int(one // 30)} ... {30 * int(one // 30) + 30} deg" for one in angle],
+        "angle": [f"{30 * int(one // 30)} ... {30 * int(one // 30) + 30} deg"
+                  if distance > ON_AXIS_M else "on the axis"
+                  for one, distance in zip(angle, radius, strict=True)],
         "radius": [f"{one:.4f} m" for one in radius],
         "label": [label for label, keep in zip(update.observation.labels, chosen, strict=True)
                   if keep]}

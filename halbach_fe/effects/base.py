@@ -43,7 +43,8 @@ class Place:
         ring, slot = (f"{letter}{number:02d}" if number else ""
                       for letter, number in (("r", self.ring), ("s", self.slot)))
         if self.at_m:
-            return f"at {', '.join(f'{one:.4g}' for one in self.at_m)} m"
+            places = (round(one, 6) + 0.0 for one in self.at_m)  # no -0, no 1e-18
+            return f"at {', '.join(f'{one:.4g}' for one in places)} m"
         if self.other[0]:
             return f"{ring}{slot}, r{self.other[0]:02d}s{self.other[1]:02d}"
         return ring + slot

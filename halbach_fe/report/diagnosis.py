@@ -73,11 +73,11 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                    for one in diagnosis.named if (ratio := _over_usual(one)) > UNUSUAL]
         if unusual:
             said.append("Far larger than is usual (the prior's standard deviation): "
-                        f"{', '.join(unusual)}. Unless a ruler confirms it, take that for a sign "
-                        "of something else.")
+                        f"{', '.join(unusual)}. Unless another measurement confirms it, take that "
+                        "for a sign of something else.")
         if not diagnosis.at_rest:
-            said.append(f"After {diagnosis.rounds} rounds the search had not come to rest: other "
-                        "effects explain the map as badly.")
+            said.append(f"After {diagnosis.rounds} rounds the search had not come to rest: what "
+                        "is missing, or how much of it, still changed.")
         if len(diagnosis.named) == MOST:
             said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
                         "a fit rather than a diagnosis, and some stand for something else.")

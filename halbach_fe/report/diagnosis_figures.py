@@ -222,7 +222,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
              label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
-    x, y, _ = 1e3 * before.observation.positions[index[0]]
+    x, y, _ = 1e3 * before.observation.positions[index[0]].round(6) + 0.0  # no -0
     top.set_title(f"{label} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     top.set_ylabel(f"{label} in T")

@@ -59,6 +59,7 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
         "quantity": "flux_density", "components": ["x"], "positions": {
             "kind": "line", "start_m": [0, 0, -0.2], "end_m": [0, 0, 0.2], "count": 41}})
     points = np.linspace([0, 0, -0.2], [0, 0, 0.2], 41)
+    points[:, :2] = 0 * points[:, 2:]  # -0 below the middle, which is no angle of 180 degrees
     found, further = diagnosed(study, points, lambda _: [3e-4, 0, 0],
                                ["background", "gain_x", "offset_x"], workshop, generator)
     (one,) = found.named
@@ -73,6 +74,7 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     (row,) = found_table(found)
     assert row["it could be"] == ", ".join(dict.fromkeys(
         candidate.effect for candidate, _ in one.found.alternatives))
+    assert not any(group.kind == "angle" for group in found.groups_before)  # on the axis
     write_report(found, [], tmp_path)  # nothing would tell
     assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
     alone = replace(one, found=replace(one.found, alternatives=()))
@@ -80,6 +82,10 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     page = (tmp_path / "diagnosis.html").read_text()
     assert "It does not tell" not in page
     assert "No two effects have to be told apart" in page
+
+
+def test_places_are_named_without_rounding_errors():
+    assert Place(at_m=(-0.07566, 9.3e-18, -1e-17)).name == "at -0.07566, 0, 0 m"
 
 
 def test_verdicts(flat):
@@ -93,7 +99,7 @@ def test_verdicts(flat):
     usual = max(abs(one.values) / [parameter.sd for parameter in one.parameters])
     huge = replace(one, values=one.values * 30 / usual)
     assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
-    assert "ruler" not in " ".join(verdict(found))
+    assert "Far larger" not in " ".join(verdict(found))
     assert "come to rest" in " ".join(verdict(replace(found, at_rest=False)))
     assert "come to rest" not in " ".join(verdict(found))
     many = verdict(replace(found, named=found.named[:1] * MOST))
