@@ -9,6 +9,7 @@ from importlib import metadata
 from halbach_fe.cli import (
     common,
     completion,
+    demagnetization,
     diagnose,
     doctor,
     export,
@@ -30,6 +31,7 @@ from halbach_fe.errors import EXIT_CODES
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
     "plan": plan, "prior": prior, "shim": shim, "sort": sort, "tolerance": tolerance,
+    "demagnetization": demagnetization,
     "simulate-measurement": simulate_measurement, "import-map": import_map, "export": export,
     "doctor": doctor, "schema": schema, "completion": completion}
 

@@ -112,6 +112,10 @@ class MagnetBlock:
         """Where points (n, 3) in m lie as seen from the block if it stood in its place."""
         return np.asarray((points - self.middle - self.shift) @ turn_of(self.turn) + self.middle)
 
+    def from_place(self, points: Floats) -> Floats:
+        """Where points (n, 3) in m lie that `to_place` would put at the given ones."""
+        return np.asarray((points - self.middle) @ turn_of(self.turn).T + self.middle + self.shift)
+
     @cached_property
     def parts(self) -> tuple[tuple[float, MagnetBlock], ...]:
         """The block, or pieces of it, and how much of its magnetization each has."""
@@ -441,17 +445,26 @@ def _turn(angle: float) -> Floats:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
+def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
+    """Points (n, m, 2) in m at fractions (n,) of an outline's thickness, from the inner side, and
+    (m,) of its width.
+
+    The second and fourth edge, from inner to outer corners and back in all shapes, are joined by
+    straight lines.
+    """
+    far, near = outline[1].at(width)[0], outline[3].at(1 - width)[0]
+    share = depth[:, None, None]
+    return np.asarray((1 - share) * near + share * far)
+
+
 def _part(outline: Outline, inner: float, outer: float, start: float, stop: float) -> Outline:
     """The part of an outline between two fractions of its thickness, from the inner side, and of
     its width.
     """
-    def at(depth: float, width: float) -> Floats:
-        far, near = outline[1].at(np.array([width]))[0][0], outline[3].at(
-            np.array([1 - width]))[0][0]
-        return np.asarray((1 - depth) * near + depth * far)
-
-    corners = np.array([at(inner, start), at(outer, start), at(outer, stop), at(inner, stop)])
-    return _edges(corners, tuple(number for number in (1, 3) if outline[number].arc))
+    (one, two), (four, three) = places_in(
+        outline, np.array([inner, outer]), np.array([start, stop])).swapaxes(0, 1)
+    return _edges(np.array([one, two, three, four]), tuple(
+        number for number in (1, 3) if outline[number].arc))
 
 
 def _edges(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:

@@ -94,12 +94,16 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
 
 
 def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Located, Floats]:
-    """Points (m, 3) inside up to ``count`` of the elements that hold the located ones.
+    """Points (m, 3) inside up to ``count`` of the elements of air that hold the located ones, or of
+    all air if none does: in matter a potential's gradient is not B.
 
     There B does not depend on which of two neighbours a point is taken to belong to. They are off
     all planes of symmetry, where some of an element's functions or their slopes vanish.
     """
     cells = np.unique(located.cells)
+    cells = cells[mesh.in_air[cells]]
+    if not len(cells):
+        cells = np.flatnonzero(mesh.in_air)
     cells = cells[np.unique(np.linspace(0, len(cells) - 1, count).astype(int))]
     dimension = located.reference.shape[1]
     reference = np.tile(_PROBE[mesh.cell_type], (len(cells), 1))

@@ -53,6 +53,7 @@ FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)
 FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
 GridCount = Annotated[int, Field(ge=1, le=10_000)]
 PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
+Temperature = Annotated[float, Field(ge=-273.15, le=500.0, allow_inf_nan=False)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
@@ -534,7 +535,7 @@ class Prior(_Model):
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
     types: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}
     temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
-    reference_temperature_C: Annotated[float, Field(ge=-273.15, le=500.0)] | None = None
+    reference_temperature_C: Temperature | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Prior:
@@ -599,6 +600,33 @@ class Inference(_Model):
             _row_or_table, json_schema_input_type=Union[int, ExcludedReading])], ...] = ()  # noqa: UP007
 
 
+class Demagnetization(_Model):
+    """What the magnet material withstands, by its data sheet at the reference temperature, and the
+    hottest it gets.
+
+    The knee is at ``squareness`` times the intrinsic coercivity: there the polarization has lost a
+    tenth (H_k of IEC 60404-8-1). Remanence and intrinsic coercivity change linearly with
+    temperature, by the fraction of a coefficient per kelvin.
+    """
+
+    intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=1e4, le=1e7)]
+    squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    remanence_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)]
+    coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
+    reference_temperature_C: Temperature = 20.0
+    temperature_C: Temperature = 20.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Demagnetization:
+        for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
+                                  ("coercivity", self.coercivity_coefficient_per_K)):
+            if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
+                raise ValueError(f"{name}_coefficient_per_K ({coefficient}) leaves nothing of it "
+                                 f"at {self.temperature_C:g} °C; use a fraction per kelvin, not "
+                                 "per cent, and a temperature the linear law holds for")
+        return self
+
+
 class Plan(_Model):
     """What `halbach-fe plan` chooses from (default: the observation's positions), and how many
     points (default: as many as the observation has).
@@ -648,6 +676,7 @@ class Study(_Model):
     prior: Prior = Prior()
     inference: Inference = Inference()
     plan: Plan = Plan()
+    demagnetization: Demagnetization | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:

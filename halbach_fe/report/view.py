@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,27 @@ IDENTITY = "magnet-view"
 
 
 @dataclass(frozen=True)
+class Colours:
+    """A number of each block, as its colour.
+
+    Attributes
+    ----------
+    values : ndarray, shape (blocks,)
+    title : str
+        Of the scale.
+    words : sequence of str
+        What is said of each block.
+    limits : tuple of float, or None
+        Of the scale; None for a scale of signed numbers, even about 0.
+    """
+
+    values: Floats
+    title: str
+    words: Sequence[str]
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Known:
     """What a page knows of the blocks.
 
@@ -44,14 +66,12 @@ class Known:
     ----------
     magnetization : ndarray, shape (blocks, D), in A/m
         Drawn as arrows.
-    deviation, sd : ndarray, shape (blocks,), or None
-        Along the easy axis, from nominal, as a fraction of it: the colour; None before a
-        measurement.
+    colours : Colours or None
+        None before a measurement.
     """
 
     magnetization: Floats
-    deviation: Floats | None = None
-    sd: Floats | None = None
+    colours: Colours | None = None
 
 
 @dataclass(frozen=True)
@@ -106,8 +126,11 @@ def of_update(update: Update) -> Markup:
     length = np.einsum("ij,ij->i", nominal, easy)
     mean = update.posterior.mean.reshape(-1, size)
     along = np.einsum("ij,ijk->ik", easy, update.posterior.root.reshape(*easy.shape, -1))
-    known = Known(mean, np.einsum("ij,ij->i", mean - nominal, easy) / length,
-                  np.linalg.norm(along, axis=1) / length)
+    change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
+    sd = 100 * np.linalg.norm(along, axis=1) / length
+    known = Known(mean, Colours(change, "posterior change<br>along the easy axis in %", [
+        f"{one:+.2f} ± {error:.2f} % along the easy axis"
+        for one, error in zip(change, sd, strict=True)]))
     scores = update.standardized(update.prediction_posterior)
     return magnet_view(update.study, known, _by_point(update.observation.positions, scores))
 
@@ -158,13 +181,14 @@ def _blocks(study: Study, known: Known) -> go.Mesh3d:
     points, faces = np.vstack(vertices), np.vstack(triangles)
     words = [_words(block, known, number) for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
-    if known.deviation is not None:
-        percent = 100 * known.deviation
-        limit = float(np.abs(percent).max()) or 1.0
-        look = {"intensity": percent[np.array(owner)[faces[:, 0]]], "intensitymode": "cell",
-                "colorscale": SIGNED, "cmin": -limit, "cmax": limit, "colorbar": {
-                    "title": {"text": "posterior change<br>along the easy axis in %"},
-                    "len": 0.45, "y": 0.7}}
+    if known.colours is not None:
+        values = known.colours.values
+        limit = float(np.abs(values).max()) or 1.0
+        low, high = known.colours.limits or (-limit, limit)
+        look = {"intensity": values[np.array(owner)[faces[:, 0]]], "intensitymode": "cell",
+                "colorscale": UNSIGNED if known.colours.limits else SIGNED, "cmin": low,
+                "cmax": high, "colorbar": {
+                    "title": {"text": known.colours.title}, "len": 0.45, "y": 0.7}}
     return go.Mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=faces[:, 0], j=faces[:, 1],
         k=faces[:, 2], text=[words[one] for one in owner], hoverinfo="text", flatshading=True,
@@ -175,9 +199,8 @@ def _words(block: MagnetBlock, known: Known, number: int) -> str:
     moment = known.magnetization[number]
     lines = [f"ring {block.ring}, slot {block.slot}",
              "M = (" + ", ".join(f"{1e-3 * one:.1f}" for one in moment) + ") kA/m"]
-    if known.deviation is not None and known.sd is not None:
-        lines.append(f"{100 * known.deviation[number]:+.2f} ± {100 * known.sd[number]:.2f} % "
-                     "along the easy axis")
+    if known.colours is not None:
+        lines.append(known.colours.words[number])
     return "<br>".join(lines)
 
 

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from halbach_fe.blocks import blocks_of
-from halbach_fe.report.view import Known, magnet_view, prism, residuals
+from halbach_fe.report.view import Colours, Known, magnet_view, prism, residuals
 from halbach_fe.study import read_study
 from tests.conftest import ROOT
 
@@ -23,8 +23,9 @@ def study_of(name):
 
 def known_of(study):
     blocks = blocks_of(study)
-    return Known(np.array([block.magnetization[:study.dimension] for block in blocks]),
-                 np.linspace(-0.02, 0.02, len(blocks)), np.full(len(blocks), 0.004))
+    percent = np.linspace(-2, 2, len(blocks))
+    return Known(np.array([block.magnetization[:study.dimension] for block in blocks]), Colours(
+        percent, "in %", [f"{one:+.2f} ± 0.40 %" for one in percent]))
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +94,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     assert own
     for text in own:
         slot = int(text.split("slot ")[1].split("M")[0])
-        percent = 100 * known.deviation[slot - 1]
-        assert f"{percent:+.2f} ± 0.40 %" in text
+        assert known.colours.words[slot - 1] in text
     shown.locator("#magnet-view .legendtoggle").first.click()
     shown.wait_for_function(
         "document.getElementById('magnet-view').data[0].visible == 'legendonly'", timeout=10_000)

@@ -1,0 +1,43 @@
+"""Map how near the blocks are to the knee of their demagnetization curve, at temperature.
+
+From the study's `demagnetization`: coercivity, coefficients and temperature of the material. Writes
+demagnetization.html and its figures, .json, .csv (by block) and .vtu (by cell, for ParaView).
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from halbach_fe.cli import common
+from halbach_fe.demagnetization import ACROSS, demagnetization
+from halbach_fe.study import read_study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--across", type=common.positive, default=ACROSS, metavar="N",
+                        help="cells across the thickness of a block (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve, write everything, print the blocks with the least margin."""
+    from halbach_fe.report.demagnetization import (  # matplotlib loads when needed
+        demagnetization_summary,
+        worst_blocks,
+        write_demagnetization,
+    )
+
+    study = read_study(arguments.study)
+    with common.workshop(arguments) as workshop:
+        found = demagnetization(study, workshop, arguments.across)
+    write_demagnetization(found, arguments.output)
+    summary = demagnetization_summary(found)
+    if arguments.json:
+        common.print_json(summary)
+    else:
+        common.print_table(worst_blocks(found.by_block()), "Blocks with the least margin")
+        common.say(f"{100 * found.share_beyond_now:.2g} % of the volume is past the knee at "
+                   f"{found.material.temperature_C:g} °C.")
+        common.say(f"Report: {arguments.output / 'demagnetization.html'}")
+    return 0

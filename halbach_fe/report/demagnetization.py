@@ -1,0 +1,159 @@
+"""Figures, tables and page of the demagnetization margin."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from halbach_fe.blocks import Floats, Ints
+from halbach_fe.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
+from halbach_fe.field_map import atomic, write_csv
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.view import Colours, Known, magnet_view
+from halbach_fe.update import write_text
+
+PAST = "#D55E00"
+SWEEP_K = 40.0
+"""How far the curve of temperatures goes beyond the magnet's, and that of the last of `SHARES`."""
+
+WORST_ROWS = 12
+
+
+def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
+    """What a script wants to know of the margin."""
+    material, worst = found.material, int(np.argmin(found.margin))
+    block = found.blocks[found.cells.block[worst]]
+    temperature = material.temperature_C
+    limits = {str(share): found.limit_temperature(share) for share in SHARES}
+    return {
+        "study": found.study.name, "temperature_C": temperature,
+        "knee_A_per_m": float(knee(material, temperature)),
+        "least_H_A_per_m": float(found.along[worst]),
+        "least_margin_A_per_m": float(found.margin[worst]),
+        "at_m": found.cells.middles[worst].tolist(), "ring": block.ring, "slot": block.slot,
+        "share_beyond_knee": found.share_beyond_now,
+        "limit_temperature_C": {share: limit if math.isfinite(limit) else None
+                                for share, limit in limits.items()},
+        "cells": len(found.along),
+    }
+
+
+def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
+    """Write demagnetization.json, .csv (by block), .vtu (by cell), .html and the figures."""
+    summary, rows = demagnetization_summary(found), found.by_block()
+    write_text(folder / "demagnetization.json",
+               json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    with atomic(folder / "demagnetization.csv") as temporary:
+        write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
+            "study": found.study.name, "temperature_C": str(found.material.temperature_C),
+        }, temporary)
+    write_vtu(found, folder / "demagnetization.vtu")
+    pictures = save({
+        "demagnetization_map.png": (_map(found), "H along the magnetization in the blocks; cells "
+                                    "past the knee, if any, are outlined"),
+        "demagnetization_temperature.png": (_temperatures(found), "Share of the magnet's volume "
+                                            "past the knee, by temperature"),
+        "demagnetization_blocks.png": (_slots(found), "H along the magnetization by slot: the mean "
+                                       "of the blocks, and the least in any cell of them"),
+    }, folder)
+    write_page(folder / "demagnetization.html", "demagnetization.html.j2", pictures,
+               study=found.study, summary=summary, material=found.material,
+               rows=worst_blocks(rows), blocks=len(rows), view=_view(found, rows))
+
+
+def worst_blocks(rows: list[dict[str, float | int]]) -> list[dict[str, str]]:
+    """The blocks with the least margin, as text."""
+    return [{"ring": str(row["ring"]), "slot": str(row["slot"]),
+             "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
+             "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
+             "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
+             "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
+             "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}
+            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:WORST_ROWS]]
+
+
+def _layers(found: DemagnetizationMap) -> dict[str, Ints]:
+    """Cells to draw, by what they are: nearest to the middle, and the layer of the least margin."""
+    z = found.cells.middles[:, 2].round(9)
+    middle = z[np.argmin(np.abs(z))]
+    worst = z[np.argmin(found.margin)]
+    if np.isclose(abs(worst), abs(middle)):
+        return {f"z = {1e3 * worst:.0f} mm" if np.ptp(z) else "": np.flatnonzero(z == worst)}
+    return {f"z = {1e3 * one:.0f} mm{words}": np.flatnonzero(z == one)
+            for one, words in ((middle, ""), (worst, ", least margin"))}
+
+
+def _map(found: DemagnetizationMap) -> Figure:
+    layers = _layers(found)
+    figure = Figure(figsize=(5.2 * len(layers) + 1, 5), layout="constrained")
+    limits = 1e-3 * float(found.along.min()), 1e-3 * float(found.along.max())
+    threshold = -1e-3 * float(knee(found.material, found.material.temperature_C))
+    axes: list[Axes] = list(figure.subplots(1, len(layers), squeeze=False)[0])
+    for axis, (title, cells) in zip(axes, layers.items(), strict=True):
+        faces = 1e3 * found.cells.vertices[found.cells.corners[cells, :4]][..., :2]
+        values = 1e-3 * found.along[cells]
+        drawn = PolyCollection(list(faces), array=values, cmap="cividis", edgecolors="face", lw=0.2)
+        drawn.set_clim(*limits)
+        axis.add_collection(drawn)
+        axis.add_collection(PolyCollection(list(faces[values < threshold]), facecolors="none",
+                                           edgecolors=PAST, lw=0.8))
+        axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", title=title)
+        axis.autoscale_view()
+    bar = figure.colorbar(drawn, ax=axes, label="H along the magnetization in kA/m")
+    if limits[0] < threshold < limits[1]:
+        bar.ax.axhline(threshold, color=PAST, lw=2)
+    return figure
+
+
+def _temperatures(found: DemagnetizationMap) -> Figure:
+    material = found.material
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    axis = figure.subplots()
+    limit = found.limit_temperature(SHARES[-1])
+    hottest = max(material.temperature_C, limit if math.isfinite(limit) else -np.inf)
+    temperature = np.linspace(min(material.temperature_C, material.reference_temperature_C),
+                              hottest + SWEEP_K, 241)
+    axis.plot(temperature, 100 * found.share_beyond(temperature), color=POSTERIOR)
+    axis.axvline(material.temperature_C, color=PRIOR, ls="--",
+                 label=f"the magnet's, {material.temperature_C:g} °C")
+    axis.set(xlabel="temperature in °C", ylabel="past the knee, % of volume", ylim=(0, None))
+    axis.legend()
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def _slots(found: DemagnetizationMap) -> Figure:
+    rows = found.by_block()
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    axis = figure.subplots()
+    slots = np.array([row["slot"] for row in rows])
+    for key, words, colour, shift in (("mean_H_A_per_m", "mean", POSTERIOR, -0.15),
+                                      ("least_H_A_per_m", "least", MEASURED, 0.15)):
+        values = 1e-3 * np.array([row[key] for row in rows])
+        axis.plot(slots + shift, values, "o", ms=4, color=colour, label=words, alpha=0.7)
+    axis.axhline(-1e-3 * float(knee(found.material, found.material.temperature_C)), color=PAST,
+                 label="knee")
+    axis.axhline(0, color=PUBLISHED, lw=0.8)
+    axis.set(xlabel="slot", ylabel="H in kA/m")
+    axis.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1))
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def _view(found: DemagnetizationMap, rows: list[dict[str, float | int]]) -> Markup:
+    size, count = found.study.dimension, len(found.blocks)
+    magnetization: Floats = np.array([block.magnetization[:size] for block in found.blocks])
+    margin, words = np.zeros(count), ["not magnetized"] * count
+    for number, row in zip(np.unique(found.cells.block), rows, strict=True):
+        margin[number] = 1e-3 * row["margin_A_per_m"]
+        words[number] = f"least margin {margin[number]:+.0f} kA/m"
+    return magnet_view(found.study, Known(magnetization, Colours(
+        margin, "least margin<br>to the knee in kA/m", words,
+        (min(0.0, float(margin.min())), max(0.0, float(margin.max()))))))
