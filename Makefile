@@ -6,10 +6,12 @@
 # make study-faser-diagnosis what the model lacks, by the published profile
 # make study-linear-3d       the paper's linear validation: 576 magnetizations from a map of the bore
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
+# make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke
+# make study-mri           the same of an MRI array of cubes
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity test benchmark lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -32,6 +34,17 @@ study-linear-3d: setup
 
 study-nonlinear-2d: setup
 	.venv/bin/python studies/nonlinear-2d/run.py -o results/nonlinear-2d
+
+# Their campaigns were simulated by `halbach-fe simulate-measurement`; each has something hidden.
+study-quadrupole study-mri: study-%: setup
+	.venv/bin/halbach-fe solve studies/$*/study.toml -o results/$*/field
+	.venv/bin/halbach-fe demagnetization studies/$*/study.toml -o results/$*/demagnetization
+	.venv/bin/halbach-fe infer studies/$*/study.toml --measurements studies/$*/campaign/map.csv \
+	    --blocks studies/$*/campaign/blocks.csv --held-out studies/$*/campaign/held-out.csv \
+	    -o results/$*/inferred
+	.venv/bin/halbach-fe diagnose studies/$*/study.toml --measurements studies/$*/campaign/map.csv \
+	    --blocks studies/$*/campaign/blocks.csv --held-out studies/$*/campaign/held-out.csv \
+	    -o results/$*/diagnosis
 
 study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
