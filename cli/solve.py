@@ -62,9 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
         "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
-    versions = {key: data.attrs[key] for key in ("halbach_fe", "getdp", "method")}
-    write_report(Solution(study, points, flux_density, observation, readings, errors, versions | {
-        "points, readings": f"{len(points)}, {len(readings)}",
+    write_report(Solution(study, points, flux_density, observation, readings, errors, {
+        "study file": common.digest(arguments.study), "GetDP": workshop.getdp.version,
+        "method": study.solver.method, "points, readings": f"{len(points)}, {len(readings)}",
         "solved in": f"{summary['seconds']} s"}), arguments.output)
     if is_nonlinear(study):
         summary["newton_residuals"] = newton_history(arguments.output)

@@ -17,11 +17,12 @@ from halbach_fe.report.page import (
     PRIOR,
     SECOND,
     axes_along,
-    draw_magnet,
+    geometry,
+    places,
     save,
     write_page,
 )
-from halbach_fe.report.view import of_nominal
+from halbach_fe.report.view import field_points, of_nominal
 from halbach_fe.study import COMPONENTS, CirclePositions, FourierCoefficients, Study
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
@@ -56,9 +57,8 @@ class Solution:
 def write_report(solution: Solution, folder: Path) -> None:
     """Write report.html, self-contained, and its figures as PNG into ``folder``."""
     figures = {
-        "geometry.png": (_geometry(solution.study), "The blocks of a ring with their "
-                         "magnetization, the iron if there is any, and the circles of the study "
-                         "(dotted)"),
+        "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with their "
+                         "magnetization, the iron if there is any, and the study's positions"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
     multipoles, circle = multipole_rows(solution)
@@ -68,7 +68,7 @@ def write_report(solution: Solution, folder: Path) -> None:
         multipoles=multipoles, circle=circle, provenance=solution.provenance,
         strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
         error=float(solution.errors.max()),
-        view=of_nominal(solution.study, solution.points, solution.flux_density))
+        view=of_nominal(solution.study, field_points(solution.points, solution.flux_density)))
 
 
 def multipole_rows(solution: Solution) -> tuple[list[dict[str, str]], str]:
@@ -97,24 +97,10 @@ def multipole_rows(solution: Solution) -> tuple[list[dict[str, str]], str]:
                 f"r = {1e3 * radius:g} mm, z = {1e3 * solution.points[index[0], 2]:g} mm")
 
 
-def _geometry(study: Study) -> Figure:
-    figure = Figure(figsize=(5.5, 5.5), layout="constrained")
-    axis = figure.subplots()
-    draw_magnet(axis, study)
-    positions = study.observation.positions
-    if isinstance(positions, CirclePositions):
-        angle = np.linspace(0, 2 * np.pi, 181)
-        for radius in positions.radius_m:
-            axis.plot(1e3 * radius * np.cos(angle), 1e3 * radius * np.sin(angle), ":",
-                      color=MEASURED, lw=1)
-    axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
-    return figure
-
-
 def _field(solution: Solution) -> Figure:
     """Components along z, or around the circle, or by number of the point; errors below."""
-    place, label = _places(solution.points)
-    seen, _ = _places(solution.observation.positions)
+    place, label = places(solution.points)
+    seen, _ = places(solution.observation.positions)
     figure, (top, bottom) = axes_along(2, [2, 1])
     order = np.argsort(place, kind="stable")
     for component, colour, column in zip(COMPONENTS, COLOURS, solution.flux_density.T, strict=True):
@@ -126,12 +112,3 @@ def _field(solution: Solution) -> Figure:
     bottom.set_xlabel(label)
     return figure
 
-
-def _places(points: Floats) -> tuple[Floats, str]:
-    """Where points (n, 3) in m stand in the figure, and what that is."""
-    x, y, z = points.T
-    if np.ptp(z) > 0:
-        return 1e3 * z, "z in mm"
-    if np.hypot(x, y).min() > 0:
-        return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
-    return np.arange(1.0, len(points) + 1), "number of the point"
