@@ -81,6 +81,11 @@ def digest(path: Path) -> str:
     return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
 
 
+def digests(files: Mapping[str, Path | None]) -> dict[str, str]:
+    """`digest` of files by what they are, as far as they were given."""
+    return {what: digest(path) for what, path in files.items() if path is not None}
+
+
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """--json."""
     parser.add_argument("--json", action="store_true", help="print results as JSON")

@@ -1,8 +1,8 @@
 """Compute the field of a study's nominal magnet at the study's positions.
 
 Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
-field_map.vtu (open it in ParaView), readings.csv with the study's observation, report.html, and the
-GetDP run folders, which can be run by hand.
+field_map.vtu (open it in ParaView), readings.csv with the study's observation, multipoles.csv if it
+has circles, report.html, and the GetDP run folders, which can be run by hand.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def _row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:
     sigma = _noise(study, data)
     return {"points of": name, "number": str(len(z)),
             "components": ", ".join(f"B{one}" for one in observed_components(study)),
-            "z in m": f"{z.min():g} to {z.max():g}",
+            "z in m": " to ".join(dict.fromkeys(f"{one:g}" for one in (z.min(), z.max()))),
             "largest reading in T": f"{np.nanmax(np.abs(fields)):.5g}",
             "noise in T": " to ".join(dict.fromkeys(
                 f"{one:.1e}" for one in (np.nanmin(sigma), np.nanmax(sigma))))}

@@ -10,7 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.observation import Observation, circles, fourier_analysis
+from halbach_fe.multipoles import solved_circles
+from halbach_fe.observation import Observation
+from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -23,11 +25,9 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.view import field_points, of_nominal
-from halbach_fe.study import COMPONENTS, CirclePositions, FourierCoefficients, Study
+from halbach_fe.study import COMPONENTS, Study
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
-MOST_ORDERS = 10
-UNITS = 1e4
 
 
 @dataclass(frozen=True)
@@ -55,46 +55,26 @@ class Solution:
 
 
 def write_report(solution: Solution, folder: Path) -> None:
-    """Write report.html, self-contained, and its figures as PNG into ``folder``."""
+    """Write report.html, self-contained, and its figures as PNG into ``folder``; and
+    multipoles.csv, if the positions are full circles.
+    """
     figures = {
         "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with their "
                          "magnetization, the iron if there is any, and the study's positions"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
-    multipoles, circle = multipole_rows(solution)
+    multipoles: list[Table] = [
+        (model, {"nominal": known}) for model, known in solved_circles(
+            solution.study, solution.points, solution.flux_density, solution.errors)]
+    if multipoles:
+        table_csv(solution.study, multipoles, folder / "multipoles.csv")
     write_page(
         folder / "report.html", "solution.html.j2", save(figures, folder), study=solution.study,
         array=solution.study.array, remanence=blocks_of(solution.study)[0].remanence,
-        multipoles=multipoles, circle=circle, provenance=solution.provenance,
+        multipoles=middle_table(multipoles), provenance=solution.provenance,
         strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
         error=float(solution.errors.max()),
         view=of_nominal(solution.study, field_points(solution.points, solution.flux_density)))
-
-
-def multipole_rows(solution: Solution) -> tuple[list[dict[str, str]], str]:
-    """Multipoles on the circle that is nearest to the middle, of the largest radius, as text, and
-    which one that is; nothing if there are no circles.
-    """
-    positions = solution.study.observation.positions
-    if not isinstance(positions, CirclePositions):
-        return [], ""
-    orders = min(MOST_ORDERS, (positions.angles - 1) // 2)
-    if orders < 1:
-        return [], ""
-    settings = FourierCoefficients(quantity="fourier_coefficients", harmonics=orders,
-                                   positions=positions)
-    radius, index = min(circles(solution.points, settings), key=lambda one: (
-        abs(solution.points[one[1][0], 2]), -one[0]))
-    matrix, _, _ = fourier_analysis(solution.points[index], settings.model_copy(
-        update={"positions": positions.model_copy(update={"radius_m": (radius,), "count": 1})}))
-    skew, normal = (matrix @ solution.flux_density[index].ravel()).reshape(2, orders)
-    main = int(np.argmax(np.hypot(skew, normal)))
-    scale = UNITS / np.hypot(skew[main], normal[main])
-    return [{"n": str(order + 1), "B_n in T": f"{normal[order]:+.6f}",
-             "A_n in T": f"{skew[order]:+.6f}", "b_n in units": f"{scale * normal[order]:+.2f}",
-             "a_n in units": f"{scale * skew[order]:+.2f}"}
-            for order in range(orders)], (
-                f"r = {1e3 * radius:g} mm, z = {1e3 * solution.points[index[0], 2]:g} mm")
 
 
 def _field(solution: Solution) -> Figure:

@@ -78,7 +78,7 @@ def basis(found: Verification) -> str:
     text = ("The estimated error is what all further refinements would change, if each changes "
             f"less by the same factor as the last two did (order {found.order:.1f}{limit} in the "
             "element size), and what a boundary farther away changes.")
-    if len(found.differences) > 3:  # noqa: PLR2004
+    if len(found.differences) > 3:
         text += (" The dual formulation errs in the opposite direction, as far as energies go; its "
                  "difference is the error bar of readings, and not part of the estimate.")
     return text
