@@ -43,8 +43,8 @@ def reference_text(model: MultipoleModel) -> str:
              else f"at z = {model.z:g} m (Fourier coefficients of B_r)" if model.z is not None
              else "of the cross-section")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
-            f"of 1e-4 of the main one (order {model.main}); b normal, a skew, along axes in which "
-            "the nominal main multipole is normal.")
+            f"of 1e-4 of the main one (order {model.main}; European convention, order 1 is the "
+            "dipole); b normal, a skew, along axes in which the nominal main multipole is normal.")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:

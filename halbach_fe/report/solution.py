@@ -59,8 +59,9 @@ def write_report(solution: Solution, folder: Path) -> None:
     multipoles.csv, if the positions are full circles.
     """
     figures = {
-        "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with their "
-                         "magnetization, the iron if there is any, and the study's positions"),
+        "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with "
+                         "their magnetization, the iron if there is any, and the study's "
+                         "positions"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
     multipoles: list[Table] = [
@@ -87,7 +88,9 @@ def _field(solution: Solution) -> Figure:
         top.plot(place[order], column[order], ".", ms=3, color=colour, label=f"B{component}")
     top.set_ylabel("B in T")
     top.legend(ncols=3)
-    bottom.semilogy(seen, solution.errors, ".", ms=3, color=MEASURED)
+    bottom.plot(seen, solution.errors, ".", ms=3, color=MEASURED)
+    if solution.errors.any():  # blocks in vacuum have none
+        bottom.set_yscale("log")
     bottom.set_ylabel("error bar in T")
     bottom.set_xlabel(label)
     return figure

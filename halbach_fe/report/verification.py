@@ -100,8 +100,8 @@ def write_verification(
             "Error against element size, both logarithmic: what the next finer mesh changes, the "
             "slope between the two, the estimated error of the study's own mesh, and for "
             "comparison what a farther boundary and another formulation change")
-    figures["verification_along.png"] = _along(found), (
-        "Change of B at every position of the study, for each change of the model")
+        figures["verification_along.png"] = _along(found), (
+            "Change of B at every position of the study, for each change of the model")
     figures["verification_geometry.png"] = geometry(study, found.points), (
         "The blocks of a ring with their magnetization, the iron if there is any, and the study's "
         "positions")

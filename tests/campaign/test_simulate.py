@@ -24,6 +24,7 @@ from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.observation import fourier_analysis, observe, points_from, reading_noise
 from halbach_fe.study import MU_0, parse_study, read_study
 from tests.conftest import DIPOLE, changed
+from tests.pages import page
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -126,6 +127,16 @@ def test_the_truth_is_sealed(campaigns):
     assert truth["model"].keys() == {"vacuum", "reaction"}
     for name in ("map.csv", "blocks.csv"):  # nothing of it is in the open
         assert "seed" not in (folder / name).read_text()
+    text = page(folder / "campaign.html")
+    for name in ("map.csv", "held-out.csv", "blocks.csv", "truth/truth.json"):
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() in text
+    largest = np.nanmax(np.abs(read_map(folder / "map.csv")["B_T"].values))
+    assert f"<td>{largest:.5g}</td>" in text
+    # blocks as they were ordered; those that were drawn are not even there in other digits
+    assert "M = (-843.5, 0.0) kA/m" in text.replace("\\u003cbr\\u003e", "\n")
+    drawn = truth["blocks"][0]["magnetization_A_per_m"]
+    assert not any(f"{1e-3 * one:.1f}" in text.split("M = (")[1] for one in drawn[:2])
+    assert not {"calibration", "seed"} & set(text.split("</script>")[-1].split())
 
 
 def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
@@ -133,11 +144,13 @@ def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
     assert main(["simulate-measurement", str(study), "-o", str(tmp_path), "--seed", "5",
                  "--json"]) == 0
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    assert [str(path) for path in files] == ["blocks.csv", "held-out.csv", "map.csv",
-                                             "truth/truth.json"]
+    assert [str(path) for path in files] == [
+        "blocks.csv", "campaign.html", "campaign_field.png", "campaign_geometry.png",
+        "held-out.csv", "map.csv", "truth/truth.json"]
     for path in files:
         assert (tmp_path / path).read_bytes() == (folder / path).read_bytes()
-        assert (tmp_path / path).read_bytes() != (other / path).read_bytes()
+        assert path.name == "campaign_geometry.png" or (
+            tmp_path / path).read_bytes() != (other / path).read_bytes()
 
 
 def test_refusals_on_the_command_line(campaigns, tmp_path, capsys):
