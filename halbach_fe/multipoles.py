@@ -279,6 +279,9 @@ def circle_models(
     """Multipoles on the circles that a study reads, without another solve: all orders that the
     readings tell, the main one too, in units of the main one on the circle of that radius that is
     nearest to the middle; none if there are no full circles, or an instrument between.
+
+    They are Fourier coefficients of B_r at the study's own angles: of m angles, order n has what
+    there is of order m - n too. `multipole_models` takes as many angles as are needed.
     """
     main, found = study.array.multipole_order, []
     circles = _read_circles(study, observation)
