@@ -14,7 +14,7 @@ import numpy as np
 import tomlkit
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.field_map import atomic
@@ -110,8 +110,12 @@ def geometry(study: Study, points: Floats, others: Floats | None = None) -> Figu
     left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
-        axis.margins(y=0.2)
         axis.grid(alpha=0.3)
+        low, high = 1e3 * study.array.inner_radius_m, 1e3 * study.array.outer_radius_m
+        for block in blocks_of(study)[::study.array.blocks_per_ring]:
+            axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
+                                     high - low, fill=False, color="#777777", lw=0.6))
+        axis.set_ylim(0, None)
     for one, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                       (others, "x", PRIOR, "held out")):
         if one is None:
