@@ -15,6 +15,7 @@ from halbach_fe.cli import (
     export,
     import_map,
     infer,
+    multipoles,
     new,
     plan,
     prior,
@@ -30,8 +31,8 @@ from halbach_fe.errors import EXIT_CODES
 
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
-    "plan": plan, "prior": prior, "shim": shim, "sort": sort, "tolerance": tolerance,
-    "demagnetization": demagnetization,
+    "multipoles": multipoles, "plan": plan, "prior": prior, "shim": shim, "sort": sort,
+    "tolerance": tolerance, "demagnetization": demagnetization,
     "simulate-measurement": simulate_measurement, "import-map": import_map, "export": export,
     "doctor": doctor, "schema": schema, "completion": completion}
 

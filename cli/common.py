@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -73,6 +74,16 @@ def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
     """--getdp."""
     parser.add_argument("--getdp", metavar="PATH",
                         help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
+
+
+def digest(path: Path) -> str:
+    """A file's name and its SHA-256, for the provenance of a page."""
+    return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+
+def digests(files: Mapping[str, Path | None]) -> dict[str, str]:
+    """`digest` of files by what they are, as far as they were given."""
+    return {what: digest(path) for what, path in files.items() if path is not None}
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:

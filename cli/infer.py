@@ -1,6 +1,7 @@
 """Update a study's block magnetizations with a measured field map.
 
-Writes posterior.h5, prediction.csv, summary.json, report.html and its figures.
+Writes posterior.h5, prediction.csv, summary.json, report.html and its figures, and if the map has
+full circles multipoles.csv; `halbach-fe multipoles` has those of any posterior.
 """
 
 from __future__ import annotations
@@ -64,7 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
     if update.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
     write_update(update, arguments.output)
-    write_report(update, arguments.output)
+    write_report(update, arguments.output, provenance={
+        "GetDP": workshop.getdp.version, **common.digests({
+            "study file": arguments.study, "measurements": arguments.measurements,
+            "held-out map": arguments.held_out, "blocks": arguments.blocks})})
     if arguments.json:
         common.print_json(summary(update))
     else:

@@ -2,7 +2,8 @@
 
 Magnetizations are drawn from the study's prior; the field is by magpylib and NGSolve, never by
 halbach-fe's own model. Writes blocks.csv (single blocks in a Helmholtz coil), map.csv, held-out.csv
-(half a step between the map's points) and truth/truth.json, sealed: the maps name its SHA-256.
+(half a step between the map's points), truth/truth.json, sealed: the maps name its SHA-256, and
+campaign.html with its figures, which show nothing of the truth.
 """
 
 from __future__ import annotations
@@ -51,12 +52,16 @@ def _effect(text: str) -> Wanted:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write everything, print what was written."""
+    from halbach_fe.report.campaign import write_campaign_page  # matplotlib loads when needed
+
     study = read_study(arguments.study)
     elements = Elements(arguments.element_size, arguments.order)
     with common.progress_bar("magpylib") as show:
         campaign = simulate(study, arguments.seed, arguments.coil_sd, arguments.hide,
                             arguments.hide_random, elements, show)
     written = write_campaign(campaign, arguments.output)
+    write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,
+                        arguments.output, [common.digest(path) for path in written])
     summary = {
         "study": study.name, "points": campaign.readings.sizes["point"],
         "readings": int(np.isfinite(campaign.readings["B_T"].values).sum()),
@@ -67,4 +72,5 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(summary)
     else:
         common.print_table([{"what": key, "value": str(value)} for key, value in summary.items()])
+        common.say(f"Report: {arguments.output / 'campaign.html'}")
     return 0

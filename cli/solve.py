@@ -1,8 +1,8 @@
 """Compute the field of a study's nominal magnet at the study's positions.
 
 Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
-field_map.vtu (open it in ParaView), readings.csv with the study's observation, report.html, and the
-GetDP run folders, which can be run by hand.
+field_map.vtu (open it in ParaView), readings.csv with the study's observation, multipoles.csv if it
+has circles, report.html, and the GetDP run folders, which can be run by hand.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
         "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
-    versions = {key: data.attrs[key] for key in ("halbach_fe", "getdp", "method")}
-    write_report(Solution(study, points, flux_density, observation, readings, errors, versions | {
-        "points, readings": f"{len(points)}, {len(readings)}",
+    write_report(Solution(study, points, flux_density, observation, readings, errors, {
+        "study file": common.digest(arguments.study), "GetDP": workshop.getdp.version,
+        "method": study.solver.method, "points, readings": f"{len(points)}, {len(readings)}",
         "solved in": f"{summary['seconds']} s"}), arguments.output)
     if is_nonlinear(study):
         summary["newton_residuals"] = newton_history(arguments.output)

@@ -14,21 +14,29 @@ at one z, the coefficients of B_r there are given as they are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.errors import StudyError, must_be
+from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.extent import magnet_half_length, magnet_radius
 from halbach_fe.inference.prior import Gaussian
-from halbach_fe.observation import Observation, fourier_analysis, points_from
-from halbach_fe.response import response
+from halbach_fe.observation import (
+    Observation,
+    fourier_analysis,
+    observe,
+    points_from,
+    together,
+)
+from halbach_fe.response import Response, response
 from halbach_fe.solve import Workshop
 from halbach_fe.study import (
+    COMPONENTS,
     MU_0,
     CirclePositions,
     FourierCoefficients,
@@ -226,38 +234,157 @@ def multipole_model(study: Study, reference: Reference, workshop: Workshop) -> M
     StudyError
         If the reference is none for this study, or the nominal magnet has no main multipole.
     """
-    orders = tuple(sorted(set(reference.orders) - {study.array.multipole_order}))
-    if not orders:
-        raise StudyError(must_be("--orders", f"study {study.name}",
-                                 "those of unwanted multipoles", "the main one only"))
-    if study.dimension == 2 and reference.z_m is not None:
-        raise StudyError(must_be("--at-z-m", f"study {study.name}", "left out, since it is 2D",
-                                 f"{reference.z_m:g}"))
-    radius = _radius(study, reference)
-    integrated = study.dimension == 3 and reference.z_m is None
-    bare = study.model_copy(update={"instrument": Instrument()})
+    return multipole_models(study, (reference,), workshop)[0]
+
+
+def multipole_models(
+    study: Study, references: Sequence[Reference], workshop: Workshop
+) -> list[MultipoleModel]:
+    """`multipole_model` of several references, solved for together."""
     main = study.array.multipole_order
-    model = response(bare, _observation(study, radius, max(*orders, main), reference.z_m), workshop)
-    harmonics = len(model.offset) // 2
-    index = np.array([main, *orders]) - 1
+    wanted, observations = [], []
+    for one in references:
+        orders = tuple(sorted(set(one.orders) - {main}))
+        if not orders:
+            raise StudyError(must_be("--orders", f"study {study.name}",
+                                     "those of unwanted multipoles", "the main one only"))
+        if study.dimension == 2 and one.z_m is not None:
+            raise StudyError(must_be("--at-z-m", f"study {study.name}", "left out, since it is 2D",
+                                     f"{one.z_m:g}"))
+        wanted.append((orders, _radius(study, one), one.z_m))
+        observations.append(_observation(study, wanted[-1][1], max(*orders, main), one.z_m))
+    bare = study.model_copy(update={"instrument": Instrument()})
+    model = response(bare, reduce(together, observations), workshop)
+    found, first = [], 0
+    for (orders, radius, z), observation in zip(wanted, observations, strict=True):
+        part = slice(first, first + len(observation))
+        first = part.stop
+        integrated = study.dimension == 3 and z is None
+        matrix = _complexes(model.matrix[part])
+        if integrated:
+            matrix[0] += beyond(study, _reach(study))
+        index = np.array([main, *orders]) - 1
+        turn = _turn(study, matrix[main - 1], model)
+        phases = np.exp(-1j * turn * (index + 1))
+        found.append(MultipoleModel(
+            orders, main, radius, z, integrated, phases[:, None] * matrix[index],
+            phases * _complexes(model.offset[part])[index], model.error[part][index],
+            model.nominal, -turn))
+    return found
 
-    def complexes(values: Floats) -> Complexes:
-        return values[harmonics + index] + 1j * values[index]
 
-    matrix, offset = complexes(model.matrix), complexes(model.offset)
-    if integrated:
-        matrix[index == 0] += beyond(study, _reach(study))
-    own = matrix[0] @ model.nominal
-    scale = np.abs(model.matrix[harmonics + main - 1]).sum() * np.abs(model.nominal).max()
+def circle_models(
+    study: Study, observation: Observation, model: Response
+) -> list[MultipoleModel]:
+    """Multipoles on the circles that a study reads, without another solve: all orders that the
+    readings tell, the main one too, in units of the main one on the circle of that radius that is
+    nearest to the middle; none if there are no full circles, or an instrument between.
+
+    They are Fourier coefficients of B_r at the study's own angles: of m angles, order n has what
+    there is of order m - n too. `multipole_models` takes as many angles as are needed.
+    """
+    main, found = study.array.multipole_order, []
+    circles = _read_circles(study, observation)
+    for radius in sorted({radius for radius, _, _ in circles}):
+        own = sorted((z, analysis) for one, z, analysis in circles if one == radius)
+        _, middle = min(own, key=lambda pair: abs(pair[0]))
+        orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
+        if main not in orders:
+            continue
+        reference, fixed = (_complexes(middle @ one)[main - 1:main]
+                            for one in (model.matrix, model.offset))
+        try:
+            turn = _turn(study, reference[0], model)
+        except StudyError:
+            continue
+        order = np.array([main, *orders])
+        phases = np.exp(-1j * turn * order)
+        for z, analysis in own:
+            matrix, offset = (_complexes(analysis @ one)[:len(orders)]
+                              for one in (model.matrix, model.offset))
+            found.append(MultipoleModel(
+                orders, main, radius, z if study.dimension == 3 else None, False,
+                phases[:, None] * np.vstack([reference, matrix]),
+                phases * np.concatenate([fixed, offset]),
+                _circle_error(analysis, model.error)[order - 1], model.nominal, -turn))
+    return found
+
+
+def solved_circles(
+    study: Study, points: Floats, flux_density: Floats, errors: Floats
+) -> list[tuple[MultipoleModel, Multipoles]]:
+    """Multipoles of a solved field B (n, 3) in T on the study's circles, with the solver's errors
+    (readings,) in T of the study's readings.
+    """
+    observed = study.observation
+    if observed.quantity == "flux_density":
+        errors = np.repeat(errors.reshape(len(points), -1)[:, 0], len(COMPONENTS))
+        observed = observed.model_copy(update={"components": COMPONENTS})
+    bare = study.model_copy(update={"instrument": Instrument(), "observation": observed})
+    observation = observe(bare, points, np.ones_like(points, bool))
+    readings = observation.apply(flux_density)
+    # one parameter, the strength of the whole magnet
+    whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
+    exact = Gaussian(np.ones(1), np.zeros((1, 1)))
+    return [(one, one.of(exact)) for one in circle_models(bare, observation, whole)]
+
+
+def _complexes(values: Floats) -> Complexes:
+    """C_n = B_n + i A_n of A_1 ... A_K, B_1 ... B_K."""
+    half = len(values) // 2
+    return values[half:] + 1j * values[:half]
+
+
+def _turn(study: Study, row: Complexes, model: Response) -> float:
+    """Angle of the nominal main multipole, whose row of the matrix is (parameters,)."""
+    own = row @ model.nominal
+    scale = np.abs(row).sum() * np.abs(model.nominal).max()
     if not abs(own) > NOTHING_THERE * scale:
         raise StudyError(must_be(
-            "`array`", f"study {study.name}", f"that of a magnet with a multipole of order {main}",
+            "`array`", f"study {study.name}",
+            f"that of a magnet with a multipole of order {study.array.multipole_order}",
             "one without", "Check multipole_order and its exceptions."))
-    turn = float(np.angle(own)) / main
-    phases = np.exp(-1j * turn * np.array([main, *orders]))
-    return MultipoleModel(
-        orders, main, radius, reference.z_m, integrated, phases[:, None] * matrix,
-        phases * offset, model.error[index], model.nominal, -turn)
+    return float(np.angle(own)) / study.array.multipole_order
+
+
+def _read_circles(
+    study: Study, observation: Observation
+) -> list[tuple[float, float, sparse.csr_array]]:
+    """Radius and z in m of each circle, and the matrix (2 K, readings) of A_1 ... B_K there."""
+    positions, labels = observation.positions, np.array(observation.labels)
+    settings, size = study.observation.positions, len(labels)
+    plain = (observation.operator.shape == observation.analysis.shape
+             and (observation.operator != observation.analysis).nnz == 0)
+    if not isinstance(settings, CirclePositions) or not plain:
+        return []
+    pick = sparse.eye_array(size, format="csr")
+    if study.observation.quantity == "fourier_coefficients":
+        rows = np.array([label[1:].isdigit() for label in observation.labels])
+        circles = dict.fromkeys((float(x), float(z)) for x, _, z in positions[rows])
+        return [(radius, z, pick[np.flatnonzero(
+            rows & (positions[:, 0] == radius) & (positions[:, 2] == z))]) for radius, z in circles]
+    x, y = (np.flatnonzero(labels == name) for name in ("Bx", "By"))
+    harmonics = min(len(DEFAULT_ORDERS), (settings.angles - 1) // 2)
+    if len(x) != len(y) or harmonics < 1 or (positions[x] != positions[y]).any():
+        return []
+    try:
+        analysis, _, where = fourier_analysis(positions[x], FourierCoefficients(
+            quantity="fourier_coefficients", harmonics=harmonics, positions=settings))
+    except MeasurementError:  # these are no full circles
+        return []
+    matrix = sparse.csr_array(analysis[:, 0::3] @ pick[x] + analysis[:, 1::3] @ pick[y])
+    return [(float(where[first, 0]), float(where[first, 2]), matrix[first:first + 2 * harmonics])
+            for first in range(0, len(where), 2 * harmonics)]
+
+
+def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
+    """Error bars (K,) of |C_n| on a circle: those of the coefficients, or by Parseval's theorem
+    the largest that errors of its points allow.
+    """
+    if np.all(np.diff(analysis.indptr) == 1):
+        return np.asarray(analysis @ errors)[:analysis.shape[0] // 2]
+    own = errors[np.unique(analysis.indices)]
+    return np.full(analysis.shape[0] // 2, np.sqrt(2 * np.mean(own**2)))
 
 
 def beyond(study: Study, reach: float) -> Complexes:

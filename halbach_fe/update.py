@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats, points_in_material
+from halbach_fe.blocks import Floats, blocks_of, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference import linear
@@ -348,8 +348,9 @@ def write_update(update: Update, folder: Path) -> None:
              ("prior_mean", update.prior.mean), ("prior_sd", update.prior.sd),
              ("posterior_mean", update.posterior.mean), ("posterior_sd", update.posterior.sd))},
         coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
-    magnetization["posterior_covariance"] = (("parameter", "parameter_2"),
-                                             update.posterior.covariance, {"units": "A2/m2"})
+    for name, one in (("prior", update.prior), ("posterior", update.posterior)):
+        magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
+                                               {"units": "A2/m2"})
     write_hdf5(magnetization, folder / "posterior.h5")
     x, y, z = update.observation.positions.T
     columns = {
@@ -369,6 +370,36 @@ def write_update(update: Update, folder: Path) -> None:
     write_text(folder / "prediction.csv", table.getvalue())
     text = json.dumps(summary(update), indent=1, allow_nan=False)
     write_text(folder / "summary.json", text + "\n")
+
+
+def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
+    """Prior and posterior of the magnetizations in A/m, by these names, from a posterior.h5.
+
+    Raises
+    ------
+    MeasurementError
+        If it is none, or not of this study's magnet.
+    """
+    nominal = np.concatenate([block.magnetization[:study.dimension] for block in blocks_of(study)])
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as data:
+            own = data["nominal"].values
+            found = {name: Gaussian(data[f"{name}_mean"].values, _root(
+                data[f"{name}_covariance"].values)) for name in ("prior", "posterior")}
+    except (OSError, KeyError, ValueError, RuntimeError):
+        raise MeasurementError(must_be(
+            "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
+            "none that can be read")) from None
+    if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
+        raise MeasurementError(must_be(
+            "--posterior", str(path), f"that of the magnet of study {study.name}",
+            "that of another nominal magnet", "Use the study that was inferred."))
+    return found
+
+
+def _root(covariance: Floats) -> Floats:
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
 
 
 def summary(update: Update) -> dict[str, object]:

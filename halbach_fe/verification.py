@@ -7,19 +7,25 @@ blocks add up, in units of the largest field there.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import DUAL, REFINEMENT, dual, farther, refined
 from halbach_fe.exact_field import field_of
+from halbach_fe.mesh import meridian_size
 from halbach_fe.observation import fourier_analysis, noise_regions, points_from
 from halbach_fe.routes import MESHES, choose_route, is_vacuum, solve_nominal
 from halbach_fe.solve import Workshop
 from halbach_fe.study import FourierCoefficients, Study
 
 HARMONICS = 8
+
+EXACT = "exact field"
+
+FLATTEST, STEEPEST = 0.5, 4.0
+"""Orders of convergence that are believed."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,13 @@ class Verification:
         estimated for the study's own mesh as the remaining series of refinements, plus what the
         boundary changes.
     main_field_T : float
+    element_size_m : float
+        Of the study's own mesh, at the magnet.
+    points : ndarray, shape (n, 3), in m
+    field : ndarray, shape (n, 3), in T
+        On the study's own mesh.
+    changes : ndarray, shape (differences, n), in T
+        |change of B| at every point.
     """
 
     route: str
@@ -68,6 +81,15 @@ class Verification:
     error_pointwise: float
     error_fourier: float | None
     main_field_T: float
+    element_size_m: float
+    points: Floats
+    field: Floats
+    changes: Floats
+
+    def plain(self) -> dict[str, object]:
+        """For scripts, without what is given by point."""
+        return {key: value for key, value in asdict(self).items()
+                if not isinstance(value, np.ndarray)}
 
 
 def verify(
@@ -89,16 +111,16 @@ def verify(
     fine = solve("a finer mesh", refined(study, REFINEMENT))
     far = solve("a farther boundary", farther(study, MESHES[route], REFINEMENT))
     compare = _Comparison(study, points, base)
-    steps = [compare("coarser mesh to the study's", coarse, base),
-             compare("the study's mesh to a finer", base, fine),
-             compare("boundary to a farther", base, far)]
+    pairs = {"coarser mesh to the study's": (coarse, base),
+             "the study's mesh to a finer": (base, fine), "boundary to a farther": (base, far)}
     if route in DUAL:
-        steps.append(compare(f"dual route, {DUAL[route]}", base,
-                             solve(f"the dual route, {DUAL[route]}", dual(study, route))))
-    order = observed_order(steps[0].pointwise, steps[1].pointwise)
+        pairs[f"dual route, {DUAL[route]}"] = (
+            base, solve(f"the dual route, {DUAL[route]}", dual(study, route)))
     if study.solver.method == "direct" and is_vacuum(study):
-        exact = field_of(blocks_of(study), points)
-        steps.append(compare("exact field", base, exact))
+        pairs[EXACT] = base, field_of(blocks_of(study), points)
+    steps = [compare(what, *pair) for what, pair in pairs.items()]
+    order = observed_order(steps[0].pointwise, steps[1].pointwise)
+    if EXACT in pairs:
         error, fourier = steps[-1].pointwise, steps[-1].fourier
     else:
         series = 1 / (1 - REFINEMENT**-order)
@@ -107,7 +129,11 @@ def verify(
                    else series * steps[1].fourier + steps[2].fourier)
     return Verification(
         route=route, differences=tuple(steps), order=order, error_pointwise=error,
-        error_fourier=fourier, main_field_T=compare.scale)
+        error_fourier=fourier, main_field_T=compare.scale,
+        element_size_m=(meridian_size(study) if route == "azimuthal_modes"
+                        else study.mesh.block_size_m),
+        points=points, field=base, changes=np.array(
+            [np.linalg.norm(one - other, axis=1) for one, other in pairs.values()]))
 
 
 def observed_order(first: float, second: float) -> float:
@@ -117,8 +143,8 @@ def observed_order(first: float, second: float) -> float:
     change) but finite; the upper one keeps a lucky pair from looking exact.
     """
     if first <= 0 or second <= 0:
-        return 4.0 if second <= 0 else 0.5
-    return float(np.clip(np.log(first / second) / np.log(REFINEMENT), 0.5, 4.0))
+        return STEEPEST if second <= 0 else FLATTEST
+    return float(np.clip(np.log(first / second) / np.log(REFINEMENT), FLATTEST, STEEPEST))
 
 
 class _Comparison:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.inference.linear import contraction
+from halbach_fe.multipoles import circle_models
+from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
 from halbach_fe.report.prediction import (
     Published,
@@ -54,9 +56,10 @@ def score_table(update: Update, published: Published | None = None) -> list[dict
 
 def write_report(
     update: Update, folder: Path, published: Published | None = None,
-    assumptions: Sequence[str] = (),
+    assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
 ) -> None:
-    """Write report.html, self-contained, and its figures as PNG into ``folder``.
+    """Write report.html, self-contained, and its figures as PNG into ``folder``; and
+    multipoles.csv, if the readings are of full circles.
 
     ``assumptions`` are sentences that the reader must know before the numbers.
     """
@@ -81,9 +84,15 @@ def write_report(
                             "much its variance shrinks from prior to posterior, 0 % nothing, "
                             "100 % all"),
     }
+    multipoles: list[Table] = [
+        (model, {"prior": model.of(update.prior), "posterior": model.of(update.posterior)})
+        for model in circle_models(update.study, update.observation, update.response)]
+    if multipoles:
+        table_csv(update.study, multipoles, folder / "multipoles.csv")
     array = update.study.array
     write_page(
-        folder / "report.html", "inference.html.j2", save(figures, folder), update=update,
+        folder / "report.html", "inference.html.j2", save(figures, folder), study=update.study,
+        provenance=provenance, update=update, multipoles=middle_table(multipoles),
         rows=score_table(update, published), assumptions=assumptions, array=array,
         remanence=blocks_of(update.study)[0].remanence, conflict=_conflict(update),
         view=of_update(update))

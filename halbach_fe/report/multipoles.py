@@ -1,14 +1,27 @@
-"""What pages of multipoles share: their figure, and what they are of."""
+"""Tables, figures and page of multipoles, and what other pages of multipoles share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.multipoles import MultipoleModel, Multipoles
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND
+from halbach_fe.field_map import atomic, write_csv
+from halbach_fe.multipoles import MultipoleModel, Multipoles, met, plain, text_table
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, save, write_page
+from halbach_fe.study import Study
+from halbach_fe.update import write_text
+
+Table = tuple[MultipoleModel, Mapping[str, Multipoles]]
+"""Where, and of which magnets by name."""
+
+CONVENTION = "B_y + i B_x = sum (B_n + i A_n) ((x + i y) / R)^(n - 1); n = 1 is the dipole"
+
+DRAWS = 10_000
+"""Of multipoles, for the probability to be within a limit: to 0.5 % at worst."""
 
 COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
@@ -30,8 +43,8 @@ def reference_text(model: MultipoleModel) -> str:
              else f"at z = {model.z:g} m (Fourier coefficients of B_r)" if model.z is not None
              else "of the cross-section")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
-            f"of 1e-4 of the main one (order {model.main}); b normal, a skew, along axes in which "
-            "the nominal main multipole is normal.")
+            f"of 1e-4 of the main one (order {model.main}; European convention, order 1 is the "
+            "dipole); b normal, a skew, along axes in which the nominal main multipole is normal.")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
@@ -55,3 +68,91 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
     axes[0].set_ylabel("units of 1e-4")
     axes[1].legend(fontsize="small")
     return figure
+
+
+def table_csv(study: Study, tables: Sequence[Table], path: Path) -> None:
+    """Write one row per magnet, place and order."""
+    rows = [{"magnet": name, "where": _where(model), "radius_m": model.radius,
+             "z_m": np.nan if model.z is None else model.z, "n": row["n"], "b_units": row["b"],
+             "b_sd_units": row["b_sd"], "a_units": row["a"], "a_sd_units": row["a_sd"],
+             "main": known.main, "main_sd": known.main_sd, "main_unit": model.unit}
+            for model, magnets in tables for name, known in magnets.items()
+            for row in known.table()]
+    radii = dict.fromkeys(model.radius for model, _ in tables)
+    with atomic(path) as temporary:
+        write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
+            "study": study.name, "convention": CONVENTION,
+            "reference_radius_m": ", ".join(f"{one:g}" for one in radii),
+            "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
+            "which the nominal one is normal",
+            "axes_turned_by_rad": ", ".join(dict.fromkeys(
+                f"{model.turn:.9g}" for model, _ in tables))}, temporary)
+
+
+def _where(model: MultipoleModel) -> str:
+    return "integrated" if model.integrated else "cross-section" if model.z is None else "local"
+
+
+def middle_table(tables: Sequence[Table]) -> dict[str, object]:
+    """For a page: the table of the circle nearest to the magnet's middle, of the largest radius;
+    nothing if there is none.
+    """
+    if not tables:
+        return {}
+    model, magnets = min(tables, key=lambda one: (abs(one[0].z or 0.0), -one[0].radius))
+    mains = "; ".join(f"{name} {known.main:.6g}" + (
+        f" ± {known.main_sd:.2g}" if known.main_sd else "") + f" {model.unit}"
+        for name, known in magnets.items())
+    return {"reference": reference_text(model), "mains": mains, "rows": text_table(**magnets),
+            "circles": len(tables)}
+
+
+def multipoles_summary(
+    study: Study, tables: Sequence[Table], limit: float | None
+) -> dict[str, object]:
+    """What a script wants to know."""
+    return {"study": study.name, "tables": [
+        {"reference": reference_summary(model, limit),
+         **{name: plain(known, model.unit) | ({} if limit is None else {
+             "probability_within_limit": _within(known, limit)})
+            for name, known in magnets.items()}} for model, magnets in tables]}
+
+
+def _within(known: Multipoles, limit: float) -> float:
+    normals = np.random.default_rng(1).standard_normal((DRAWS, 2 * len(known.orders)))
+    return met(known.sizes_of(normals), limit)
+
+
+def verdict(table: Table, limit: float | None) -> str:
+    """The last magnet's multipoles in words."""
+    model, magnets = table
+    name, known = list(magnets.items())[-1]
+    worst = int(np.argmax(known.sizes))
+    text = (f"By the {name} the main multipole is {known.main:.6g} ± {known.main_sd:.2g} "
+            f"{model.unit}; the largest unwanted one is that of order {known.orders[worst]}, "
+            f"{known.sizes[worst]:.3g} units.")
+    if limit is not None:
+        text += (f" All are within {limit:g} units with a probability of "
+                 f"{100 * _within(known, limit):.3g} %.")
+    return text
+
+
+def write_multipoles(
+    study: Study, tables: Sequence[Table], limit: float | None, folder: Path,
+    provenance: Mapping[str, str],
+) -> None:
+    """Write multipoles.csv, multipoles.json, multipoles.html and its figures."""
+    table_csv(study, tables, folder / "multipoles.csv")
+    summary = multipoles_summary(study, tables, limit)
+    write_text(folder / "multipoles.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    pictures = save({
+        f"multipoles_{_where(model)}.png": (
+            multipole_figure(magnets, limit), "Unwanted multipoles, normal on the left and skew on "
+            "the right; bars are two standard deviations")
+        for model, magnets in tables}, folder)
+    write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
+               provenance=provenance, parts=[
+                   {"title": _where(model), "verdict": verdict((model, magnets), limit),
+                    "reference": reference_text(model), "rows": text_table(**magnets),
+                    "picture": picture}
+                   for (model, magnets), picture in zip(tables, pictures, strict=True)])

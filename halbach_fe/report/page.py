@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import base64
 import io
+import platform
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
 import jinja2
 import numpy as np
+import tomlkit
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 
-from halbach_fe.blocks import blocks_of
+from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.field_map import atomic
 from halbach_fe.study import Study
 from halbach_fe.update import write_text
@@ -23,6 +25,8 @@ from halbach_fe.update import write_text
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 SECOND = "#009E73"
 IRON = "#56B4E9"
+
+PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 
 Picture = tuple[str, str]
 """A PNG in base64, and what it shows."""
@@ -40,13 +44,23 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
     return pictures
 
 
-def write_page(path: Path, template: str, pictures: Sequence[Picture], **data: object) -> None:
-    """Write a self-contained page from a template of this folder."""
+def write_page(
+    path: Path, template: str, pictures: Sequence[Picture], study: Study | None = None,
+    provenance: Mapping[str, str] | None = None, **data: object,
+) -> None:
+    """Write a self-contained page from a template of this folder.
+
+    It ends in its provenance: words by key, the programs' versions, and the study as it was read.
+    """
+    versions = [f"{name} {metadata.version(name)}" for name in PROGRAMS]
+    text = None if study is None else tomlkit.dumps(
+        study.model_dump(mode="json", exclude_unset=True, exclude_none=True))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     write_text(path, environment.get_template(template).render(
-        pictures=pictures, version=metadata.version("halbach-fe"), **data))
+        pictures=pictures, study=study, study_text=text, provenance={**(provenance or {}),
+            "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
 
 
 def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
@@ -57,6 +71,16 @@ def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure
     for axis in axes[:, 0]:
         axis.grid(alpha=0.3)
     return figure, list(axes[:, 0])
+
+
+def places(points: Floats) -> tuple[Floats, str]:
+    """Where points (n, 3) in m stand along the x axis of a figure, and what that is."""
+    x, y, z = points.T
+    if np.ptp(z) > 0:
+        return 1e3 * z, "z in mm"
+    if np.hypot(x, y).min() > 0:
+        return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
+    return np.arange(1.0, len(points) + 1), "number of the point"
 
 
 def draw_magnet(axis: Axes, study: Study) -> None:
@@ -73,3 +97,33 @@ def draw_magnet(axis: Axes, study: Study) -> None:
     if study.iron_ring is not None:
         for radius in (study.iron_ring.inner_radius_m, study.iron_ring.outer_radius_m):
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
+
+
+def geometry(study: Study, points: Floats, others: Floats | None = None) -> Figure:
+    """A ring with its magnetization, and where points (n, 3) in m are; beside it, if they are not
+    in one plane, by z and distance from the axis. ``others`` are held out.
+    """
+    flat = np.ptp(points[:, 2]) == 0
+    figure = Figure(figsize=(5.5, 5.8) if flat else (10, 5.4), layout="constrained")
+    left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
+    draw_magnet(left, study)
+    left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
+    for axis in right:
+        axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
+        axis.grid(alpha=0.3)
+        low, high = 1e3 * study.array.inner_radius_m, 1e3 * study.array.outer_radius_m
+        for block in blocks_of(study)[::study.array.blocks_per_ring]:
+            axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
+                                     high - low, fill=False, color="#777777", lw=0.6))
+        axis.set_ylim(0, None)
+    for one, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
+                                      (others, "x", PRIOR, "held out")):
+        if one is None:
+            continue
+        x, y, z = 1e3 * one.T
+        left.plot(x, y, marker, ms=3, color=colour, label=name)
+        for axis in right:
+            axis.plot(z, np.hypot(x, y), marker, ms=3, color=colour)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2,
+                  markerscale=3)
+    return figure

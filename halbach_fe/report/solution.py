@@ -10,23 +10,24 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.observation import Observation, circles, fourier_analysis
+from halbach_fe.multipoles import solved_circles
+from halbach_fe.observation import Observation
+from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
     SECOND,
     axes_along,
-    draw_magnet,
+    geometry,
+    places,
     save,
     write_page,
 )
-from halbach_fe.report.view import of_nominal
-from halbach_fe.study import COMPONENTS, CirclePositions, FourierCoefficients, Study
+from halbach_fe.report.view import field_points, of_nominal
+from halbach_fe.study import COMPONENTS, Study
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
-MOST_ORDERS = 10
-UNITS = 1e4
 
 
 @dataclass(frozen=True)
@@ -54,84 +55,43 @@ class Solution:
 
 
 def write_report(solution: Solution, folder: Path) -> None:
-    """Write report.html, self-contained, and its figures as PNG into ``folder``."""
+    """Write report.html, self-contained, and its figures as PNG into ``folder``; and
+    multipoles.csv, if the positions are full circles.
+    """
     figures = {
-        "geometry.png": (_geometry(solution.study), "The blocks of a ring with their "
-                         "magnetization, the iron if there is any, and the circles of the study "
-                         "(dotted)"),
+        "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with "
+                         "their magnetization, the iron if there is any, and the study's "
+                         "positions"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
-    multipoles, circle = multipole_rows(solution)
+    multipoles: list[Table] = [
+        (model, {"nominal": known}) for model, known in solved_circles(
+            solution.study, solution.points, solution.flux_density, solution.errors)]
+    if multipoles:
+        table_csv(solution.study, multipoles, folder / "multipoles.csv")
     write_page(
         folder / "report.html", "solution.html.j2", save(figures, folder), study=solution.study,
         array=solution.study.array, remanence=blocks_of(solution.study)[0].remanence,
-        multipoles=multipoles, circle=circle, provenance=solution.provenance,
+        multipoles=middle_table(multipoles), provenance=solution.provenance,
         strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
         error=float(solution.errors.max()),
-        view=of_nominal(solution.study, solution.points, solution.flux_density))
-
-
-def multipole_rows(solution: Solution) -> tuple[list[dict[str, str]], str]:
-    """Multipoles on the circle that is nearest to the middle, of the largest radius, as text, and
-    which one that is; nothing if there are no circles.
-    """
-    positions = solution.study.observation.positions
-    if not isinstance(positions, CirclePositions):
-        return [], ""
-    orders = min(MOST_ORDERS, (positions.angles - 1) // 2)
-    if orders < 1:
-        return [], ""
-    settings = FourierCoefficients(quantity="fourier_coefficients", harmonics=orders,
-                                   positions=positions)
-    radius, index = min(circles(solution.points, settings), key=lambda one: (
-        abs(solution.points[one[1][0], 2]), -one[0]))
-    matrix, _, _ = fourier_analysis(solution.points[index], settings.model_copy(
-        update={"positions": positions.model_copy(update={"radius_m": (radius,), "count": 1})}))
-    skew, normal = (matrix @ solution.flux_density[index].ravel()).reshape(2, orders)
-    main = int(np.argmax(np.hypot(skew, normal)))
-    scale = UNITS / np.hypot(skew[main], normal[main])
-    return [{"n": str(order + 1), "B_n in T": f"{normal[order]:+.6f}",
-             "A_n in T": f"{skew[order]:+.6f}", "b_n in units": f"{scale * normal[order]:+.2f}",
-             "a_n in units": f"{scale * skew[order]:+.2f}"}
-            for order in range(orders)], (
-                f"r = {1e3 * radius:g} mm, z = {1e3 * solution.points[index[0], 2]:g} mm")
-
-
-def _geometry(study: Study) -> Figure:
-    figure = Figure(figsize=(5.5, 5.5), layout="constrained")
-    axis = figure.subplots()
-    draw_magnet(axis, study)
-    positions = study.observation.positions
-    if isinstance(positions, CirclePositions):
-        angle = np.linspace(0, 2 * np.pi, 181)
-        for radius in positions.radius_m:
-            axis.plot(1e3 * radius * np.cos(angle), 1e3 * radius * np.sin(angle), ":",
-                      color=MEASURED, lw=1)
-    axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
-    return figure
+        view=of_nominal(solution.study, field_points(solution.points, solution.flux_density)))
 
 
 def _field(solution: Solution) -> Figure:
     """Components along z, or around the circle, or by number of the point; errors below."""
-    place, label = _places(solution.points)
-    seen, _ = _places(solution.observation.positions)
+    place, label = places(solution.points)
+    seen, _ = places(solution.observation.positions)
     figure, (top, bottom) = axes_along(2, [2, 1])
     order = np.argsort(place, kind="stable")
     for component, colour, column in zip(COMPONENTS, COLOURS, solution.flux_density.T, strict=True):
         top.plot(place[order], column[order], ".", ms=3, color=colour, label=f"B{component}")
     top.set_ylabel("B in T")
     top.legend(ncols=3)
-    bottom.semilogy(seen, solution.errors, ".", ms=3, color=MEASURED)
+    bottom.plot(seen, solution.errors, ".", ms=3, color=MEASURED)
+    if solution.errors.any():  # blocks in vacuum have none
+        bottom.set_yscale("log")
     bottom.set_ylabel("error bar in T")
     bottom.set_xlabel(label)
     return figure
 
-
-def _places(points: Floats) -> tuple[Floats, str]:
-    """Where points (n, 3) in m stand in the figure, and what that is."""
-    x, y, z = points.T
-    if np.ptp(z) > 0:
-        return 1e3 * z, "z in mm"
-    if np.hypot(x, y).min() > 0:
-        return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
-    return np.arange(1.0, len(points) + 1), "number of the point"

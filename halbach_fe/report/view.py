@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import plotly.graph_objects as go
@@ -111,11 +111,13 @@ def field_points(positions: Floats, flux_density: Floats) -> Points:
                   (float(size.min()), float(size.max())))
 
 
-def of_nominal(study: Study, positions: Floats, flux_density: Floats) -> Markup:
-    """The view of a nominal magnet and its field B (n, 3) in T at positions (n, 3) in m."""
+def of_nominal(study: Study, points: Points) -> Markup:
+    """The view of a nominal magnet, and points of a map."""
     known = Known(np.array([block.magnetization[:study.dimension] for block in blocks_of(study)]))
-    few = np.linspace(0, len(positions) - 1, min(len(positions), MOST_POINTS)).astype(int)
-    return magnet_view(study, known, field_points(positions[few], flux_density[few]))
+    count = len(points.positions)
+    few = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    return magnet_view(study, known, replace(
+        points, positions=points.positions[few], values=points.values[few]))
 
 
 def of_update(update: Update) -> Markup:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.observation import fourier_analysis, observe, points_from, reading_noise
 from halbach_fe.study import MU_0, parse_study, read_study
 from tests.conftest import DIPOLE, changed
+from tests.pages import page
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -116,7 +118,7 @@ def test_inference_finds_the_truth(campaigns, tmp_path, capsys):
 
 def test_the_truth_is_sealed(campaigns):
     """Maps name the hash of the truth; the truth has all that was drawn."""
-    _, folder, other = campaigns
+    study, folder, other = campaigns
     text = (folder / "truth" / "truth.json").read_bytes()
     for name in ("map.csv", "held-out.csv"):
         assert read_map(folder / name).attrs["truth_sha256"] == hashlib.sha256(text).hexdigest()
@@ -126,6 +128,19 @@ def test_the_truth_is_sealed(campaigns):
     assert truth["model"].keys() == {"vacuum", "reaction"}
     for name in ("map.csv", "blocks.csv"):  # nothing of it is in the open
         assert "seed" not in (folder / name).read_text()
+    text = page(folder / "campaign.html")
+    for name in ("map.csv", "held-out.csv", "blocks.csv", "truth/truth.json"):
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() in text
+    largest = np.nanmax(np.abs(read_map(folder / "map.csv")["B_T"].values))
+    assert f"<td>{largest:.5g}</td>" in text
+    # blocks are shown as they were ordered, not as they were drawn
+    shown = set(re.findall(r"M = \(([^)]*)\)", text.rpartition("<h2>Pictures")[0]))
+    assert shown == _words(block.magnetization[:2] for block in blocks_of(read_study(study)))
+    assert not shown & _words(block["magnetization_A_per_m"][:2] for block in truth["blocks"])
+
+
+def _words(magnetizations):
+    return {", ".join(f"{1e-3 * one:.1f}" for one in each) for each in magnetizations}
 
 
 def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
@@ -133,11 +148,13 @@ def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
     assert main(["simulate-measurement", str(study), "-o", str(tmp_path), "--seed", "5",
                  "--json"]) == 0
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    assert [str(path) for path in files] == ["blocks.csv", "held-out.csv", "map.csv",
-                                             "truth/truth.json"]
+    assert [str(path) for path in files] == [
+        "blocks.csv", "campaign.html", "campaign_field.png", "campaign_geometry.png",
+        "held-out.csv", "map.csv", "truth/truth.json"]
     for path in files:
         assert (tmp_path / path).read_bytes() == (folder / path).read_bytes()
-        assert (tmp_path / path).read_bytes() != (other / path).read_bytes()
+        assert path.name == "campaign_geometry.png" or (
+            tmp_path / path).read_bytes() != (other / path).read_bytes()
 
 
 def test_refusals_on_the_command_line(campaigns, tmp_path, capsys):

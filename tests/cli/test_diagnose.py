@@ -168,7 +168,7 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
         "small: what the model lacks", "Where model and map disagree", "What is missing",
         "How sure that is", "What else it could be", "What changed",
         "Structure in the magnetizations", "The magnet", "What to measure next",
-        "The study with what was missing"]
+        "The study with what was missing", "Provenance"]
     assert len(page.pictures) == 5
     assert all(kind == "data:image/png;base64" and picture.startswith(b"\x89PNG") and text
                for kind, picture, text in page.pictures)

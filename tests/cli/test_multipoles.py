@@ -1,15 +1,19 @@
-"""tolerance, sort and shim on the command line: files, figures, messages."""
+"""multipoles, tolerance, sort and shim on the command line: files, figures, messages."""
 
 from __future__ import annotations
 
 import json
-from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common, main
+from halbach_fe.field_map import read_map
+from halbach_fe.multipoles import UNITS
 from halbach_fe.study import read_study
+from halbach_fe.update import read_posterior
+from tests.pages import page
 
 STUDY = """
 name = "cubes"  # as ordered
@@ -53,37 +57,116 @@ def made(tmp_path_factory):
     return study, folder
 
 
-class _Pictures(HTMLParser):
-    """Pictures of a page, and what it loads from elsewhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.texts, self.loaded = [], []
-
-    def handle_starttag(self, tag, attrs):
-        found = dict(attrs)
-        if tag == "img":
-            self.texts.append(found.get("alt", ""))
-            if not found["src"].startswith("data:"):
-                self.loaded.append(found["src"])
-        if tag in ("script", "link"):
-            self.loaded.append(tag)
-
-
-def page(path):
-    parser = _Pictures()
-    parser.feed(path.read_text())
-    assert parser.texts
-    assert all(len(text) > 20 for text in parser.texts)
-    assert not parser.loaded
-    return path.read_text()
-
-
 def run(capsys, *arguments, code=0):
     capsys.readouterr()
     assert main([str(one) for one in arguments]) == code
     shown = capsys.readouterr()
     return shown.err if code else json.loads(shown.out)
+
+
+def rows_of(path, magnet):
+    """Columns of a magnet in multipoles.csv, by name."""
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    table = np.genfromtxt(lines, delimiter=",", names=True, dtype=None, encoding=None)
+    return table[table["magnet"] == magnet]
+
+
+def read_from(path):
+    """Multipoles of a map on one circle, as it was read: orders 1 to 5, C_n exp(-i n turn)."""
+    data = read_map(path)
+    angle = np.arctan2(data["y_m"].values, data["x_m"].values)
+    field = data["B_T"].values[:, 1] + 1j * data["B_T"].values[:, 0]
+    return np.array([np.mean(field * np.exp(-1j * (n - 1) * angle)) for n in range(1, 6)])
+
+
+def test_multipoles_of_the_measured_magnet(made, tmp_path, capsys):
+    """The map is by magpylib and NGSolve; what is read from it directly differs by its noise,
+    2e-5 T sqrt(2 / 32) in each part of C_n, from what the posterior says.
+    """
+    study, folder = made
+    run(capsys, "infer", study, "--measurements", folder / "map.csv", "-o", tmp_path, "--json")
+    found = run(capsys, "multipoles", study, "--posterior", tmp_path / "posterior.h5", "-o",
+                tmp_path / "out", *TARGET, "--limit-units", 500, "--json")
+    (table,) = found["tables"]
+    assert table["reference"]["radius_m"] == 0.07
+    assert table["posterior"]["probability_within_limit"] == 1.0
+    assert table["prior"]["probability_within_limit"] > 0.9
+    text = (tmp_path / "out" / "multipoles.csv").read_text()
+    assert "# reference_radius_m: 0.07\n" in text
+    assert "n = 1 is the dipole" in text
+    own = rows_of(tmp_path / "out" / "multipoles.csv", "posterior")
+    for row, stored in zip(own, table["posterior"]["multipoles"], strict=True):
+        for column, key in (("n", "n"), ("b_units", "b"), ("b_sd_units", "b_sd"),
+                            ("a_units", "a"), ("a_sd_units", "a_sd")):
+            assert row[column] == stored[key]
+    assert list(own["main"]) == [table["posterior"]["main_T"]] * 4
+    shown = page(tmp_path / "out" / "multipoles.html")
+    assert all(f"{row['b_units']:+.2f} ± {row['b_sd_units']:.2f}" in shown for row in own)
+
+    turn = -table["reference"]["axes_turned_by_rad"]
+    coefficients = read_from(folder / "map.csv") * np.exp(-1j * turn * np.arange(1, 6))
+    truth = UNITS * coefficients[1:] / abs(coefficients[0])
+    noise = UNITS * 2e-5 * np.sqrt(2 / 32) / abs(coefficients[0])
+    assert own["main"][0] == pytest.approx(abs(coefficients[0]), abs=4e-5)
+
+    def scores(rows):
+        return np.concatenate([
+            (rows["b_units"] - truth.real) / np.hypot(rows["b_sd_units"], noise),
+            (rows["a_units"] - truth.imag) / np.hypot(rows["a_sd_units"], noise)])
+
+    assert np.abs(scores(own)).max() < 4
+    assert np.abs(truth).max() > 10
+    # negative controls: skew for normal, and the prior's mean with the posterior's error bars
+    swapped, early = own.copy(), own.copy()
+    swapped["b_units"], swapped["a_units"] = own["a_units"], own["b_units"]
+    prior = rows_of(tmp_path / "out" / "multipoles.csv", "prior")
+    early["b_units"], early["a_units"] = prior["b_units"], prior["a_units"]
+    assert min(np.abs(scores(swapped)).max(), np.abs(scores(early)).max()) > 10
+    assert np.abs(scores(prior)).max() < 4
+
+    # infer has the same from its own readings, orders 1 to 10, by as many points as the map has
+    directly = rows_of(tmp_path / "multipoles.csv", "posterior")
+    assert list(directly["n"]) == list(range(1, 11))
+    np.testing.assert_allclose(directly["b_units"][1:5], own["b_units"], atol=0.5)
+    assert "Multipoles" in page(tmp_path / "report.html")
+    # standard deviations are those of the stored covariance, and the wrong magnet is refused
+    stored = read_posterior(read_study(study), tmp_path / "posterior.h5")
+    assert stored["posterior"].sd.max() < stored["prior"].sd.min()
+    other = tmp_path / "other.toml"
+    other.write_text(STUDY.replace("1.3", "1.31"))
+    error = run(capsys, "multipoles", other, "--posterior", tmp_path / "posterior.h5", "-o",
+                tmp_path / "x", code=4)
+    assert "another nominal magnet" in error
+    error = run(capsys, "multipoles", study, "--posterior", folder / "map.csv", "-o",
+                tmp_path / "x", code=4)
+    assert "posterior.h5" in error
+
+
+def test_multipoles_of_the_nominal_magnet(made, tmp_path, capsys):
+    """solve's own field on the study's circle, with the solver's error: none in vacuum."""
+    study, _ = made
+    run(capsys, "solve", study, "-o", tmp_path, "--json")
+    table = rows_of(tmp_path / "multipoles.csv", "nominal")
+    assert table["b_units"][0] == pytest.approx(UNITS)
+    data = read_map(tmp_path / "field_map.csv")
+    angle = np.arctan2(data["y_m"].values, data["x_m"].values)
+    radial = data["B_T"].values[:, 0] * np.cos(angle) + data["B_T"].values[:, 1] * np.sin(angle)
+    coefficients = np.array([2 * np.mean(radial * (np.sin(n * angle) + 1j * np.cos(n * angle)))
+                             for n in range(1, 6)])
+    assert table["main"][0] == pytest.approx(abs(coefficients[0]), rel=1e-9)
+    sizes = np.hypot(table["b_units"], table["a_units"])[:5]
+    np.testing.assert_allclose(sizes, UNITS * np.abs(coefficients) / abs(coefficients[0]),
+                               atol=1e-6)
+    assert (table["b_sd_units"] == 0).all()
+    assert "multipoles.csv" in page(tmp_path / "report.html")
+    permeable = tmp_path / "permeable.toml"
+    permeable.write_text(STUDY.replace("remanence", "recoil_permeability = 1.05\nremanence"))
+    run(capsys, "solve", permeable, "-o", tmp_path / "permeable", "--json")
+    error = rows_of(tmp_path / "permeable" / "multipoles.csv", "nominal")["b_sd_units"]
+    assert ((error > 0) & (error < 10)).all()
+    # without a posterior the study's prior is taken
+    found = run(capsys, "multipoles", study, "-o", tmp_path / "prior", *TARGET, "--json")
+    assert set(found["tables"][0]) == {"reference", "prior"}
 
 
 def test_shim(made, tmp_path, capsys):

@@ -10,7 +10,16 @@ import pytest
 from halbach_fe.campaign.bodies import magnet_of
 from halbach_fe.campaign.vacuum import vacuum_field
 from halbach_fe.inference.prior import Gaussian
-from halbach_fe.multipoles import UNITS, Reference, met, multipole_model
+from halbach_fe.multipoles import (
+    UNITS,
+    Reference,
+    circle_models,
+    met,
+    multipole_model,
+    multipole_models,
+)
+from halbach_fe.observation import observe, points_from
+from halbach_fe.response import response
 from halbach_fe.study import parse_study
 from tests.conftest import DIPOLE, changed
 
@@ -155,3 +164,72 @@ def test_permeability_and_its_error(workshop):
     known = model.of(Gaussian(model.nominal, np.zeros((32, 1))))
     assert np.abs(known.mean).max() < 3 * known.sd.max()
     assert known.sd.max() < 1
+
+
+RINGS = {"dimension": 3, "array__ring_length_m": 0.08, "array__rings": 2}
+CIRCLES = {"kind": "circles", "radius_m": 0.06, "angles": 40, "z_min_m": -0.05, "z_max_m": 0.1,
+           "count": 4}
+
+
+def circles_of(study, workshop, measured=None):
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool) if measured is None
+                          else measured)
+    return circle_models(study, observation, response(study, observation, workshop))
+
+
+@pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
+def test_circles_that_are_read(workshop, generator, quantity):
+    """Without permeability both fields are exact; each circle is in units of the one at z = 0."""
+    observed = {"quantity": quantity, "positions": CIRCLES}
+    if quantity == "fourier_coefficients":
+        observed["harmonics"] = 6
+    study = study_of(**RINGS, observation=observed)
+    models = circles_of(study, workshop)
+    assert [model.z for model in models] == pytest.approx([-0.05, 0, 0.05, 0.1])
+    bodies, magnetizations = deviating(study, generator)
+    angle = 2 * np.pi * np.arange(40) / 40
+    exact = Gaussian(magnetizations, np.zeros((len(magnetizations), 1)))
+
+    def analysed(field, order):  # B_r, as a study's coefficients are
+        radial = field[:, 0] * np.cos(angle) + field[:, 1] * np.sin(angle)
+        return 2 * np.mean(radial * (np.sin(order * angle) + 1j * np.cos(order * angle)))
+
+    turn = -models[0].turn
+    fields = [vacuum_field(bodies, np.column_stack(
+        [0.06 * np.cos(angle), 0.06 * np.sin(angle), 0 * angle + model.z])) for model in models]
+    main = abs(analysed(fields[1], 1))
+    for model, field in zip(models, fields, strict=True):
+        truth = np.array([analysed(field, n) * np.exp(-1j * turn * n) for n in model.orders])
+        known = model.of(exact)
+        assert known.main == pytest.approx(main, rel=1e-8)
+        b, a = known.mean.reshape(2, -1)
+        np.testing.assert_allclose(b + 1j * a, UNITS * truth / main, atol=1e-4)
+    assert models[3].of(exact).mean[0] < 0.8 * UNITS  # the ends are weaker
+
+
+def test_circles_that_are_none(workshop):
+    """Nothing is said of a line, of half a circle, of one component, or through a probe's gain."""
+    study = study_of()
+    count = len(points_from(study.observation.positions))
+    assert circles_of(study, workshop)
+    measured = np.ones((count, 3), bool)
+    measured[::3] = False
+    assert circles_of(study, workshop, measured) == []
+    for changes in ({"observation__components": ["x"]}, {"instrument": {"gain": [0.1, 0, 0]}},
+                    {"observation__positions": {"kind": "line", "start_m": [0, 0, 0],
+                                                "end_m": [0.05, 0, 0], "count": 3}}):
+        assert circles_of(study_of(**changes), workshop) == []
+
+
+def test_references_solved_together(workshop):
+    """Are the same as one by one."""
+    study = study_of(**RINGS)
+    wanted = Reference(0.05, (2, 3)), Reference(0.05, (2, 4), 0.02)
+    together = multipole_models(study, wanted, workshop)
+    for one, reference in zip(together, wanted, strict=True):
+        alone = multipole_model(study, reference, workshop)
+        np.testing.assert_allclose(one.matrix, alone.matrix, rtol=1e-12, atol=1e-20)
+        assert (one.orders, one.z, one.integrated) == (alone.orders, alone.z, alone.integrated)
+    assert together[0].integrated
+    assert not together[1].integrated

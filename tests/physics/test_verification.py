@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import pytest
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
 from halbach_fe.cli import main
 from halbach_fe.observation import points_from
+from halbach_fe.report.verification import verdict, write_verification
 from halbach_fe.routes import solve_nominal
 from halbach_fe.verification import observed_order, refined, verify
+from tests.pages import page
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
 
@@ -74,9 +77,35 @@ def test_observed_order():
 
 def test_verify_from_the_command_line(tmp_path, capsys):
     from tests.cli.test_cli import STUDY
-    path = tmp_path / "study.toml"
+    path, out = tmp_path / "study.toml", tmp_path / "out"
     path.write_text(STUDY)
-    assert main(["verify", str(path), "-o", str(tmp_path / "out")]) == 0
-    assert "estimated error" in capsys.readouterr().out
-    stored = json.loads((tmp_path / "out" / "verification.json").read_text())
+    assert main(["verify", str(path), "-o", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "estimated error" in shown.out
+    stored = json.loads((out / "verification.json").read_text())
     assert 0 < stored["error_pointwise"] < 0.1
+    text = page(out / "verification.html")
+    error, main_field = stored["error_pointwise"], stored["main_field_T"]
+    assert f"{error * main_field:.1e} T at most, {error:.1e} of the largest field" in text
+    assert f"{error * main_field / 1e-4:.2g} of the smallest noise" in text
+    assert f"{error * main_field:.1e} T at most" in shown.err
+    # the largest change of each column is the table's
+    table = np.genfromtxt(out / "verification.csv", delimiter=",", skip_header=2)
+    assert len(table) == 10
+    for one, column in zip(stored["differences"], table[:, 3:].T, strict=True):
+        assert column.max() / main_field == pytest.approx(one["pointwise"])
+        assert f"<td>{one['pointwise']:.1e}</td>" in text
+
+
+def test_a_field_without_finite_elements(dipole, workshop, tmp_path):
+    """In vacuum the reaction is nothing: no figure of convergence, and a verdict that says so."""
+    study = dipole(array__recoil_permeability=1.0)
+    found = verify(study, workshop)
+    assert "exact one of the blocks" in verdict(study, found)
+    write_verification(study, found, tmp_path, {})
+    page(tmp_path / "verification.html")
+    assert not (tmp_path / "verification_convergence.png").exists()
+    # negative control: a mesh whose refinement does not help is warned of
+    stuck = replace(found, order=0.5, error_pointwise=0.01)
+    write_verification(study, stuck, tmp_path, {})
+    assert "the mesh should be finer" in page(tmp_path / "verification.html")

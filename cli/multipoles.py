@@ -1,0 +1,57 @@
+"""Compute the multipoles of a magnet, with their standard deviations.
+
+Of the magnet that was measured, from the posterior that `halbach-fe infer` found; without one, what
+the study's prior tells. In 3D of the field integrated along z, and of the circle at --at-z-m, which
+is otherwise in the middle. Writes multipoles.csv, multipoles.json, multipoles.html and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from halbach_fe.cli import common
+from halbach_fe.multipoles import multipole_models, text_table
+from halbach_fe.study import read_study
+from halbach_fe.tolerance import assembled_prior
+from halbach_fe.update import read_posterior
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--posterior", type=Path, metavar="H5",
+                        help="posterior.h5 that halbach-fe infer wrote for this study")
+    common.add_multipole_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve, write everything, print the tables."""
+    from halbach_fe.report.multipoles import (  # matplotlib loads when needed
+        multipoles_summary,
+        write_multipoles,
+    )
+
+    study, wanted = read_study(arguments.study), common.reference(arguments)
+    known = read_posterior(study, arguments.posterior) if arguments.posterior else None
+    references = [wanted]
+    if study.dimension == 3:
+        references = [replace(wanted, z_m=None), replace(wanted, z_m=wanted.z_m or 0.0)]
+    with common.workshop(arguments) as workshop:
+        models = multipole_models(study, references, workshop)
+    magnets = known or {"prior": assembled_prior(study, models[0].nominal)}
+    tables = [(model, {name: model.of(one) for name, one in magnets.items()}) for model in models]
+    limit = arguments.limit_units
+    write_multipoles(study, tables, limit, arguments.output, {
+        "GetDP": workshop.getdp.version, **common.digests(
+            {"study file": arguments.study, "posterior": arguments.posterior})})
+    if arguments.json:
+        common.print_json(multipoles_summary(study, tables, limit))
+    else:
+        for model, found in tables:
+            common.print_table(text_table(**found), "Multipoles in units of 1e-4, " + (
+                "integrated along z" if model.integrated else
+                "of the cross-section" if model.z is None else f"at z = {model.z:g} m"))
+        common.say(f"Report: {arguments.output / 'multipoles.html'}")
+    return 0
