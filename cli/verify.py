@@ -11,6 +11,7 @@ import json
 from dataclasses import asdict
 
 from halbach_fe.cli import common
+from halbach_fe.cost import of_verify
 from halbach_fe.study import read_study
 from halbach_fe.update import write_text
 from halbach_fe.verification import verify
@@ -19,11 +20,14 @@ from halbach_fe.verification import verify
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
+    common.add_dry_run_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify, write, print."""
     study = read_study(arguments.study)
+    if arguments.dry_run:
+        return common.print_estimate(of_verify(study, arguments.jobs), arguments.json)
     with common.workshop(arguments) as workshop:
         found = verify(study, workshop, say=lambda what: common.say(f"solving {what}"))
     write_text(arguments.output / "verification.json",
