@@ -69,22 +69,55 @@ class Law:
 GETDP_BYTES, GETDP_SECONDS = 50e6, 0.1
 
 PLANE = Law(3600, 0, 1.5e-5, 2.3e-6)
-EDGES = {1: Law(2700, 90, 7e-7, 1.5e-6, 1.4), 2: Law(3330, 65, 4.7e-7, 1.5e-6, 1.4)}
-FACTORIZED = Law(2480, 150, 1.15e-6, 1.3e-6, 1.4)
+"""Eleven runs on cross-sections and half-planes, 3 400 to 152 000 unknowns, 1 to 9 solves: memory
+within 5 %, of which 2400 bytes each are what ``-petsc_prealloc 200`` takes; time within 20 %."""
+
+FACTORIZED = Law(2480, 150, 1.1e-6, 1.3e-6, 1.4)
+"""Scalar potential, 36 000, 61 000, 96 000 and 99 000 unknowns: memory within 8 % but for a flat
+magnet, whose factors are smaller: 26 % too much, and twice the time."""
+
 ITERATED = Law(5150, 0, 2e-5, 5.8e-5)
-STEPPED = Law(5150, 0, 1.2e-4, 0)
+"""By conjugate gradients, 226 000 and 274 000 unknowns: memory within 1 %, time without iron within
+5 %. Thin iron takes five times as many iterations."""
 
-NEWTON_STEPS = 8
-NEWTON_MEMORY = 2.2
+IRON_ITERATIONS = 5.0
 
-PYTHON_BYTES = 0.27 * GIB
-ELEMENT_BYTES = 2000
+EDGES = {1: Law(2700, 90, 7e-7, 1.5e-6, 1.4), 2: Law(2430, 88, 5.5e-7, 1.5e-6, 1.4)}
+"""Edge elements by order. First: 27 000 to 206 000 unknowns on three magnets, memory within 7 %,
+time within 40 %. Second: 42 000, 132 000 and 264 000, memory within 4 %, time within 20 %."""
+
+STEPPED = Law(10_700, 0, 8e-5, 0)
+"""Multigrid for Newton's steps, 61 000 and 203 000 unknowns: with `NEWTON_BYTES`, within 1 %."""
+
+NEWTON_BYTES, NEWTON_MATRICES, NEWTON_STEPS = 4400, 2, 6
+"""By unknown, for the matrix of the Jacobian, and by step, both measured at 11 000 and 86 000
+unknowns; 3 to 9 steps were seen."""
+
+PYTHON_BYTES, ELEMENT_BYTES = 0.27 * GIB, 2000
+"""This program, its libraries, and what it reads of a mesh and its unknowns: measured 1000 to 2100
+by element, of 10 000 to 208 000."""
+
 MATRIX_COPIES = 4
 PAIRS_AT_ONCE, PAIR_BYTES = 4_000_000, 200
 OWN_SECONDS, ELEMENT_SECONDS, PAIR_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 5e-6, 1e-9
-GRID, GRID_SECONDS = 150, 0.095
 
 MESH_BYTES = {"cross_section": 104, "meridian": 70, "extruded": 104}
+"""Of the file, by element, by kind of mesh."""
+
+UNKNOWN_BYTES = {"edge_elements": 75}
+"""Of GetDP's list of unknowns, by unknown, by route; of the others `OTHER_UNKNOWN_BYTES`."""
+
+OTHER_UNKNOWN_BYTES = 30
+
+GRID, GRID_SECONDS = 150, 0.095
+"""The grid whose factorization tells a machine's speed, and the processor time that it took where
+the laws were measured."""
+
+COARSER = {"cross_section": "enlarge mesh.block_size_m",
+           "meridian": "enlarge mesh.meridian_size_m",
+           "extruded": "enlarge mesh.block_size_m, mesh.bore_size_m or mesh.growth, or take fewer "
+                       "mesh.layers_per_ring"}
+"""How to have fewer elements, by kind of mesh."""
 
 
 @dataclass(frozen=True)
@@ -185,12 +218,6 @@ class Estimate:
                                "warning": self.warning}
 
 
-COARSER = {"cross_section": "enlarge mesh.block_size_m",
-           "meridian": "enlarge mesh.meridian_size_m",
-           "extruded": "enlarge mesh.block_size_m, mesh.bore_size_m or mesh.growth, or take fewer "
-                       "mesh.layers_per_ring"}
-
-
 @dataclass(frozen=True)
 class CountedMesh:
     """How many parts a mesh will have: elements, and what is off its boundary and on its axis."""
@@ -285,17 +312,14 @@ def posed(
     variants = 1 if study.solver.method == "direct" else 2
     sources = 1 + study.dimension * len(blocks)
 
-    def problem(
-        unknowns: int, law: Law, processes: int, matrices: int, solves: int,
-        per_unknown: float = 1.0
-    ) -> Problem:
+    def problem(unknowns: int, law: Law, processes: int, matrices: int, solves: int) -> Problem:
         each = law.bytes_each + law.fill * unknowns ** (1 / 3)
         seconds = (GETDP_SECONDS + matrices * law.matrix_s * unknowns**law.power
                    + solves * law.solve_s * unknowns)
         disk = mesh.elements * MESH_BYTES[kind] + unknowns * (
-            (75 if route == "edge_elements" else 25) + 8 * solves)
+            UNKNOWN_BYTES.get(route, OTHER_UNKNOWN_BYTES) + 8 * solves)
         return Problem(what, route, mesh.elements, unknowns, processes, matrices, solves,
-                       (GETDP_BYTES + per_unknown * unknowns * each) / GIB, seconds, disk / GIB)
+                       (GETDP_BYTES + unknowns * each) / GIB, seconds, disk / GIB)
 
     if route == "azimuthal_modes":
         weights = nominal_waves(study, modes_needed(study, points))
@@ -308,15 +332,17 @@ def posed(
     law = PLANE if route == "cross_section" else EDGES[study.solver.edge_order]
     if route == "scalar_potential":
         law = FACTORIZED if unknowns <= formulation.factorized else ITERATED
+        if law is ITERATED and study.iron_ring is not None:
+            law = replace(law, solve_s=IRON_ITERATIONS * law.solve_s)
     if not is_nonlinear(study):
         parts = min(sources, max(1, jobs // variants))
         return [problem(unknowns, law, variants * parts, 1, math.ceil(sources / parts))]
     linear = [problem(unknowns, law, 1, 1, sources)] if blocks and variants == 2 else []
     if not blocks and unknowns > formulation.factorized_for_newton:
         law = STEPPED
-    newton = [problem(unknowns, law, 1 if blocks else variants, NEWTON_STEPS,
-                      NEWTON_STEPS + (sources if blocks else 0), NEWTON_MEMORY)]
-    return newton + linear
+    law = replace(law, bytes_each=law.bytes_each + NEWTON_BYTES)
+    return [problem(unknowns, law, 1 if blocks else variants, NEWTON_MATRICES * NEWTON_STEPS,
+                    NEWTON_STEPS + (sources if blocks else 0)), *linear]
 
 
 def _symmetry(study: Study) -> Symmetry:
