@@ -100,10 +100,10 @@ def plane_size(study: Study, kind: str) -> tuple[float, float]:
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})})
     triangles, rim = _counted(drawn, blocks[:DRAWN], radius)
+    more = triangles - _equilateral(drawn, radius)  # along curves
     if len(blocks) > DRAWN:  # every further one adds the same
         fewer, _ = _counted(drawn, blocks[:DRAWN // 2], radius)
-        triangles += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
-    more = triangles - _equilateral(drawn, radius)  # along curves
+        more += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
     return wanted + more * coarser**ALONG_CURVES, rim
 
 
@@ -112,9 +112,9 @@ def _counted(study: Study, blocks: tuple[MagnetBlock, ...], radius: float) -> tu
     with gmsh_session(study.name):
         draw(study, blocks, radius)
         gmsh.model.mesh.generate(2)
-        return tuple(sum(len(gmsh.model.mesh.getElementsByType(kind, entity)[0])
-                         for entity in entities)
-                     for kind, entities in ((TRIANGLE, [-1]), (LINE, outer_curves(radius))))
+        mesh = gmsh.model.mesh
+        rim = sum(len(mesh.getElementsByType(LINE, curve)[0]) for curve in outer_curves(radius))
+        return len(mesh.getElementsByType(TRIANGLE)[0]), rim
 
 
 def _equilateral(study: Study, radius: float) -> float:

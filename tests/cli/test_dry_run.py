@@ -10,8 +10,8 @@ import pytest
 from halbach_fe import cost
 from halbach_fe.cli import main
 from halbach_fe.field_map import field_map, write_map
-from tests.conftest import circle
 from tests.cli.test_cli import STUDY
+from tests.conftest import circle
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_it_starts_and_writes_nothing(commands, verb, tmp_path, capsys):
         assert shown[name] > 0
     for one in shown["problems"]:
         assert one["unknowns"] > one["elements"] > 0
-    assert main(commands[verb]) == 3, "without it GetDP is needed"
+    assert main(commands[verb]) == 6, "without it GetDP is needed"
 
 
 def test_the_table(commands, capsys):
@@ -86,6 +86,7 @@ def test_a_bad_map_is_refused_as_ever(commands, tmp_path, capsys, getdp):
         codes, said = [], []
         for more in (["--dry-run"], ["--getdp", str(getdp.executable)]):
             codes.append(main([*commands["infer"], *more]))
-            said.append(capsys.readouterr().err.splitlines()[-1])
+            sentence = capsys.readouterr().err.splitlines()[-1]
+            said.append(sentence.partition("the first at")[0])  # of places in another order
         assert codes[0] == codes[1] != 0
         assert said[0] == said[1]
