@@ -55,8 +55,6 @@ def studies(dipole, short_dipole):
         "steel": dipole(iron_ring=STEEL),
         "modes": three(),
         "symmetry": three(array__block=TRAPEZOID),
-        "one by one": three(array__block=TRAPEZOID, array__blocks_per_ring=4, array__rings=1,
-                            solver__symmetry=False),
         "second order": three(solver__edge_order=2, solver__method="direct"),
         "stand-in": three(array__block__angular_gap_deg=0.5),
     }
@@ -95,8 +93,7 @@ def test_large_rings_are_drawn_in_part(studies, monkeypatch):
     assert within(COUNT_FACTOR, found, real)
 
 
-@pytest.mark.parametrize("name", ["cross-section", "steel", "modes", "symmetry",
-                                  "one by one", "stand-in"])
+@pytest.mark.parametrize("name", ["cross-section", "steel", "modes", "symmetry", "stand-in"])
 def test_the_runs_are_those_foretold(studies, name, workshop, monkeypatch):
     """Number and unknowns of all GetDP runs of a response matrix, and how much each solves."""
     study, jobs = studies[name], []
