@@ -20,6 +20,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from halbach_fe.cost import TIME_FACTOR, Estimate
 from halbach_fe.errors import HalbachError, HalbachWarning
 from halbach_fe.getdp import find_getdp
 from halbach_fe.multipoles import DEFAULT_ORDERS, Reference
@@ -34,6 +35,38 @@ def add_study_arguments(parser: argparse.ArgumentParser) -> None:
     add_study_and_output(parser)
     add_solver_arguments(parser)
     add_json_argument(parser)
+
+
+def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
+    """--dry-run."""
+    parser.add_argument("--dry-run", action="store_true",
+                        help="estimate memory, time and disk; nothing is solved or written")
+
+
+def print_estimate(estimate: Estimate, as_json: bool) -> int:
+    """Print what a run will take, and warn if memory is not enough; return the exit code."""
+    if as_json:
+        print_json(estimate.as_dict())
+    else:
+        print_table([{
+            "mesh": one.what, "route": one.route, "elements": str(one.elements),
+            "unknowns": str(one.unknowns), "processes": str(one.processes),
+            "solves each": str(one.solves), "GiB each": f"{one.memory_GiB:.2g}",
+            "s each": f"{one.seconds:.2g}"} for one in estimate.problems], "Runs of GetDP")
+        available = estimate.available_GiB
+        print_table([{"what": what, "value": value} for what, value in {
+            "route": estimate.route, "blocks": str(estimate.blocks),
+            "readings": str(estimate.readings), "parameters": str(estimate.parameters),
+            "GetDP processes": f"{estimate.processes}, up to {estimate.jobs} at a time",
+            "solves": str(estimate.solves),
+            "memory": f"{estimate.memory_GiB:.2g} GiB in all processes together"
+            + ("" if available is None else f", of {available:.2g} GiB available"),
+            "disk": f"{estimate.disk_GiB:.2g} GiB at most",
+            "time": f"{estimate.seconds:.2g} s, within a factor of about {TIME_FACTOR:g}",
+        }.items()], f"{estimate.study}, estimated")
+    if estimate.warning is not None:
+        say(f"warning: {estimate.warning}")
+    return 0
 
 
 def add_solver_arguments(parser: argparse.ArgumentParser) -> None:

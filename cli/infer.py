@@ -11,15 +11,17 @@ from pathlib import Path
 
 from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
+from halbach_fe.cost import of_infer
 from halbach_fe.errors import StudyError
 from halbach_fe.field_map import read_map
 from halbach_fe.study import is_nonlinear, read_study
-from halbach_fe.update import infer, summary, write_update
+from halbach_fe.update import infer, observed, summary, write_update
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
+    common.add_dry_run_argument(parser)
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
     parser.add_argument("--held-out", type=Path, metavar="MAP",
@@ -35,11 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Infer, write everything, print the before/after table."""
-    from halbach_fe.report.inference import (  # matplotlib loads only when needed
-        score_table,
-        write_report,
-    )
-
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     if arguments.samples and not is_nonlinear(study):
         raise StudyError(
@@ -47,6 +44,16 @@ def run(arguments: argparse.Namespace) -> int:
             "linear, and its posterior has a closed form. Leave it out.")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     unseen = read_map(arguments.held_out) if arguments.held_out else None
+    if arguments.dry_run:
+        if arguments.samples:
+            common.say("The chains of --samples are not counted.")
+        found = of_infer(study, observed(study, data, blocks, unseen), arguments.jobs)
+        return common.print_estimate(found, arguments.json)
+    from halbach_fe.report.inference import (  # matplotlib loads only when needed
+        score_table,
+        write_report,
+    )
+
     with common.workshop(arguments) as workshop:
         update = infer(study, data, workshop, blocks, linearized_only=bool(arguments.samples),
                        unseen=unseen)

@@ -14,6 +14,7 @@ from importlib import metadata
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.cost import of_solve
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.field_map import field_map, write_map
 from halbach_fe.observation import observe, points_from
@@ -26,17 +27,21 @@ from halbach_fe.update import write_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
+    common.add_dry_run_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write the maps, print a summary."""
-    from halbach_fe.report.solution import Solution, write_report  # matplotlib when needed
-
     study = read_study(arguments.study)
     points = points_from(study.observation.positions)
     started = time.monotonic()
     check_points(study, points)
     observation = observe(study, points, np.ones_like(points, bool))
+    if arguments.dry_run:
+        return common.print_estimate(
+            of_solve(study, observation, arguments.jobs), arguments.json)
+    from halbach_fe.report.solution import Solution, write_report  # matplotlib when needed
+
     with common.workshop(arguments) as workshop:
         part = finite_element_part(study, points, workshop, columns=False)
         flux_density = exact_part(study, points) + part.nominal

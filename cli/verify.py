@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
+from halbach_fe.cost import of_verify
 from halbach_fe.study import read_study
 from halbach_fe.verification import verify
 
@@ -17,6 +18,7 @@ from halbach_fe.verification import verify
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
+    common.add_dry_run_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -24,6 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.verification import difference_table, verdict, write_verification
 
     study = read_study(arguments.study)
+    if arguments.dry_run:
+        return common.print_estimate(of_verify(study, arguments.jobs), arguments.json)
     with common.workshop(arguments) as workshop:
         found = verify(study, workshop, say=lambda what: common.say(f"solving {what}"))
     write_verification(study, found, arguments.output, {

@@ -6,8 +6,8 @@ layers along z. Both run by hand::
     python -m halbach_fe.geo STUDY.toml -o FOLDER
 """
 
-from halbach_fe.geo.cross_section import mesh_2d
-from halbach_fe.geo.extruded import mesh_3d
-from halbach_fe.geo.meridian import mesh_meridian
+from halbach_fe.geo.cross_section import mesh_2d, plane_size
+from halbach_fe.geo.extruded import layers, mesh_3d
+from halbach_fe.geo.meridian import grid_size, mesh_meridian
 
-__all__ = ["mesh_2d", "mesh_3d", "mesh_meridian"]
+__all__ = ["grid_size", "layers", "mesh_2d", "mesh_3d", "mesh_meridian", "plane_size"]

@@ -39,6 +39,11 @@ def mesh_meridian(study: Study, size: float, mesh_path: Path) -> Regions:
                      for ring in range(1, study.array.rings + 1)))
 
 
+def grid_size(study: Study, size: float) -> tuple[int, int]:
+    """Numbers of nodes of the half-plane's mesh along r and z."""
+    return len(_radii(study, size)), len(_heights(study, size))
+
+
 def _radii(study: Study, size: float) -> Floats:
     array, iron = study.array, study.iron_ring
     stops = [0.0, array.inner_radius_m, array.outer_radius_m]

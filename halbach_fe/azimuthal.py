@@ -102,7 +102,7 @@ class _Case:
     Attributes
     ----------
     weights : ndarray
-        Of the nominal array, see `_nominal_waves`.
+        Of the nominal array, see `nominal_waves`.
     solved : tuple of int
         Rings, from 0, of the blocks that are solved for.
     located, probes : Located
@@ -147,18 +147,12 @@ def solve_modes(
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
     highest = modes_needed(study, points)
     mesh = verify_mesh(build_meridian(study, make_folder(workshop.folder)))
-    check_inside(mesh, points)
+    check_inside(study.name, mesh.radius, mesh.half_length, points)
     located = locate(mesh, meridian)
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
-    weights = _nominal_waves(study, highest)
+    weights = nominal_waves(study, highest)
     case = _Case(study, mesh, weights, solved, located, *probes_of(mesh, located))
-    wanted = list(range(highest + 1))
-    if not blocks:
-        size = np.abs(weights).max(axis=(1, 2, 3))
-        wanted = [m for m in wanted if size[m] > NO_REMANENCE * size.max()]
-    # mode 0 has another condition on the axis, so it is a run of its own
-    spans = [span for first in (True, False)
-             for span in _runs([m for m in wanted if (m == 0) == first])]
+    spans = spans_of(weights, all_modes=bool(blocks))
     variants = [False] if study.solver.method == "direct" else [False, True]
     tasks = [_task(case, span, vacuum, workshop)
              for span in reversed(spans) for vacuum in variants]
@@ -172,6 +166,17 @@ def solve_modes(
     return _superpose(case, modes, points, where, blocks)
 
 
+def spans_of(weights: Floats, all_modes: bool) -> list[tuple[int, int]]:
+    """First and last mode of every run, by the `nominal_waves`; all modes for single blocks, or
+    only those of the nominal array.
+    """
+    size = np.abs(weights).max(axis=(1, 2, 3))
+    wanted = [m for m in range(len(weights)) if all_modes or size[m] > NO_REMANENCE * size.max()]
+    # mode 0 has another condition on the axis, so it is a run of its own
+    return [span for first in (True, False)
+            for span in _runs([m for m in wanted if (m == 0) == first])]
+
+
 def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
     """Spans (first, last) of consecutive modes."""
     found = []
@@ -181,7 +186,7 @@ def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
     return found
 
 
-def _nominal_waves(study: Study, highest: int) -> Floats:
+def nominal_waves(study: Study, highest: int) -> Floats:
     """Nominal remanence as waves, (modes, 2, rings, 3) in T: by what goes into cos(m theta) and
     sin(m theta), ring, and along or across the blocks' middles, or along z.
 
@@ -258,12 +263,14 @@ def stage(
         numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
                  "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
                  "PRINTED_SOURCE": printed},
-        unknowns=_unknowns(case.mesh.inner) - (_unknowns(case.mesh.axis) if span[0] > 0 else 0),
+        unknowns=unknowns_of(case.mesh.inner, case.mesh.axis, span[0]),
         solves=(span[1] - span[0] + 1) * (sources[1] - sources[0] + 1), time_limit_s=time_limit_s)
 
 
-def _unknowns(entities: Entities) -> int:
-    return entities.nodes + entities.edges + entities.faces
+def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
+    """How many unknowns a mode has, by what the mesh has off the boundary, and on the axis."""
+    everywhere, fixed = (one.nodes + one.edges + one.faces for one in (inner, axis))
+    return everywhere - (fixed if mode > 0 else 0)
 
 
 def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) -> Floats:

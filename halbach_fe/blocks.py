@@ -480,15 +480,19 @@ def _check_overlaps(outlines: tuple[Outline, ...]) -> None:
     Shared faces are allowed; outlines are drawn in by 1e-6 so that rounding decides nothing.
     """
     t = np.linspace(0.0, 1.0, 9)
-    drawn_in = []
+    drawn_in, centres, reaches = [], [], []
     for outline in outlines:
         boundary = np.vstack([edge.at(t)[0][:-1] for edge in outline])
         centre = np.mean([edge.start for edge in outline], axis=0)
         drawn_in.append(centre + (1 - 1e-6) * (boundary - centre))
+        centres.append(centre)
+        reaches.append(1.1 * np.hypot(*(boundary - centre).T).max())  # arcs bulge between samples
+    places, sizes = np.array(centres), np.array(reaches)
     for i, polygon in enumerate(drawn_in):
         samples = np.vstack([polygon, polygon.mean(axis=0)])
-        for j, other in enumerate(outlines):
-            if i != j and (outline_contains(other, samples).any()
+        near = np.hypot(*(places - places[i]).T) <= sizes + sizes[i]
+        for j in np.flatnonzero(near).tolist():
+            if i != j and (outline_contains(outlines[j], samples).any()
                            or _cross(polygon, drawn_in[j])):
                 raise StudyError(
                     f"Input `array.block` of study must leave neighbours apart; instead blocks "

@@ -139,11 +139,10 @@ def finite_element_part(
     if not columns:
         nominal = _solve_nominal(study, points, workshop, route)
         return ElementFields(np.nan, nominal, nominal, blocks_of(study), _not_solved)
-    near = simpler(study)
-    if study.solver.route == "auto" and route == "scalar_potential" and suits(near, points):
+    near = stand_in(study, route, points)
+    if near is not None:
         return _about(near, study, points, workshop)
-    # in a cross-section there is little to save, and iron saturates where the field is
-    placed = study.solver.symmetry and size == 3 and not is_nonlinear(study)
+    placed = is_placed(study)
     symmetry = symmetry_of(study) if placed else no_symmetry(study)
     places, index = symmetry.spread(points)
     if is_nonlinear(study):
@@ -165,6 +164,20 @@ def finite_element_part(
     return ElementFields(_superposition_tolerance(study, route, placed),
                          nominal[here] if is_nonlinear(study) else tangent, tangent,
                          blocks_of(study), block)
+
+
+def is_placed(study: Study) -> bool:
+    """Whether blocks are solved for by symmetry: in a cross-section there is little to save, and
+    iron saturates where the field is.
+    """
+    return study.solver.symmetry and study.dimension == 3 and not is_nonlinear(study)
+
+
+def stand_in(study: Study, route: str, points: Floats) -> Study | None:
+    """The `simpler` study, if its single blocks stand for those of the study; see `_about`."""
+    near = simpler(study)
+    chosen = study.solver.route == "auto" and route == "scalar_potential" and suits(near, points)
+    return near if chosen else None
 
 
 def simpler(study: Study) -> Study:

@@ -25,7 +25,7 @@ from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.errors import GetDPError, NotConvergedError, OutputError, PointsOutsideError
 from halbach_fe.evaluation import Located, curl_operators, locate, nodal_operators, probes_of
 from halbach_fe.getdp import GetDP, Job
-from halbach_fe.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
+from halbach_fe.mesh import MESH_NAME, Entities, VerifiedMesh, build_mesh, verify_mesh
 from halbach_fe.solutions import (
     Unknowns,
     read_matrix,
@@ -87,7 +87,7 @@ class Formulation:
     ----------
     problem : str
     unknowns : callable
-        How many there must be on a mesh.
+        How many there must be, by what a mesh has off the boundary.
     flux_density : callable
         Mesh, located points and unknowns to the sparse operators of Bx, By, Bz there.
     factorized : int
@@ -101,7 +101,7 @@ class Formulation:
     """
 
     problem: str
-    unknowns: Callable[[VerifiedMesh], int]
+    unknowns: Callable[[Entities], int]
     flux_density: Callable[[VerifiedMesh, Located, Unknowns], list[sparse.csr_array]]
     factorized: float = np.inf
     factorized_for_newton: float = np.inf
@@ -126,8 +126,8 @@ FACTORIZED = 200_000
 """Unknowns of a scalar potential of second order: 160 000 take 4 GiB and 25 s, while thin iron
 takes conjugate gradients 2400 iterations, 60 s, for every source."""
 
-CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda mesh: mesh.inner.nodes, _curl_of_axial)
-SCALAR_POTENTIAL = Formulation("scalar_potential_3d.pro", lambda mesh: mesh.inner.nodes,
+CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda inner: inner.nodes, _curl_of_axial)
+SCALAR_POTENTIAL = Formulation("scalar_potential_3d.pro", lambda inner: inner.nodes,
                                _minus_gradient, FACTORIZED, FACTORIZED // 4, law="permeability")
 
 
@@ -135,8 +135,8 @@ def edge_elements(order: int) -> Formulation:
     """Edge elements of order 1 or 2."""
     return Formulation(
         # the tree of the gauge, started on the boundary, has one edge per corner off it
-        "magnetostatics_3d.pro", lambda mesh: mesh.inner.edges - mesh.inner.corners + (
-            2 * mesh.inner.faces if order == 2 else 0),
+        "magnetostatics_3d.pro", lambda inner: inner.edges - inner.corners + (
+            2 * inner.faces if order == 2 else 0),
         curl_operators, numbers={"ORDER": order})
 
 
@@ -288,7 +288,7 @@ def _case(
     if study.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
     mesh = verify_mesh(build_mesh(study, make_folder(workshop.folder)))
-    check_inside(mesh, points)
+    check_inside(study.name, mesh.radius, mesh.half_length, points)
     return _Case(study, mesh, locate(mesh, points, anywhere), blocks, formulation,
                  workshop.time_limit_s)
 
@@ -450,7 +450,7 @@ def _newton_task(
         job = stage(case.study, case.mesh, places, folder, case.formulation, case.blocks,
                     (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
-        unknowns = case.formulation.unknowns(case.mesh)
+        unknowns = case.formulation.unknowns(case.mesh.inner)
         if not gateaux and unknowns > case.formulation.factorized_for_newton:
             job = replace(job, options=runner.NEWTON_STEPS, linear_residual=runner.NEWTON_RESIDUAL)
         return replace(
@@ -573,7 +573,7 @@ def stage(
                samples=(nominal_samples(study) if samples is None else samples).tolist()),
         encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
-    unknowns = formulation.unknowns(mesh)
+    unknowns = formulation.unknowns(mesh.inner)
     direct = unknowns <= formulation.factorized
     return Job(
         problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
@@ -621,14 +621,14 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
-def check_inside(mesh: VerifiedMesh, points: Floats) -> None:
-    """Refuse points outside the mesh, where GetDP would print zeros."""
+def check_inside(name: str, radius_m: float, half_length_m: float, points: Floats) -> None:
+    """Refuse points (n, 3) outside the mesh of a study, where GetDP would print zeros."""
     radius = np.hypot(points[:, 0], points[:, 1])
-    outside = (radius > mesh.radius) | (np.abs(points[:, 2]) > mesh.half_length)
+    outside = (radius > radius_m) | (np.abs(points[:, 2]) > half_length_m)
     if outside.any():
         x, y, z = points[np.argmax(outside)]
         raise PointsOutsideError(
-            f"Input `observation.positions` of study {mesh.regions.study} must lie within the "
-            f"meshed region (radius {mesh.radius:g} m, half length {mesh.half_length:g} m); "
-            f"instead {outside.sum()} points lie outside, the first at ({x:g}, {y:g}, {z:g}) m. "
-            "Check the units of the points, or enlarge `open_boundary`.")
+            f"Input `observation.positions` of study {name} must lie within the meshed region "
+            f"(radius {radius_m:g} m, half length {half_length_m:g} m); instead {outside.sum()} "
+            f"points lie outside, the first at ({x:g}, {y:g}, {z:g}) m. Check the units of the "
+            "points, or enlarge `open_boundary`.")

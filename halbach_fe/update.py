@@ -246,26 +246,8 @@ def infer(
         If a map or the blocks do not fit the study.
     """
     of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
-    observation, noise, readings = _measured(study, data, excluded(study, data.sizes["point"]))
-    keep = held_out(study, observation)
-    parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
-    if unseen is not None:
-        try:
-            other, its_noise, its_readings = _measured(
-                predicted_as(study, unseen), unseen, np.zeros((unseen.sizes["point"], 3), bool))
-        except MeasurementError as error:
-            raise MeasurementError(
-                str(error).replace(" of map must", " of held-out map must")) from None
-        observation, noise = together(observation, other), noise.beside(its_noise)
-        readings = np.concatenate([readings, its_readings])
-        parts += (HELD_OUT_MAP,) * len(other)
-        keep = np.array(parts) != TRAINING
-    heights = observation.points[:, 2]
-    if study.dimension == 2 and np.ptp(heights) > 0:
-        raise MeasurementError(must_be(
-            "points", "map", "in one plane for a 2D study",
-            f"z from {heights.min():g} to {heights.max():g} m",
-            "Use a 3D study, or one circle of the map."))
+    observation, noise, readings, parts = _read(study, data, unseen)
+    keep = np.array(parts) != TRAINING
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
         names = [region.name for region in study.noise.regions]
@@ -292,6 +274,48 @@ def infer(
         log_evidence=learnt.log_evidence,
         kind="linearized" if is_nonlinear(study) else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None)
+
+
+def observed(
+    study: Study, data: xr.Dataset, blocks: BlockTable | None = None,
+    unseen: xr.Dataset | None = None,
+) -> Observation:
+    """What `infer` would update with and predict, its inputs checked as there.
+
+    What uncertain positions add to the noise, the slow part of reading a map, is left out.
+    """
+    if blocks is not None:
+        prior_from_blocks(study, blocks)
+    if study.noise is not None:
+        study = study.model_copy(update={
+            "noise": study.noise.model_copy(update={"position_sd_m": None})})
+    return _read(study, data, unseen)[0]
+
+
+def _read(
+    study: Study, data: xr.Dataset, unseen: xr.Dataset | None
+) -> tuple[Observation, Noise, Floats, tuple[str, ...]]:
+    """A map, and one that is only predicted: with noise, readings in T, and the part of each."""
+    observation, noise, readings = _measured(study, data, excluded(study, data.sizes["point"]))
+    keep = held_out(study, observation)
+    parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
+    if unseen is not None:
+        try:
+            other, its_noise, its_readings = _measured(
+                predicted_as(study, unseen), unseen, np.zeros((unseen.sizes["point"], 3), bool))
+        except MeasurementError as error:
+            raise MeasurementError(
+                str(error).replace(" of map must", " of held-out map must")) from None
+        observation, noise = together(observation, other), noise.beside(its_noise)
+        readings = np.concatenate([readings, its_readings])
+        parts += (HELD_OUT_MAP,) * len(other)
+    heights = observation.points[:, 2]
+    if study.dimension == 2 and np.ptp(heights) > 0:
+        raise MeasurementError(must_be(
+            "points", "map", "in one plane for a 2D study",
+            f"z from {heights.min():g} to {heights.max():g} m",
+            "Use a 3D study, or one circle of the map."))
+    return observation, noise, readings, parts
 
 
 def _measured(

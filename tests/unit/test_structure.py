@@ -18,7 +18,7 @@ ORDER = ["errors", "analytic", "materials", "study", "study_file", "blocks", "sy
          "measured_prior", "solve", "azimuthal", "routes", "observation", "discretization",
          "response", "nonlinear", "update", "sampled",
          "scene", "effects", "diagnosis", "diagnose", "next_measurement", "diagnosed",
-         "planning", "sensitivity", "demagnetization", "verification", "multipoles",
+         "planning", "sensitivity", "demagnetization", "verification", "cost", "multipoles",
          "remounting", "shimming", "sorting", "tolerance", "campaign", "report", "cli"]
 
 # A synthetic campaign tests the model of the field, so it must not come from it.
