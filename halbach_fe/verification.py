@@ -112,7 +112,7 @@ def verify(
     far = solve("a farther boundary", farther(study, MESHES[route], REFINEMENT))
     compare = _Comparison(study, points, base)
     pairs = {"coarser mesh to the study's": (coarse, base),
-             "the study's mesh to a finer": (base, fine), "boundary moved farther away": (base, far)}
+             "the study's mesh to a finer": (base, fine), "boundary farther away": (base, far)}
     if route in DUAL:
         pairs[f"dual route, {DUAL[route]}"] = (
             base, solve(f"the dual route, {DUAL[route]}", dual(study, route)))
