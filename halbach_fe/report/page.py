@@ -115,7 +115,6 @@ def geometry(study: Study, points: Floats, others: Floats | None = None) -> Figu
         for block in blocks_of(study)[::study.array.blocks_per_ring]:
             axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
                                      high - low, fill=False, color="#777777", lw=0.6))
-        axis.set_ylim(0, None)
     for one, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                       (others, "x", PRIOR, "held out")):
         if one is None:
@@ -124,6 +123,8 @@ def geometry(study: Study, points: Floats, others: Floats | None = None) -> Figu
         left.plot(x, y, marker, ms=3, color=colour, label=name)
         for axis in right:
             axis.plot(z, np.hypot(x, y), marker, ms=3, color=colour)
+    for axis in right:
+        axis.set_ylim(0, None)  # not before: it would end the scaling to what is drawn
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2,
                   markerscale=3)
     return figure
