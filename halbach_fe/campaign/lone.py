@@ -7,6 +7,7 @@ its moment is ``int (B_r + (mu - 1) mu_0 H) dV / mu_0``.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,21 +26,27 @@ def moments(bodies: tuple[Body, ...], length: float) -> Floats:
 
     Infinite bodies are taken for ``length`` in m. Bodies that are alike share the solves.
     """
-    meshes: dict[Shape, Any] = {}
-    known: dict[tuple[object, ...], Floats] = {}
     found = []
     for body in bodies:
         shape = body.shape
         if np.isinf(shape.length):
             shape = replace(shape, length=length)
-        tensor = body.permeability
-        key = (shape, *tensor.round(12).ravel())  # an easy axis has no sign
-        if key not in known:
-            if shape not in meshes and not np.array_equal(tensor, np.eye(3)):
-                meshes[shape] = block_mesh(shape)
-            known[key] = moment_matrix(shape, tensor, meshes.get(shape))
-        found.append(known[key] @ body.remanence * body.mean_factor)
+        matrix = _known_matrix(shape, tuple(body.permeability.round(12).ravel()))
+        found.append(matrix @ body.remanence * body.mean_factor)
     return np.array(found)
+
+
+@lru_cache(maxsize=1024)
+def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
+    """`moment_matrix` of a permeability row by row. An easy axis has no sign: blocks share it."""
+    tensor = np.reshape(permeability, (3, 3))
+    vacuum = np.array_equal(tensor, np.eye(3))
+    return moment_matrix(shape, tensor, None if vacuum else _known_mesh(shape))
+
+
+@lru_cache(maxsize=1)
+def _known_mesh(shape: Shape) -> Any:
+    return block_mesh(shape)
 
 
 def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: int = 3) -> Floats:
