@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from importlib import metadata
 
 import numpy as np
@@ -35,23 +36,30 @@ def run(arguments: argparse.Namespace) -> int:
     study = read_study(arguments.study)
     points = points_from(study.observation.positions)
     started = time.monotonic()
-    check_points(study, points)
     observation = observe(study, points, np.ones_like(points, bool))
+    read_at = observation.points  # where the instrument's probe is then
+    elsewhere = not np.array_equal(read_at, points)
+    places = np.vstack([points, read_at]) if elsewhere else points
+    check_points(study, places)
     if arguments.dry_run:
         return common.print_estimate(
             of_solve(study, observation, arguments.jobs), arguments.json)
     from halbach_fe.report.solution import Solution, write_report  # matplotlib when needed
 
     with common.workshop(arguments) as workshop:
-        part = finite_element_part(study, points, workshop, columns=False)
-        flux_density = exact_part(study, points) + part.nominal
+        part = finite_element_part(study, places, workshop, columns=False)
+        field = exact_part(study, places) + part.nominal
+        flux_density = field[:len(points)]
         data = field_map(points, flux_density, attributes={
             "study": study.name, "halbach_fe": metadata.version("halbach-fe"),
             "getdp": workshop.getdp.version, "method": study.solver.method})
         for suffix in (".h5", ".csv", ".vtu"):
             write_map(data, arguments.output / f"field_map{suffix}")
-        errors = reading_errors(study, observation, part, error_workshop(workshop))
-    readings = observation.apply(flux_density)
+        last = slice(-len(read_at), None)
+        errors = reading_errors(study, observation, replace(
+            part, nominal=part.nominal[last], error=None if part.error is None
+            else part.error[last]), error_workshop(workshop))
+    readings = observation.apply(field[last])
     lines = ["label,x_m,y_m,z_m,value_T,error_T"] + [
         f"{label},{x!r},{y!r},{z!r},{value!r},{error!r}"
         for label, (x, y, z), value, error in zip(

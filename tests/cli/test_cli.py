@@ -15,7 +15,7 @@ import pytest
 from halbach_fe.blocks import blocks_of
 from halbach_fe.cli import main, parser
 from halbach_fe.errors import EXIT_CODES
-from halbach_fe.field_map import field_map, read_map, write_map
+from halbach_fe.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.study import MU_0, Study, read_study
 from tests.conftest import ROOT, circle
 
@@ -58,6 +58,31 @@ def measured(tmp_path):
     points = circle(0.03, 10)
     write_map(field_map(points, np.tile([0.55, 0.0, np.nan], (10, 1))), path)
     return path
+
+
+@pytest.mark.parametrize("instrument", [
+    "translation_m = [0.002, 0.0, 0.0]",
+    "sensor_position_m = [[0.002, 0.0, 0.0], [0.002, 0.0, 0.0], [0.0, 0.0, 0.0]]"])
+def test_solve_reads_where_the_probe_is(study, tmp_path, instrument):
+    """The map is of the study's positions, the readings are those of a probe that is 2 mm off."""
+    displaced = circle(0.03, 10, start=0.0) + np.array([0.002, 0.0, 0.0])
+    moved = tmp_path / "moved.toml"
+    moved.write_text(STUDY.replace(
+        'kind = "circles"\nradius_m = 0.03\nangles = 10',
+        f'kind = "points"\npoints_m = {displaced.tolist()}'))
+    study.write_text(STUDY + f"\n[instrument]\n{instrument}\n")
+    found = {}
+    for name, path in (("off", study), ("moved", moved)):
+        assert main(["solve", str(path), "-o", str(tmp_path / name), "--json"]) == 0
+        rows = np.genfromtxt(tmp_path / name / "readings.csv", delimiter=",", names=True,
+                             dtype=None, encoding=None)
+        found[name] = rows["value_T"], rows["error_T"]
+    (values, errors), (expected, bars) = found["off"], found["moved"]
+    np.testing.assert_allclose(values, expected, atol=1e-12)
+    np.testing.assert_allclose(errors, bars, atol=1e-9)
+    nominal = read_map(tmp_path / "off" / "field_map.csv")
+    np.testing.assert_allclose(points_of(nominal), circle(0.03, 10, start=0.0), atol=1e-12)
+    assert np.abs(nominal["B_T"].values[:, :2].ravel() - values).max() > 1e-6
 
 
 def test_solve_writes_maps(study, tmp_path, capsys, getdp):
