@@ -104,7 +104,7 @@ def test_3d_error_falls_with_refinement(short_dipole, workshop):
     errors = []
     for size, layers in ((0.03, 2), (0.015, 4)):
         study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"},
-                             mesh={"block_size_m": size, "layers_per_ring": layers})
+                             mesh={"block_size_m": size, "layers_per_ring": layers, "growth": 1.8})
         exact = field_of(blocks_of(study), points)
         found = solve_nominal(study, points, workshop)
         errors.append(np.sqrt(np.mean((found - exact) ** 2)) / np.abs(exact).max())
