@@ -8,6 +8,7 @@ of a slot are tried at once, by columns that are computed once.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats, Ints, blocks_of, facing_angle_deg
-from halbach_fe.errors import MeasurementError, must_be
+from halbach_fe.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.inference.prior import turned
 from halbach_fe.measured_prior import as_mounted, loose_blocks, types_of
 from halbach_fe.multipoles import Complexes, MultipoleModel, Multipoles
@@ -101,6 +102,10 @@ def sort_blocks(
     """
     bench = _bench(study, table, model)
     _check_numbers(study, table)
+    if len(set(table.type)) == len(table):
+        warnings.warn(f"Every block of study {study.name} is of a type of its own and fits one "
+                      "slot only: there is nothing to sort. Say in prior.types which slots take "
+                      "the same blocks, or measure spare ones.", HalbachWarning, stacklevel=2)
     tolerance = ENOUGH * float(np.sum(_known(study, bench, _numbered(bench)).root ** 2))
     best, least = _numbered(bench), np.inf
     for start in range(STARTS):

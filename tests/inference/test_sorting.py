@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.block_table import BlockTable
 from halbach_fe.campaign.blocks import coil_table, draw
 from halbach_fe.campaign.bodies import magnet_of
-from halbach_fe.errors import MeasurementError, StudyError
+from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.measured_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.multipoles import Reference, multipole_model
 from halbach_fe.solve import Workshop
@@ -163,6 +163,15 @@ def test_types_stay_in_their_slots(workshop):
     with pytest.raises(MeasurementError, match="enough for the 1 slots"):
         sort_blocks(study_of(), part(blocks(study_of(), 3)[1], 11), model,
                     np.random.default_rng(1))
+
+
+def test_where_there_is_no_choice_it_is_said(workshop):
+    study = study_of(**SQUARES)
+    model = multipole_model(study, Reference(RADIUS, ORDERS), workshop)
+    nominal = magnet_of(study)
+    table, _ = coil_table(study, nominal, nominal, COIL_SD, np.random.default_rng(0))
+    with pytest.warns(HalbachWarning, match="nothing to sort"):
+        sort_blocks(study, table, model, np.random.default_rng(0))
 
 
 def test_the_seed_decides(workshop):
