@@ -163,10 +163,7 @@ def orders(text: str) -> tuple[int, ...]:
 
 def count(text: str) -> int:
     """Parse a whole number of at least 0."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"must be at least 0, not {value}")
-    return value
+    return _at_least(0, text)
 
 
 def finite_number(text: str) -> float:
@@ -179,9 +176,13 @@ def finite_number(text: str) -> float:
 
 def positive(text: str) -> int:
     """Parse a whole number of at least 1."""
+    return _at_least(1, text)
+
+
+def _at_least(least: int, text: str) -> int:
     value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {value}")
+    if value < least:
+        raise argparse.ArgumentTypeError(f"must be at least {least}, not {value}")
     return value
 
 
