@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from halbach_fe.cli import (
+    cache,
     common,
     completion,
     demagnetization,
@@ -34,7 +35,7 @@ VERBS = {
     "multipoles": multipoles, "plan": plan, "prior": prior, "shim": shim, "sort": sort,
     "tolerance": tolerance, "demagnetization": demagnetization,
     "simulate-measurement": simulate_measurement, "import-map": import_map, "export": export,
-    "doctor": doctor, "schema": schema, "completion": completion}
+    "cache": cache, "doctor": doctor, "schema": schema, "completion": completion}
 
 
 def parser() -> argparse.ArgumentParser:

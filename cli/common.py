@@ -12,7 +12,8 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -20,6 +21,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from halbach_fe.cache import default_cache
+from halbach_fe.cluster import connected
 from halbach_fe.cost import TIME_FACTOR, Estimate
 from halbach_fe.errors import HalbachError, HalbachWarning
 from halbach_fe.getdp import find_getdp
@@ -70,9 +73,19 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
 
 
 def add_solver_arguments(parser: argparse.ArgumentParser) -> None:
-    """--jobs, --time-limit, --getdp."""
-    parser.add_argument("--jobs", type=positive, default=min(2, os.cpu_count() or 1), metavar="N",
-                        help="GetDP processes at a time (default: %(default)s)")
+    """How GetDP is run: --jobs, --mpi, --time-limit, --scheduler, --cache, --getdp."""
+    parser.add_argument("--jobs", type=positive, metavar="N",
+                        help="runs of GetDP at a time (default: 2, or one for each core of the "
+                        "--scheduler's workers)")
+    parser.add_argument("--mpi", type=positive, default=1, metavar="N",
+                        help="MPI processes that share each run, for solves that are too large for "
+                        "one (default: %(default)s)")
+    parser.add_argument("--scheduler", metavar="ADDRESS",
+                        help="Dask scheduler, whose workers run GetDP in place of this machine")
+    parser.add_argument("--cache", type=Path, metavar="DIR",
+                        help="folder where answers of GetDP are kept (default: $HALBACH_FE_CACHE, "
+                        "then ~/.cache/halbach-fe)")
+    parser.add_argument("--no-cache", action="store_true", help="neither use nor keep any")
     parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
                         help="for each GetDP process (default: %(default)g)")
     add_getdp_argument(parser)
@@ -227,10 +240,21 @@ def guarded(run: Callable[[], int]) -> int:
 def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
     """A workshop in the output folder; shows progress on a terminal's stderr."""
     getdp = find_getdp(arguments.getdp)
-    with progress_bar("solving") as show:
-        yield Workshop(
-            getdp=getdp, folder=arguments.output, jobs=arguments.jobs,
-            time_limit_s=arguments.time_limit, progress=show)
+    cache = None if arguments.no_cache else default_cache(arguments.cache)
+    with progress_bar("solving") as show, ExitStack() as stack:
+        made = Workshop(
+            getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
+            time_limit_s=arguments.time_limit, progress=show, cache=cache,
+            processes=arguments.mpi)
+        if arguments.scheduler:
+            cluster = stack.enter_context(connected(arguments.scheduler))
+            made = replace(made, run=cluster.run, jobs=arguments.jobs or cluster.cores)
+        yield made
+
+
+def jobs(arguments: argparse.Namespace) -> int:
+    """How many runs of GetDP there are at a time on this machine."""
+    return int(arguments.jobs or min(2, os.cpu_count() or 1))
 
 
 @contextmanager

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         if arguments.samples:
             common.say("The chains of --samples are not counted.")
-        found = of_infer(study, observed(study, data, blocks, unseen), arguments.jobs)
+        found = of_infer(study, observed(study, data, blocks, unseen), common.jobs(arguments))
         return common.print_estimate(found, arguments.json)
     from halbach_fe.report.inference import (  # matplotlib loads only when needed
         score_table,

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_points(study, places)
     if arguments.dry_run:
         return common.print_estimate(
-            of_solve(study, observation, arguments.jobs), arguments.json)
+            of_solve(study, observation, common.jobs(arguments)), arguments.json)
     from halbach_fe.report.solution import Solution, write_report  # matplotlib when needed
 
     with common.workshop(arguments) as workshop:

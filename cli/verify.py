@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     if arguments.dry_run:
-        return common.print_estimate(of_verify(study, arguments.jobs), arguments.json)
+        return common.print_estimate(of_verify(study, common.jobs(arguments)), arguments.json)
     with common.workshop(arguments) as workshop:
         found = verify(study, workshop, say=lambda what: common.say(f"solving {what}"))
     write_verification(study, found, arguments.output, {

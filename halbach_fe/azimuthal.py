@@ -288,7 +288,6 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     compare_printed(gradients(case.probes, solutions[printed:printed + 1])[0], folder / OUTPUT,
                     case.places)
     result = gradients(case.located, solutions)
-    (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
     return result.reshape(modes, sources, *result.shape[1:])
 
 

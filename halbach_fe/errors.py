@@ -86,6 +86,12 @@ class ExtraMissingError(HalbachError):
     exit_code = 11
 
 
+class SchedulerError(HalbachError):
+    """The Dask scheduler cannot be reached, or it and its workers failed."""
+
+    exit_code = 12
+
+
 class CheckFailedError(HalbachError):
     """A self-check ran and its figure was out of bounds."""
 
@@ -105,6 +111,7 @@ EXIT_CODES: dict[int, str] = {
     CheckFailedError.exit_code: "a self-check failed",
     SamplingError.exit_code: "the posterior was not sampled well enough",
     ExtraMissingError.exit_code: "an optional part is not installed",
+    SchedulerError.exit_code: "the Dask scheduler or its workers failed",
     130: "interrupted (Ctrl-C)",
 }
 

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import MeasurementError, OutputError, must_be
+from halbach_fe.in_the_making import name_in_the_making, remove_left_behind
 from halbach_fe.study import COMPONENTS, MAX_LENGTH_M
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -199,7 +200,8 @@ def atomic(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix,
+        remove_left_behind(path.parent)
+        handle, name = tempfile.mkstemp(prefix=name_in_the_making(path.stem), suffix=path.suffix,
                                         dir=path.parent)
         os.close(handle)
     except OSError as error:

@@ -27,6 +27,7 @@ from halbach_fe.blocks import Floats
 from halbach_fe.errors import GetDPError, GetDPNotFoundError
 
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
+LOG_NAME = "getdp.log"
 MAX_NAME = 200
 """GetDP keeps paths in 256 characters, and appends to them."""
 
@@ -42,16 +43,16 @@ preallocated make assembling many times slower."""
 
 CONJUGATE_GRADIENTS = (
     "-petsc_prealloc", "400",
-    "-ksp_type", "cg", "-pc_type", "sor", "-pc_sor_symmetric", "-ksp_rtol", "1e-10",
+    "-ksp_type", "cg", "-pc_type", "sor", "-pc_sor_local_symmetric", "-ksp_rtol", "1e-10",
     "-ksp_max_it", "5000",
 )
 """For large scalar potentials of second order in 3D. Incomplete Cholesky is faster where it works,
-but loses definiteness on fine meshes."""
+but loses definiteness on fine meshes. Sweeps are local to each MPI process; there are no others."""
 
 NEWTON_STEPS = (
     "-petsc_prealloc", "400",
     "-ksp_type", "cg", "-pc_type", "gamg", "-mg_levels_ksp_type", "richardson",
-    "-mg_levels_pc_type", "sor", "-mg_levels_pc_sor_symmetric", "-ksp_rtol", "1e-4",
+    "-mg_levels_pc_type", "sor", "-mg_levels_pc_sor_local_symmetric", "-ksp_rtol", "1e-4",
     "-ksp_max_it", "5000",
 )
 """For large scalar potentials again: a step of Newton's method need not be exact, its convergence
@@ -65,8 +66,13 @@ _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
 """Open MPI, which Debian's GetDP is built with, otherwise starts a daemon for every run; it can
 outlive a killed run, and costs 8 s where the machine's own name does not resolve."""
 
+_TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+             "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"}
+"""For `mpirun`: containers have no other user than root, and who asks knows the cores."""
+
 _INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp`), or name it with --getdp or "
             f"{ENVIRONMENT_VARIABLE}.")
+_COLOURS = re.compile(r"\x1b\[\d*m")
 _NAMED_FAILURES = (  # pattern in the log, what it means
     (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
     (r"[Nn]o space left", "the disk is full"),
@@ -118,6 +124,8 @@ class Job:
         The run is ended after so many seconds.
     threads : int
         Threads of the linear algebra.
+    processes : int
+        MPI processes that share the run.
     """
 
     problem: str
@@ -133,6 +141,18 @@ class Job:
     linear_residual: float = MAX_RELATIVE_RESIDUAL
     time_limit_s: float = 3600.0
     threads: int = 1
+    processes: int = 1
+
+    @property
+    def large(self) -> tuple[str, ...]:
+        """Files of solutions and matrices, which only this program reads."""
+        saved = [name for name in self.outputs if name.endswith(".res")]
+        return tuple(name for name in (self.solutions, self.matrix, *saved) if name)
+
+
+Run = Callable[
+    [GetDP, Job, Path, Callable[[str], None] | None, threading.Event | None], list[str]]
+"""What runs a job like `run` does."""
 
 
 def find_getdp(named: str | Path | None = None) -> GetDP:
@@ -271,27 +291,39 @@ def _check_before(job: Job, folder: Path) -> None:
                        "declares, and GetDP would ignore it", folder)
 
 
+def _launcher(job: Job) -> list[str]:
+    """What GetDP is started by: so that it ends when its starter does, however that ends, and
+    under MPI if several processes share the run.
+    """
+    setpriv = shutil.which("setpriv")
+    tether = [setpriv, "--pdeathsig", "KILL"] if setpriv else []
+    if job.processes == 1:
+        return tether
+    return [*tether, "mpirun", "-n", str(job.processes), *tether]
+
+
 def _execute(
     arguments: list[str], job: Job, folder: Path,
     on_line: Callable[[str], None] | None, cancel: threading.Event | None,
 ) -> list[str]:
     threads = str(job.threads)
-    environment = os.environ | _ALONE | {
+    environment = os.environ | (_ALONE if job.processes == 1 else _TOGETHER) | {
         "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
     lines: list[str] = []
     try:
         process = subprocess.Popen(
-            arguments, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+            [*_launcher(job), *arguments], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
             start_new_session=True)
     except OSError as error:
-        raise _failure(f"it could not be started ({error.strerror})", folder) from None
+        hint = " Is `mpirun` installed (Debian: openmpi-bin)?" if job.processes > 1 else ""
+        raise _failure(f"it could not be started ({error.strerror}){hint}", folder) from None
 
     def read() -> None:
         assert process.stdout is not None
         with process.stdout:
             for text in process.stdout:  # progress bars use carriage returns
-                for line in re.split(r"[\r\b]+", text.rstrip("\n")):
+                for line in re.split(r"[\r\b]+", _COLOURS.sub("", text.rstrip("\n"))):
                     if line.strip() and not re.search(r"rocessing \(|%\s+: P", line):
                         lines.append(line)
                         if on_line is not None:
@@ -339,7 +371,7 @@ def _kill(process: subprocess.Popen[str]) -> None:
 def _save_log(folder: Path, arguments: list[str], lines: list[str]) -> None:
     text = "\n".join([" ".join(arguments[1:]), *lines, ""])
     with contextlib.suppress(OSError):  # the failure that filled the disk is the one to report
-        (folder / "getdp.log").write_text(text, encoding="utf-8")
+        (folder / LOG_NAME).write_text(text, encoding="utf-8")
 
 
 def _check_log(lines: list[str], job: Job, folder: Path) -> None:
@@ -348,6 +380,10 @@ def _check_log(lines: list[str], job: Job, folder: Path) -> None:
             said = line.partition(":")[2].strip()
             raise _failure(f"{_name_of(said, 'GetDP warned')}: '{said[:200]}'", folder)
     text = "\n".join(lines)
+    if job.processes > 1 and f", {job.processes} nodes," not in text:
+        raise _failure(
+            f"it did not run in the {job.processes} MPI processes asked for: `mpirun` must be of "
+            "the MPI that GetDP is built with (Debian: openmpi-bin)", folder)
     sizes = [int(n) for n in re.findall(r"System \d+/\d+: (\d+) Dofs", text)]
     if not sizes or 0 in sizes:
         raise _failure("the system has no unknowns: is the mesh empty?", folder)
@@ -374,10 +410,17 @@ def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
                 raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
                                "linear solver did not converge", folder)
             found += first is not None
-            first, last = float(match[2]), np.inf
+            first, last = _residual(match[2], folder), np.inf
         else:
-            last = float(match[2])
+            last = _residual(match[2], folder)
     return found
+
+
+def _residual(text: str, folder: Path) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise _failure(f"its log shows '{text[:40]}' for a residual", folder) from None
 
 
 def _name_of(text: str, otherwise: str) -> str:
@@ -388,6 +431,6 @@ def _failure(what: str, folder: Path) -> GetDPError:
     hint = ""
     if shutil.disk_usage(folder).free < 10_000_000:
         hint = " The disk is full: free some space."
-    log = folder / "getdp.log"
+    log = folder / LOG_NAME
     return GetDPError(f"GetDP did not give a result that can be trusted: {what}.{hint}"
                       + (f" Its log is {log}." if log.is_file() else ""))

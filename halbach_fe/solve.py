@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 
 from halbach_fe import getdp as runner
 from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.cache import Cache
 from halbach_fe.errors import GetDPError, NotConvergedError, OutputError, PointsOutsideError
 from halbach_fe.evaluation import Located, curl_operators, locate, nodal_operators, probes_of
-from halbach_fe.getdp import GetDP, Job
+from halbach_fe.getdp import GetDP, Job, Run
+from halbach_fe.in_the_making import name_in_the_making, remove_left_behind
 from halbach_fe.mesh import MESH_NAME, Entities, VerifiedMesh, build_mesh, verify_mesh
 from halbach_fe.solutions import (
     Unknowns,
@@ -70,6 +72,12 @@ class Workshop:
     time_limit_s : float
         For each of them.
     progress : callable, optional
+    cache : Cache, optional
+        Keeps what GetDP answered, for the next time that the same is asked.
+    run : callable
+        What runs GetDP: here, or elsewhere (`halbach_fe.cluster`).
+    processes : int
+        MPI processes of every run, for a solve that is too large for one.
     """
 
     getdp: GetDP
@@ -77,6 +85,9 @@ class Workshop:
     jobs: int = 1
     time_limit_s: float = 3600.0
     progress: Progress | None = None
+    cache: Cache | None = None
+    run: Run = runner.run
+    processes: int = 1
 
 
 @dataclass(frozen=True)
@@ -258,7 +269,6 @@ def assemble(study: Study, workshop: Workshop, formulation: Formulation) -> Asse
     def keep_matrix(folder: Path, unknowns: Unknowns, _: NDArray[np.floating]) -> None:
         kept["unknowns"] = unknowns
         kept["matrix"] = read_matrix(folder / MATRIX_FILE, unknowns.count)
-        (folder / MATRIX_FILE).unlink()
 
     def keep_solutions(_: Path, __: Unknowns, solutions: NDArray[np.floating]) -> None:
         kept["solutions"] = np.array(solutions, float)
@@ -335,7 +345,7 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
 
     def run(task: Task) -> Floats:
         with _run_folder(workshop.folder, task.name, cancel) as folder:
-            job = task.stage(folder)
+            job = replace(task.stage(folder), processes=workshop.processes)
             if task.matrix:
                 job = replace(job, matrix=MATRIX_FILE)
             history: list[str] = []
@@ -345,11 +355,18 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
                 if line.startswith("NEWTON"):
                     history.append(line)
 
+            kept = workshop.cache.entry(workshop.getdp, job, folder) if workshop.cache else None
             try:
-                runner.run(workshop.getdp, job, folder, see, cancel)
+                if kept is None or not kept.restore(see):
+                    workshop.run(workshop.getdp, job, folder, see, cancel)
             except GetDPError as error:
                 raise _with_history(error, newton_residuals(history)) from None
-            return task.read(folder)
+            result = task.read(folder)
+            if kept is not None:
+                kept.store()  # what was read and found sound
+            for name in job.large:  # and not needed to run the folder by hand
+                (folder / name).unlink()
+            return result
 
     with ThreadPoolExecutor(max(1, workshop.jobs)) as pool:
         futures = [pool.submit(run, task) for task in tasks]
@@ -363,6 +380,8 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
             cancel.set()  # on failure and on Ctrl-C nobody waits for the others
             for future in futures:
                 future.cancel()
+            if workshop.cache is not None:
+                workshop.cache.trim()
 
 
 def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
@@ -428,7 +447,6 @@ def _source_task(
         result = _fields(case, unknowns, case.located, solutions)
         if keep is not None:
             keep(folder, unknowns, solutions)
-        (folder / SOLUTIONS_FILE).unlink()  # large, and not needed to run the folder by hand
         return result
 
     return Task(
@@ -464,14 +482,12 @@ def _newton_task(
         saved = read_saved(folder / _saved(case), unknowns.count, len(samples))
         compare_printed(_fields(case, unknowns, probes, saved[:1])[0], folder / NEWTON_FILE, places)
         fields = _fields(case, unknowns, case.located, saved)
-        (folder / _saved(case)).unlink()
         if not gateaux:
             return fields
         derivatives = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, columns, steps)
         compare_printed(_fields(case, unknowns, probes, derivatives[:1])[0],
                         folder / FLUX_DENSITY_FILE, places)
         fields = np.concatenate([fields, _fields(case, unknowns, case.located, derivatives)])
-        (folder / SOLUTIONS_FILE).unlink()
         return fields
 
     return Task(f"getdp-{_variant(vacuum)}", fill, read, len(samples) + columns)
@@ -511,13 +527,13 @@ def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
 
 def newton_history(folder: Path) -> list[float]:
     """Relative residuals of Newton's method in the run that a workshop's folder keeps."""
-    log = folder / f"getdp-{_variant(False)}" / "getdp.log"
+    log = folder / f"getdp-{_variant(False)}" / runner.LOG_NAME
     return newton_residuals(log.read_text("utf-8").splitlines())[-1]
 
 
 def write_history(folder: Path) -> int:
     """Keep the residuals of a run's log as a table; return the number of steps."""
-    history = newton_residuals((folder / "getdp.log").read_text("utf-8").splitlines())
+    history = newton_residuals((folder / runner.LOG_NAME).read_text("utf-8").splitlines())
     rows = [f"{sample},{step},{residual:.6e}" for sample, residuals in enumerate(history)
             for step, residual in enumerate(residuals)]
     (folder / NEWTON_HISTORY).write_text("\n".join(["sample,step,residual", *rows, ""]), "utf-8")
@@ -590,7 +606,8 @@ def _run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pa
     """A private folder, kept as ``name`` after a good run and as ``name-failed`` (with the log)
     after a bad one; anything else that ends the run leaves nothing.
     """
-    folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=make_folder(parent)))
+    remove_left_behind(make_folder(parent))
+    folder = Path(tempfile.mkdtemp(prefix=name_in_the_making(name), dir=parent))
     try:
         yield folder
         _replace(folder, parent / name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from halbach_fe.cache import LIMIT_VARIABLE
 from halbach_fe.getdp import GetDP, find_getdp
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study, parse_study
@@ -19,6 +21,8 @@ ROOT = Path(__file__).parent.parent
 
 settings.register_profile("patient", deadline=None)  # on a busy machine time says nothing
 settings.load_profile("patient")
+
+os.environ[LIMIT_VARIABLE] = "0"  # tests compute; those of the cache name one of their own
 
 # A dipole of FASER's cross-section; sizes coarse enough for tests.
 DIPOLE: dict[str, Any] = {

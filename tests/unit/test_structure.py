@@ -12,11 +12,12 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
          for path in (ROOT / folder).rglob("*.py")]
 
 # Later rooms may import earlier ones, never the other way round.
-ORDER = ["errors", "analytic", "materials", "study", "study_file", "blocks", "symmetry", "extent",
-         "regions", "exact_field", "external", "geo", "mesh", "field_map", "formats", "new_study",
-         "instrument", "block_table", "getdp", "solutions", "evaluation", "condensed", "inference",
-         "measured_prior", "solve", "azimuthal", "routes", "observation", "discretization",
-         "response", "nonlinear", "update", "sampled",
+ORDER = ["errors", "in_the_making", "analytic", "materials", "study", "study_file", "blocks",
+         "symmetry", "extent", "regions", "exact_field", "external", "geo", "mesh", "field_map",
+         "formats", "new_study", "instrument", "block_table", "getdp", "cache", "cluster",
+         "solutions", "evaluation", "condensed", "inference", "measured_prior", "solve",
+         "azimuthal", "routes", "observation", "discretization", "response", "nonlinear", "update",
+         "sampled",
          "scene", "effects", "diagnosis", "diagnose", "next_measurement", "diagnosed",
          "planning", "sensitivity", "demagnetization", "verification", "cost", "multipoles",
          "remounting", "shimming", "sorting", "tolerance", "campaign", "report", "cli"]

@@ -1,0 +1,44 @@
+"""Names of files and folders in the making, and what is left of them when a process was killed.
+
+Whatever is written appears whole or not at all: it is made under a name of its own beside its
+place, and renamed. A process that is killed cannot tidy up; who comes next sees by the name that
+nobody works on it any more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import socket
+from pathlib import Path
+
+_NAME = re.compile(r"\..+~(?P<host>[^~]+)~(?P<process>\d+)~")
+
+
+def name_in_the_making(name: str) -> str:
+    """How the name of something begins while this process is making it."""
+    return f".{name}~{socket.gethostname()}~{os.getpid()}~"
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Remove what processes of this machine that are gone were making in a folder."""
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            match = _NAME.match(path.name)
+            if match and match["host"] == socket.gethostname() and not _runs(int(match["process"])):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
