@@ -6,12 +6,14 @@ import argparse
 import hashlib
 import json
 import math
+import multiprocessing
 import os
 import signal
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from halbach_fe.cache import default_cache
+from halbach_fe.cache import Cache, default_cache
 from halbach_fe.cluster import connected
 from halbach_fe.cost import TIME_FACTOR, Estimate
 from halbach_fe.errors import HalbachError, HalbachWarning
@@ -240,16 +242,31 @@ def guarded(run: Callable[[], int]) -> int:
 def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
     """A workshop in the output folder; shows progress on a terminal's stderr."""
     getdp = find_getdp(arguments.getdp)
-    cache = None if arguments.no_cache else default_cache(arguments.cache)
     with progress_bar("solving") as show, ExitStack() as stack:
         made = Workshop(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
-            time_limit_s=arguments.time_limit, progress=show, cache=cache,
+            time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)
         if arguments.scheduler:
             cluster = stack.enter_context(connected(arguments.scheduler))
             made = replace(made, run=cluster.run, jobs=arguments.jobs or cluster.cores)
         yield made
+
+
+def cache(arguments: argparse.Namespace) -> Cache | None:
+    """Where answers of GetDP are kept."""
+    return None if arguments.no_cache else default_cache(arguments.cache)
+
+
+@contextmanager
+def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
+    """What runs independent functions: processes of this machine, or the --scheduler's workers."""
+    if arguments.scheduler:
+        with connected(arguments.scheduler) as cluster:
+            yield cluster.executor
+        return
+    with ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn")) as pool:
+        yield pool
 
 
 def jobs(arguments: argparse.Namespace) -> int:

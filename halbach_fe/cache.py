@@ -3,8 +3,9 @@
 An entry is a folder, named by the SHA-256 of everything GetDP was given: the files of its run
 folder (mesh, problem, generated part), the options and constants of the job, and GetDP's version
 and build. It holds what GetDP wrote, and a manifest with the SHA-256 of every file; those are
-compared whenever it is used. Entries appear whole (a rename) and belong to nobody, so that several processes
-may share a cache. When it is larger than its limit, the entries that were not used for longest go.
+compared whenever it is used. Entries appear whole (a rename) and belong to nobody, so that several
+processes may share a cache. When it is larger than its limit, the entries that were not used for
+longest go.
 """
 
 from __future__ import annotations

@@ -316,8 +316,8 @@ def _execute(
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
             start_new_session=True)
     except OSError as error:
-        hint = " Is `mpirun` installed (Debian: openmpi-bin)?" if job.processes > 1 else ""
-        raise _failure(f"it could not be started ({error.strerror}){hint}", folder) from None
+        what = "`mpirun` (Debian: openmpi-bin)" if job.processes > 1 else "it"
+        raise _failure(f"{what} could not be started ({error.strerror})", folder) from None
 
     def read() -> None:
         assert process.stdout is not None

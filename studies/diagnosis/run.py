@@ -9,14 +9,17 @@ independent, and --jobs of them run at a time::
 from __future__ import annotations
 
 import argparse
+import atexit
 import itertools
 import json
-import multiprocessing
 import os
+import shutil
 import sys
+import tempfile
+import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.block_table import BlockTable
+from halbach_fe.cache import Cache
 from halbach_fe.campaign.effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.campaign.extras import needed
 from halbach_fe.campaign.simulate import simulate
@@ -35,6 +39,7 @@ from halbach_fe.effects import catalogue
 from halbach_fe.errors import CheckFailedError, HalbachError
 from halbach_fe.extent import magnet_half_length
 from halbach_fe.field_map import points_of
+from halbach_fe.getdp import find_getdp
 from halbach_fe.report.sealed_cases import write_sealed_cases
 from halbach_fe.solve import Workshop
 from halbach_fe.study import HeldOut, Study, read_study
@@ -280,19 +285,23 @@ def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
     return rows
 
 
-_solver: dict[Path, Solver] = {}
-"""Of this process, which keeps what it solved for other cases."""
+_known: dict[int, tuple[Workshop, Solver]] = {}
+"""Of each thread of a worker: where it works, and what it solved for other cases."""
 
 
-def run_one(study: Study, case: Case, workshop: Workshop, path: Path) -> str:
-    """Run a case in a process of its own and keep what came of it; return why not, if it failed."""
-    there = replace(workshop, folder=workshop.folder / f"work-{os.getpid()}")
-    solver = _solver.setdefault(there.folder, remembering(there))
+def run_one(
+    study: Study, case: Case, getdp: str | None, time_limit_s: float, cache: Cache | None
+) -> dict[str, Any]:
+    """Run a case, on any machine; return what came of it, or why nothing did as ``failure``."""
     try:
-        write_text(path, json.dumps(run_case(study, case, there, solver), indent=1) + "\n")
+        if threading.get_ident() not in _known:
+            folder = Path(tempfile.mkdtemp(prefix="halbach-fe-"))
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            workshop = Workshop(find_getdp(getdp), folder, time_limit_s=time_limit_s, cache=cache)
+            _known[threading.get_ident()] = workshop, remembering(workshop)
+        return run_case(study, case, *_known[threading.get_ident()])
     except HalbachError as error:
-        return str(error)
-    return ""
+        return {"failure": str(error)}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -303,17 +312,18 @@ def run(arguments: argparse.Namespace) -> int:
         chosen = [one for one in chosen if one.seed in arguments.only]
     paths = {case: arguments.output / "cases" / f"{case.name}.json" for case in chosen}
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the cases share the cores
-    with (common.workshop(arguments) as workshop,
-          ProcessPoolExecutor(arguments.jobs, multiprocessing.get_context("spawn")) as pool):
-        alone = replace(workshop, jobs=1, progress=None)
-        waiting = {pool.submit(run_one, study, case, alone, path): case
+    cache = common.cache(arguments)
+    with common.workers(arguments) as pool:
+        waiting = {pool.submit(
+            run_one, study, case, arguments.getdp, arguments.time_limit, cache): case
                    for case, path in paths.items() if not path.exists()}
         for number, future in enumerate(as_completed(waiting), start=1):
-            case = waiting[future]
-            failure = future.result()
+            case, found = waiting[future], future.result()
+            if "failure" not in found:
+                write_text(paths[case], json.dumps(found, indent=1) + "\n")
             common.say(f"{number}/{len(waiting)} " + (
-                f"{case.name} failed: {failure}" if failure
-                else sentence(json.loads(paths[case].read_text()))))
+                f"{case.name} failed: {found['failure']}" if "failure" in found
+                else sentence(found)))
     results = [json.loads(path.read_text()) for path in paths.values() if path.exists()]
     rates = report(study, results, arguments.output)
     missed = [f"{len(paths) - len(results)} cases failed"] * (len(results) < len(paths)) + [
