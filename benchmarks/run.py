@@ -14,13 +14,13 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import diagnosis, inference, nonlinear, response
+from benchmarks import diagnosis, inference, nonlinear, recovery, response
 from halbach_fe.cli import common
 from halbach_fe.update import write_text
 
 RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
-         "inference": inference.run, "diagnosis": diagnosis.run}
+         "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run}
 
 
 def main() -> None:

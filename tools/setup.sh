@@ -13,8 +13,9 @@ libraries="libgl1 libglu1-mesa libxcursor1 libxft2 libxinerama1 libxrender1"
 missing=""
 getdp=${HALBACH_FE_GETDP:-getdp}
 command -v "$getdp" >/dev/null 2>&1 || missing="getdp libopenblas0-pthread"
-if [ "$extra" = test ]; then  # pages are opened in it
+if [ "$extra" = test ]; then  # pages are opened in the one, runs shared by the other
     command -v chromium >/dev/null 2>&1 || missing="$missing chromium"
+    command -v mpirun >/dev/null 2>&1 || missing="$missing openmpi-bin"
 fi
 usable="import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
 "$python" -c "$usable" >/dev/null 2>&1 || missing="$missing python3 python3-venv"

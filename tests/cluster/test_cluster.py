@@ -11,9 +11,9 @@ import threading
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from halbach_fe.cli import main
@@ -124,9 +124,7 @@ def test_work_of_a_lost_worker_is_done_again(grid, cluster, workshop, dipole, tm
     doomed.send_signal(signal.SIGKILL)
     doomed.wait()
     assert not found
-    while alive(child):  # GetDP goes with it
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    child.wait(timeout=30)  # GetDP goes with it
     grid.worker()
     thread.join(timeout=120)
     assert np.array_equal(found[0], alone)
@@ -134,17 +132,7 @@ def test_work_of_a_lost_worker_is_done_again(grid, cluster, workshop, dipole, tm
 
 def children_of(pid):
     """Runs of GetDP that a process has started; asking for the version is none."""
-    said = subprocess.run(["ps", "--ppid", str(pid), "-o", "pid=,args="], capture_output=True,
-                          text=True, check=False).stdout
-    return [int(line.split()[0]) for line in said.splitlines() if " -solve " in line]
-
-
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+    return [child for child in psutil.Process(pid).children() if "-solve" in child.cmdline()]
 
 
 def test_what_nobody_waits_for_ends(grid, cluster, workshop, dipole, tmp_path):
@@ -174,9 +162,7 @@ def test_what_nobody_waits_for_ends(grid, cluster, workshop, dipole, tmp_path):
     cancel.set()
     thread.join(timeout=30)
     assert "cancelled" in errors[0]
-    while alive(child):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    child.wait(timeout=30)
 
 
 def test_a_worker_with_another_getdp_is_refused(grid, cluster, workshop, dipole, tmp_path):
