@@ -22,6 +22,9 @@ from halbach_fe.cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.cli import common
 
 EXAMPLE = Path(__file__).parent.parent / "studies" / "quadrupole"
+ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}
+"""Of whole files."""
+
 KILLS = {"solve": 8, "infer": 9, "diagnose": 6}
 
 
@@ -94,7 +97,7 @@ def unreadable(folder: Path) -> list[str]:
                 xr.open_dataset(path, engine="h5netcdf").close()
             except Exception as error:  # any, it must not fail
                 found.append(f"{path.name}: {error}")
-        elif path.suffix in (".json", ".csv", ".html") and not path.read_bytes().endswith(b"\n"):
+        elif not path.is_dir() and not path.read_bytes().endswith(ENDS.get(path.suffix, b"")):
             found.append(f"{path.name} is cut off")
     return found
 

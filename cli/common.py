@@ -10,6 +10,8 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -265,8 +267,22 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
         with connected(arguments.scheduler) as cluster:
             yield cluster.executor
         return
-    with ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn")) as pool:
-        yield pool
+    with ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn"),
+                             _end_with, (os.getpid(),)) as pool:
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has, however that ended."""
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def jobs(arguments: argparse.Namespace) -> int:

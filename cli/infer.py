@@ -65,8 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
                 write_sampled,
             )
 
-            sampled = sample_posterior(update, workshop, arguments.samples, seed=arguments.seed,
-                                       say=common.say)
+            with common.workers(arguments) as pool:
+                sampled = sample_posterior(update, workshop, arguments.samples,
+                                           seed=arguments.seed, say=common.say, mapped=pool.map)
             update = with_samples(update, sampled)
             write_sampled(sampled, arguments.output)
     if update.response.reused:

@@ -18,7 +18,7 @@ and accelerates (D. G. Anderson, J. ACM 12 (1965) 547; H. F. Walker, P. Ni, SIAM
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import scipy.sparse as sparse
@@ -97,6 +97,10 @@ class Condensed:
         tangent = self._factorize(self.potential @ self.reference + added)
         object.__setattr__(self, "_state", _Reference(
             added, tangent, self._added_slope(self.reference, added, tangent)))
+
+    def __reduce__(self) -> tuple[type[Condensed], tuple[object, ...]]:
+        """Travels without the factorization, which is made again where it arrives."""
+        return Condensed, tuple(getattr(self, one.name) for one in fields(self) if one.init)
 
     def solve(
         self, parameters: Floats, tolerance_T: float = 1e-9, newton: bool = False

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import OutputError, SamplingError
@@ -53,6 +55,9 @@ LIKELIHOOD_ERROR = 1e-2
 a standard deviation allow each to be off by this part of it over n."""
 
 SMALLEST_TOLERANCE_T = 1e-9
+Map = Callable[..., Iterable[Any]]
+"""`map`, or that of a `concurrent.futures.Executor`."""
+
 MIN_DRAWS = 20
 
 
@@ -97,6 +102,7 @@ class Sampled:
 def sample_posterior(
     update: Update, workshop: Workshop, draws: int, chains: int = 4, seed: int = 1,
     effective: float = 400.0, say: Callable[[str], None] = lambda text: None,
+    mapped: Map = map,
 ) -> Sampled:
     """Sample the posterior of an update whose iron has an H(B) curve.
 
@@ -108,6 +114,9 @@ def sample_posterior(
         Draws of each chain, of which the first tenth is discarded; chains.
     effective : float
         Effective samples that every parameter must reach.
+    mapped : callable
+        Runs a function for every chain like `map`, one after another; that of an executor runs
+        them at a time, with the same result.
 
     Raises
     ------
@@ -122,7 +131,7 @@ def sample_posterior(
     train = ~update.held_out
     errors = update.noise.plus(model.error).part(train)
     tolerance = max(SMALLEST_TOLERANCE_T, LIKELIHOOD_ERROR * errors.finest / len(errors))
-    target = Posterior(lambda p: model(p, tolerance)[train], update.readings[train], errors,
+    target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors,
                        update.prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
     generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
@@ -136,9 +145,12 @@ def sample_posterior(
     key = _key(update, model, chains, seed)
     target.solves += _resume(path, key, runs)
     while len(runs[0].samples) < draws:
-        for run in runs:
-            run.go_on(sample(target, moves, min(CHUNK, draws - len(run.samples)), run.generator,
-                             run.last, first=len(run.samples)))
+        steps = [(target, moves, min(CHUNK, draws - len(run.samples)), run.generator, run.last,
+                  len(run.samples)) for run in runs]
+        for run, (chain, generator, solves) in zip(
+                runs, mapped(_advance, *zip(*steps, strict=True)), strict=True):
+            run.go_on(chain, generator)
+            target.solves += solves
         _store(path, key, runs, model.parameters, target.solves)
         say(f"{len(runs[0].samples)} of {draws} draws")
     kept = np.array([run.samples[draws // 10:draws] for run in runs])
@@ -156,6 +168,27 @@ def sample_posterior(
         Prediction(predicted.mean(axis=0), predicted.std(axis=0), lambda rows: spread[:, rows].T))
 
 
+@dataclass(frozen=True)
+class _Readings:
+    """Those that update the model, by magnetization."""
+
+    model: NonlinearModel
+    tolerance_T: float
+    train: NDArray[np.bool_]
+
+    def __call__(self, magnetization: Floats) -> Floats:
+        return self.model(magnetization, self.tolerance_T)[self.train]
+
+
+def _advance(
+    target: Posterior, moves: Sequence[Move], count: int, generator: np.random.Generator,
+    last: Floats, first: int,
+) -> tuple[Chain, np.random.Generator, int]:
+    """Some more steps of a chain, on any machine; with its generator and the solves they took."""
+    own = replace(target)  # counts from zero
+    return sample(own, moves, count, generator, last, first=first), generator, own.solves
+
+
 @dataclass
 class _Run:
     """A chain in the making."""
@@ -165,8 +198,9 @@ class _Run:
     samples: Floats = field(default_factory=lambda: np.empty((0, 0)))
     accepted: float = 0.0
 
-    def go_on(self, chain: Chain) -> None:
-        """Append."""
+    def go_on(self, chain: Chain, generator: np.random.Generator) -> None:
+        """Append; the generator is where the chain left it."""
+        self.generator = generator
         before = len(self.samples)
         self.samples = np.vstack([self.samples, chain.samples]) if before else chain.samples
         total = len(self.samples)

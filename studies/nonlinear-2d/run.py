@@ -59,8 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
         with common.workshop(arguments) as workshop:
             there = replace(workshop, folder=folder)
             update = infer(study, read_map(HERE / f"map-{case}.csv"), there, prior=prior)
-            found = sample_posterior(update, there, arguments.samples, effective=EFFECTIVE,
-                                     say=common.say)
+            with common.workers(arguments) as pool:
+                found = sample_posterior(update, there, arguments.samples, effective=EFFECTIVE,
+                                         say=common.say, mapped=pool.map)
         write_sampled(found, folder)
         updated = with_samples(update, found)
         results[f"{what}: prior"] = dict(scores(prior, truth))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import ngsolve
@@ -114,7 +116,9 @@ def test_stored_for_arviz(campaign, found):
 
 
 def test_interrupted_chains_go_on(campaign, found):
-    """What an interrupted run stored is used, and the result is that of an undisturbed one."""
+    """What an interrupted run stored is used, and the result is that of an undisturbed one, also
+    if the chains go on at a time, in processes of their own, to which the model travels.
+    """
     workshop = room(campaign[4], "interrupted")
 
     def interrupt(text):
@@ -124,7 +128,8 @@ def test_interrupted_chains_go_on(campaign, found):
     with pytest.raises(KeyboardInterrupt):
         sample_posterior(campaign[3], workshop, 1000, say=interrupt)
     said: list[str] = []
-    again = sample_posterior(campaign[3], workshop, 1000, say=said.append)
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        again = sample_posterior(campaign[3], workshop, 1000, say=said.append, mapped=pool.map)
     assert said[1].startswith("750")
     np.testing.assert_array_equal(again.draws, found.draws)
 
