@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import hashlib
 import json
 import math
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 import threading
@@ -20,6 +22,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import scipy.linalg as linalg
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -28,7 +32,7 @@ from rich.table import Table
 from halbach_fe.cache import Cache, default_cache
 from halbach_fe.cluster import connected
 from halbach_fe.cost import TIME_FACTOR, Estimate
-from halbach_fe.errors import HalbachError, HalbachWarning
+from halbach_fe.errors import OUT_OF_MEMORY, HalbachError, HalbachWarning
 from halbach_fe.getdp import find_getdp
 from halbach_fe.multipoles import DEFAULT_ORDERS, Reference
 from halbach_fe.solve import Workshop
@@ -222,6 +226,7 @@ def guarded(run: Callable[[], int]) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("once", HalbachWarning)
             warnings.showwarning = lambda message, *_: say(f"warning: {message}")
+            _claim_buffers()
             return run()
     except HalbachError as error:
         say(f"error: {error}")
@@ -231,13 +236,34 @@ def guarded(run: Callable[[], int]) -> int:
         return 130
     except BrokenPipeError:
         return 0
-    except Exception:
+    except Exception as error:
+        if _for_want_of_memory(error):
+            say(f"error: There is not enough memory ({str(error) or 'it ran out'}). --dry-run "
+                "foretells what solve, infer and verify need; use a coarser mesh, fewer readings "
+                "or --jobs 1.")
+            return OUT_OF_MEMORY
         traceback.print_exc()
         say("error: this is a bug in halbach-fe; please report it with the above.")
         return 1
     finally:
         for number, handler in zip(signals, previous, strict=True):
             signal.signal(number, handler)
+
+
+def _for_want_of_memory(error: Exception) -> bool:
+    """Whether that is the cause; of libraries and threads only the text tells."""
+    return (isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+            or any(text in str(error) for text in (
+                "failed to map segment", "can't start new thread")))
+
+
+def _claim_buffers() -> None:
+    """Under a limit of memory, have OpenBLAS take what it needs while there is some: it keeps that,
+    and where it gets nothing it tries forever.
+    """
+    if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        some = np.eye(200)  # numpy and scipy have one each
+        linalg.cholesky(some @ some)
 
 
 @contextmanager

@@ -98,6 +98,8 @@ class CheckFailedError(HalbachError):
     exit_code = 9
 
 
+OUT_OF_MEMORY = 13
+
 EXIT_CODES: dict[int, str] = {
     0: "success",
     1: "unexpected error (a bug: please report it)",
@@ -112,6 +114,7 @@ EXIT_CODES: dict[int, str] = {
     SamplingError.exit_code: "the posterior was not sampled well enough",
     ExtraMissingError.exit_code: "an optional part is not installed",
     SchedulerError.exit_code: "the Dask scheduler or its workers failed",
+    OUT_OF_MEMORY: "not enough memory",
     130: "interrupted (Ctrl-C)",
 }
 

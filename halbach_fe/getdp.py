@@ -330,10 +330,10 @@ def _execute(
                             on_line(line)
 
     reader = threading.Thread(target=read, daemon=True)
-    reader.start()
     deadline = time.monotonic() + job.time_limit_s
     ended = ""
     try:
+        reader.start()
         while process.poll() is None:
             if cancel is not None and cancel.is_set():
                 ended = "it was cancelled"
@@ -346,7 +346,8 @@ def _execute(
     finally:
         if process.poll() is None:
             _kill(process)
-        reader.join(timeout=10)
+        if reader.is_alive():
+            reader.join(timeout=10)
         _save_log(folder, arguments, lines)
     if ended:
         raise _failure(ended, folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,9 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.recovery import unreadable
 from halbach_fe.blocks import blocks_of
+from halbach_fe.cache import LIMIT_VARIABLE
 from halbach_fe.cli import main, parser
 from halbach_fe.errors import EXIT_CODES
 from halbach_fe.field_map import field_map, points_of, read_map, write_map
@@ -369,6 +372,22 @@ def test_full_disk(study, small_disk, capsys):
     assert not list(small_disk.rglob(".field_map*"))
 
 
+@pytest.mark.parametrize("small_disk", [16, 256], indirect=True)
+def test_full_disk_of_the_cache(study, small_disk, tmp_path, monkeypatch, capsys):
+    """Costs a warning, and what was kept is whole."""
+    monkeypatch.setenv(LIMIT_VARIABLE, "1")
+    assert main(["solve", str(study), "-o", str(tmp_path / "out"), "--cache",
+                 str(small_disk)]) == 0
+    said = capsys.readouterr().err
+    assert "not kept in the cache" in said
+    kept = list(small_disk.glob("*/*/manifest.json"))
+    assert bool(kept) == (os.statvfs(small_disk).f_blocks * os.statvfs(small_disk).f_frsize > 1e5)
+    assert not list(small_disk.glob("*/.*"))
+    assert main(["solve", str(study), "-o", str(tmp_path / "again"), "--cache",
+                 str(small_disk)]) == 0
+    assert "damaged" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("small_disk", [16, 32], indirect=True)
 def test_full_disk_while_writing_results(study, small_disk, capsys):
     """HDF5 must not crash the process when its file finds no room."""
@@ -378,6 +397,53 @@ def test_full_disk_while_writing_results(study, small_disk, capsys):
     assert code == 8
     assert "No space left" in sentence
     assert not list(small_disk.rglob("*field_map*"))
+
+
+@pytest.mark.parametrize("small_disk", [64], indirect=True)
+def test_read_only_folder(study, small_disk, capsys):
+    """Even root cannot write there."""
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    code, sentence = refused(["solve", study, "-o", small_disk / "out"], capsys)
+    assert code == 8
+    assert "Read-only file system" in sentence
+
+
+def test_getdp_that_vanishes(study, tmp_path, capsys):
+    """After it was found; on a network's disk that happens."""
+    fake = fake_getdp(tmp_path, "")
+    fake.write_text(fake.read_text().replace("exit 0", f"rm {fake}; exit 0"))
+    out = tmp_path / "out"
+    code, sentence = refused(["solve", study, "-o", out, "--getdp", fake], capsys)
+    assert code == 7
+    assert "No such file" in sentence
+    assert not list(out.glob("field_map*"))
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from halbach_fe.cli import main
+now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+limit = now + int(sys.argv[1]) * 2**20
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize("extra_MiB", [100, 200, 300, 400])
+def test_memory_limit(study, measured, tmp_path, extra_MiB):
+    """Beyond what the program takes itself: whoever meets it says so, and nothing is broken."""
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(extra_MiB), "infer", str(study), "--measurements",
+         str(measured), "-o", str(out)], env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode in (0, 7, 13), done.stderr
+    if done.returncode:
+        assert re.search(r"not enough memory|Cannot allocate|out of memory", done.stderr)
+        assert "Traceback" not in done.stderr
+    assert not unreadable(out)
+    assert extra_MiB > 100 or done.returncode, "the control: there is no run in so little"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
