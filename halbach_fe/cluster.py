@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +35,26 @@ class Answer:
     failure: str = ""
 
 
+class _Workers(Executor):
+    """Runs functions on workers as if they were alone in the world."""
+
+    def __init__(self, inner: Executor) -> None:
+        self._inner = inner
+
+    def submit(
+        self, fn: Callable[..., Any], /, *args: object, **kwargs: object
+    ) -> Future[Any]:
+        return self._inner.submit(_alone, fn, *args, **kwargs)
+
+
+def _alone(function: Callable[..., Any], *args: object, **kwargs: object) -> object:
+    """Where there is a Dask scheduler, xarray asks it for leave to write a file."""
+    import dask
+
+    with dask.config.set(scheduler="synchronous"):
+        return function(*args, **kwargs)
+
+
 @dataclass(frozen=True)
 class Cluster:
     """A Dask scheduler and its workers."""
@@ -50,8 +70,7 @@ class Cluster:
     @property
     def executor(self) -> Executor:
         """Runs functions on the workers, each under a key of its own."""
-        executor: Executor = self.client.get_executor(pure=False)
-        return executor
+        return _Workers(self.client.get_executor(pure=False))
 
     def run(
         self, getdp: GetDP, job: Job, folder: Path,
@@ -83,9 +102,7 @@ class Cluster:
         except HalbachError:
             raise
         except Exception as error:  # of Dask's own, by many names
-            raise SchedulerError(
-                f"The Dask scheduler {self.address} or its workers failed: "
-                f"{type(error).__name__}: {error} Look into their logs.") from None
+            raise _failed(self.address, error) from None
 
 
 @contextmanager
@@ -115,8 +132,17 @@ def connected(address: str) -> Iterator[Cluster]:
             f"tcp://host:8786; instead at {address}: {error}.") from None
     try:
         yield Cluster(client, address)
+    except Exception as error:
+        if type(error).__module__.startswith("distributed"):
+            raise _failed(address, error) from None
+        raise
     finally:
         client.close()
+
+
+def _failed(address: str, error: Exception) -> SchedulerError:
+    return SchedulerError(f"The Dask scheduler {address} or its workers failed: "
+                          f"{type(error).__name__}: {error} Look into their logs.")
 
 
 def _answer(getdp: GetDP, job: Job, given: dict[str, bytes], home: str) -> Answer:

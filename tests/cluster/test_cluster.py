@@ -15,10 +15,12 @@ from functools import partial
 import numpy as np
 import psutil
 import pytest
+import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.cluster import connected
 from halbach_fe.errors import ExtraMissingError, GetDPError, SchedulerError
+from halbach_fe.field_map import write_hdf5
 from halbach_fe.getdp import ENVIRONMENT_VARIABLE
 from halbach_fe.routes import solve_nominal
 from tests.conftest import ROOT, circle
@@ -52,7 +54,8 @@ class Grid:
         with (self.folder / f"log-{len(self.started)}").open("w") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments], stdout=log, stderr=log,
-                env=os.environ | {"OMP_NUM_THREADS": "1"} | (environment or {}), cwd=self.folder)
+                env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)} | (
+                    environment or {}), cwd=self.folder)
         self.started.append(process)
         return process
 
@@ -196,6 +199,28 @@ def test_functions_go_there_too(grid, cluster):
         cluster.executor.submit(lambda x: (x + offset, os.getpid()), x) for x in range(3)]}
     assert os.getpid() not in pids
     assert list(cluster.executor.map(partial(pow, 2), [1, 2, 3])) == [2, 4, 8]
+
+
+def writes(folder):
+    data = xr.Dataset({"one": ("x", np.arange(3.0))})
+    write_hdf5(data, folder / "data.h5")
+    return data
+
+
+def test_functions_there_write_files(grid, cluster, tmp_path):
+    """For which xarray asks the scheduler, if it knows of one."""
+    grid.worker()
+    data = cluster.executor.submit(writes, tmp_path).result()
+    with xr.open_dataset(tmp_path / "data.h5", engine="h5netcdf") as found:
+        assert found.equals(data)
+
+
+def test_a_function_that_kills_its_workers(grid):
+    """Dask tries it on four of them."""
+    for _ in range(4):
+        grid.worker()
+    with (pytest.raises(SchedulerError, match="KilledWorker"), connected(grid.address) as cluster):
+        cluster.executor.submit(os._exit, 1).result()
 
 
 def test_a_scheduler_that_ends(grid, cluster, workshop, dipole):
