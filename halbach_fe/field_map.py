@@ -27,7 +27,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats
+from halbach_fe.cells import number as number_in
 from halbach_fe.errors import MeasurementError, OutputError, must_be
 from halbach_fe.study import COMPONENTS, MAX_LENGTH_M
 
@@ -175,11 +177,15 @@ def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, 
     """Write columns by name, with attributes as comments; NaN is an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as file:
         for key, value in attributes.items():
-            file.write(f"# {key}: {' '.join(str(value).split())}\n")
+            file.write(f"# {_one_line(key)}: {_one_line(value)}\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         for row in zip(*columns.values(), strict=True):
             writer.writerow([_cell(value) for value in row])
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
 
 
 def write_hdf5(data: xr.Dataset, path: Path) -> None:
@@ -252,11 +258,10 @@ def _write_vtu(data: xr.Dataset, path: Path) -> None:
 def _read_hdf5(path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as opened:
-            data = opened.load()
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        data = foreign.dataset(path)
+    except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
-                                       f"'{str(error).splitlines()[0]}'")) from None
+                                       f"'{error}'")) from None
     for name in ("B_T", *POSITION_COLUMNS):
         if name not in data.variables:
             raise MeasurementError(must_be("variable", where, f"`{name}`", "a file without it"))
@@ -284,11 +289,11 @@ def _read_hdf5(path: Path) -> xr.Dataset:
 def _read_vtu(path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        mesh = meshio.read(path)
+        mesh = foreign.mesh(path)
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
         if "time_s" in mesh.point_data:
             data["time_s"] = ("point", mesh.point_data["time_s"])
-    except (Exception, SystemExit) as error:  # meshio raises, or exits on, whatever it meets
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
                                        f"'{error}'")) from None
     return data
@@ -352,12 +357,10 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
 def finite(cell: str, what: str, where: str, hint: str = "") -> float:
     """The number in a cell; MeasurementError if it is none, or not finite."""
     try:
-        value = float(cell)
+        return number_in(cell)
     except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'", hint))
-    return value
+        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'",
+                                       hint)) from None
 
 
 def check_readings(data: xr.Dataset, path: Path) -> None:

@@ -1,0 +1,128 @@
+"""Files that libraries read for us, and what these must not do with files of unknown origin.
+
+Whatever a library raises becomes ValueError with one line; what it prints or warns of is dropped.
+HDF5 files can name other files to take data from, and can promise any amount of data: both are
+refused before anything is read. No such file holds code: nothing here unpickles.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+SMALL = 1 << 26
+"""Bytes of data that any file may promise."""
+
+MOST_COMPRESSED = 100
+"""Times a file's size, of data in it, beyond `SMALL`. Ours are not compressed at all."""
+
+MAX_OBJECTS = 10_000
+"""Of an HDF5 file; groups may contain one another without end."""
+
+
+def dataset(path: Path, group: str | None = None) -> xr.Dataset:
+    """Labelled data of an HDF5 file, or one of its groups, in memory.
+
+    Raises
+    ------
+    OSError
+        If there is no such file.
+    ValueError
+        If it is damaged, or refused as `hdf5` says.
+    """
+    raw = path.read_bytes()
+    with _refusing():
+        with hdf5(raw):
+            pass
+        with xr.open_dataset(io.BytesIO(raw), group=group, engine="h5netcdf",
+                             phony_dims="sort") as opened:
+            return opened.load()
+
+
+def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Values of just this shape, all of them finite; ValueError for any others."""
+    values = np.asarray(data.values, float)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise ValueError(f"it must be {shape} finite numbers")
+    return values
+
+
+@contextlib.contextmanager
+def hdf5(raw: bytes) -> Iterator[Any]:
+    """Open HDF5 data.
+
+    Raises
+    ------
+    ValueError
+        If they are damaged, take data from other files (external links, external storage, virtual
+        datasets), hold objects that are no text, or promise more than a file of this size can hold.
+    """
+    with _refusing():
+        file = h5py.File(io.BytesIO(raw), "r")
+    with file, np.errstate(all="ignore"):
+        with _refusing():
+            _check(file, max(SMALL, MOST_COMPRESSED * len(raw)))
+        yield file
+
+
+def mesh(path: Path) -> meshio.Mesh:
+    """A file that meshio reads.
+
+    Raises
+    ------
+    ValueError
+        If meshio does not, or ends the program, as it does for some.
+    """
+    with _refusing():
+        return meshio.read(path)
+
+
+def _check(file: Any, limit: int) -> None:
+    waiting, found, promised = [file], 0, 0
+    while waiting:
+        group = waiting.pop()
+        for name in group:
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.SoftLink):  # what it is another name of comes by itself
+                continue
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"`{name}` is in another file")
+            node = group[name]
+            found += 1
+            if found > MAX_OBJECTS:
+                raise ValueError(f"it holds more than {MAX_OBJECTS} objects")
+            if isinstance(node, h5py.Group):
+                waiting.append(node)
+            elif isinstance(node, h5py.Dataset):
+                if node.external or node.is_virtual:
+                    raise ValueError(f"`{name}` takes its data from another file")
+                if node.dtype.hasobject and h5py.check_string_dtype(node.dtype) is None:
+                    raise ValueError(f"`{name}` holds neither numbers nor text")
+                promised += (node.size or 0) * max(1, node.dtype.itemsize)
+                if promised > limit:
+                    raise ValueError(f"`{name}` would be {promised:.2g} bytes, in a file too small "
+                                     "for that")
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """Turn what a library does with a bad file into one ValueError."""
+    silent = io.StringIO()
+    try:
+        with (warnings.catch_warnings(), contextlib.redirect_stdout(silent),
+              contextlib.redirect_stderr(silent)):
+            warnings.simplefilter("ignore")
+            yield
+    except (Exception, SystemExit) as error:
+        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise ValueError(reason) from None
