@@ -102,9 +102,10 @@ def read_blocks(path: str | Path) -> BlockTable:
 
     def texts(name: str) -> tuple[str, ...]:
         for number, row in lines:
-            if not row[name]:
-                raise MeasurementError(must_be(f"{name} in line {number}", where, "given",
-                                               "an empty cell"))
+            if not row[name] or row[name].startswith("#"):  # which begins a comment
+                raise MeasurementError(must_be(f"{name} in line {number}", where,
+                                               "given, and not begin with #",
+                                               f"'{row[name]}'" if row[name] else "an empty cell"))
         return tuple(row[name] for _, row in lines)
 
     return BlockTable(

@@ -9,7 +9,6 @@ An error of any other type that reaches the command line is a bug of ours (exit 
 
 from __future__ import annotations
 
-
 MAX_SENTENCE, MAX_QUOTED = 3000, 1000
 """Characters of an error, and of what it quotes, which may be a path or a list of keys."""
 

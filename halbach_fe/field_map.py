@@ -245,7 +245,7 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
 def _cell(value: object) -> str:
     if isinstance(value, float | np.floating):
         return "" if np.isnan(value) else repr(float(value))
-    return str(value)
+    return _one_line(value)
 
 
 def _write_vtu(data: xr.Dataset, path: Path) -> None:
@@ -280,6 +280,8 @@ def _read_hdf5(path: Path) -> xr.Dataset:
             continue
         numeric = name == "scan" or np.issubdtype(data[name].dtype, np.floating) or (
             np.issubdtype(data[name].dtype, np.integer))
+        if name == "scan" and data[name].dtype.kind in "OST":
+            data[name] = data[name].astype(str)
         if data[name].dims != dims or not numeric:
             raise MeasurementError(must_be(f"`{name}`", where, f"numbers labelled {dims}",
                                            f"{data[name].dtype} labelled {data[name].dims}"))
@@ -329,10 +331,19 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
 
 def _cells(line: str, number: int, where: str) -> list[str]:
     try:
-        return [cell.strip() for cell in next(csv.reader([line]))]
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
         raise MeasurementError(must_be(f"line {number}", where, "comma-separated values",
                                        f"'{error}'")) from None
+    _check_printable(cells, f"line {number}", where)
+    return cells
+
+
+def _check_printable(names: Iterable[str], what: str, where: str) -> None:
+    """Serial numbers, types and scans go to terminals and into other files."""
+    for name in names:
+        if not name.isprintable():
+            raise MeasurementError(must_be(what, where, "without control characters", f"'{name}'"))
 
 
 def _check_header(header: list[str], where: str) -> None:
@@ -382,6 +393,8 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
             raise MeasurementError(must_be("sigma", where, "positive for every reading",
                                            "zero, a negative or a missing one"))
+    if "scan" in data:
+        _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)
 
 

@@ -16,8 +16,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
 
-from tests.fuzz.contract import TIME_LIMIT_S, BrokenError, Reader, outcome
-from tests.fuzz.mutation import damaged
+from tests.fuzz.contract import TIME_LIMIT_S, BrokenError, Reader, refusal
+from tests.fuzz.mutation import made
 from tests.fuzz.readers import readers
 
 MEMORY = 1 << 31
@@ -26,13 +26,9 @@ MEMORY = 1 << 31
 KEPT = Path("build", "fuzz")
 
 
-def made(reader: Reader, seed: int, number: int) -> bytes:
+def numbered(reader: Reader, seed: int, number: int) -> bytes:
     """The input of a number; the same in every run with a seed."""
-    random = Random(f"{reader.name} {seed} {number}")
-    if reader.made is not None and random.random() < 0.5:
-        content = reader.made(random)
-        return damaged([content], reader.tokens, random) if random.random() < 0.3 else content
-    return damaged(reader.seeds, reader.tokens, random)
+    return made(reader, Random(f"{reader.name} {seed} {number}"))
 
 
 def work(reader: Reader, seed: int, first: int, seconds: float, tell: Connection) -> None:
@@ -48,7 +44,8 @@ def work(reader: Reader, seed: int, first: int, seconds: float, tell: Connection
         while time.monotonic() < end:
             tell.send((number, "begun"))
             try:
-                tell.send((number, outcome(reader, made(reader, seed, number), folder)))
+                said = refusal(reader, numbered(reader, seed, number), folder)
+                tell.send((number, "refused" if said else "read"))
             except BrokenError as error:
                 tell.send((number, error))
             number += 1
@@ -67,7 +64,7 @@ def fuzz(reader: Reader, seed: int, seconds: float) -> tuple[dict[str, int], dic
             defects[kind] = number
             KEPT.mkdir(parents=True, exist_ok=True)
             name = f"{reader.name} {seed} {number}".replace(" ", "-")
-            (KEPT / name).write_bytes(made(reader, seed, number))
+            (KEPT / name).write_bytes(numbered(reader, seed, number))
             sys.stderr.write(f"{reader.name}, input {number}: {kind}\n{detail}\n")
 
     while time.monotonic() < end:

@@ -62,8 +62,8 @@ class Reader:
     made: Callable[[Any], bytes] | None = None
 
 
-def outcome(reader: Reader, content: bytes, folder: Path) -> str:
-    """Read a file of this content in a folder: ``read`` or ``refused``.
+def refusal(reader: Reader, content: bytes, folder: Path) -> str:
+    """Read a file of this content in a folder; return what is said against it, or nothing.
 
     Raises
     ------
@@ -80,19 +80,19 @@ def outcome(reader: Reader, content: bytes, folder: Path) -> str:
               contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed)):
             warnings.simplefilter("error")
             reader.valid(reader.read(path))
-        found = "read"
+        said = ""
     except HalbachError as error:
         if reader.refusal is None or type(error) is not reader.refusal:
             raise _broken(error) from error
-        _check_sentence(str(error), reader)
-        found = "refused"
+        said = str(error)
+        _check_sentence(said, reader)
     except (Exception, SystemExit) as error:
         raise _broken(error) from error
     if printed.getvalue():
         raise BrokenError("it prints", printed.getvalue())
     if _listing(folder) != before or path.read_bytes() != content:
         raise BrokenError("it writes", f"{before} became {_listing(folder)}")
-    return found
+    return said
 
 
 def _check_sentence(sentence: str, reader: Reader) -> None:

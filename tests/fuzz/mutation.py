@@ -6,6 +6,8 @@ import re
 from collections.abc import Callable, Sequence
 from random import Random
 
+from tests.fuzz.contract import Reader
+
 MAX_SIZE = 50_000
 """In bytes; larger ones tell nothing that smaller ones do not."""
 
@@ -32,6 +34,14 @@ def damaged(seeds: Sequence[bytes], tokens: Sequence[bytes], random: Random) -> 
     for _ in range(random.choice((1, 1, 1, 2, 2, 3, 4, 6))):
         content = random.choice(WAYS)(content, seeds, tokens, random)[:MAX_SIZE]
     return content
+
+
+def made(reader: Reader, random: Random) -> bytes:
+    """An input for a reader: a damaged file, or one that is made up, which may be damaged too."""
+    if reader.made is None or random.random() < 0.5:
+        return damaged(reader.seeds, reader.tokens, random)
+    content = reader.made(random)
+    return damaged([content], reader.tokens, random) if random.random() < 0.3 else content
 
 
 Seeds = Sequence[bytes]

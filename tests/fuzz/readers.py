@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import io
-import json
 import tempfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -20,7 +18,6 @@ from halbach_fe.errors import (
     GetDPError,
     MeasurementError,
     MeshError,
-    NotConvergedError,
     StudyError,
 )
 from halbach_fe.field_map import check_readings, field_map, read_map, write_map
@@ -32,9 +29,9 @@ from halbach_fe.formats.openpmd import content as openpmd_content
 from halbach_fe.getdp import Job, _check_log, find_getdp, read_vectors
 from halbach_fe.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.regions import Regions
+from halbach_fe.response import Response
 from halbach_fe.response import _read as read_response
 from halbach_fe.response import _write as write_response
-from halbach_fe.response import Response
 from halbach_fe.routes import finite_element_part
 from halbach_fe.sampled import _Run
 from halbach_fe.solutions import read_matrix, read_saved, read_solutions, read_unknowns
@@ -46,7 +43,6 @@ from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import RICH, document
 from tests.unit.test_import_map import (
-    AXES,
     COMSOL,
     FIELD,
     MM_MT,
@@ -115,15 +111,9 @@ def a_map(scans: bool = True) -> xr.Dataset:
 
 
 def compact_hdf5() -> bytes:
-    """A map by another program: no scales, big-endian, single precision, compressed."""
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w", libver="latest") as file:
-        file.create_dataset("B_T", data=FIELD[:4].astype(">f4"), compression="gzip", chunks=(2, 3))
-        for name, column in zip(("x_m", "y_m", "z_m"), POINTS[:4].T, strict=True):
-            file[name] = column
-            file[name].make_scale() if name == "x_m" else None
-        file["component"] = np.array([b"x", b"y", b"z"])
-    return buffer.getvalue()
+    """A map as others would write it: big-endian, single precision, compressed."""
+    return written(".h5", lambda path: a_map().to_netcdf(path, engine="h5netcdf", encoding={
+        "B_T": {"dtype": ">f4", "zlib": True, "shuffle": True, "chunksizes": (2, 3)}}))
 
 
 def posterior(dimension: int = 2) -> bytes:
@@ -286,7 +276,7 @@ def edge_elements() -> bytes:
 
 
 def check_unknowns(found) -> None:
-    assert 0 < found.count
+    assert found.count > 0
     for function in found.functions:
         assert function.min() >= -1
         assert function.max() < found.count
@@ -336,6 +326,15 @@ LOG = (b"  0 KSP Residual norm 1.0\n", b"KSP Residual norm nan\n", b" 3 KSP Resi
        b"NEWTON 1 0 x\n", b"NEWTON 1 3 1e-9\n", b"Error : ")
 
 
+NAMES = (
+    "study", "changed study", "steel", "map (CSV)", "map (HDF5)", "map (VTU)", "block table",
+    "import: columns", "import: opera", "import: comsol", "import: openpmd", "import as columns",
+    "import as opera", "import as comsol", "import as openpmd", "posterior", "stored response",
+    "stored chains", "mesh", "regions", "GetDP: unknowns", "GetDP: unknowns of edges",
+    "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log")
+"""To collect tests by, without making the seeds."""
+
+
 @cache
 def readers() -> tuple[Reader, ...]:
     """All of them."""
@@ -349,15 +348,15 @@ def readers() -> tuple[Reader, ...]:
     sheet = (COMSOL + SPREADSHEET + rows(field=FIELD * [1, 1, 1000])).encode()
     columns = tuple(f"{header}\n{rows(mark)}".encode() for mark, header in (
         ("  ", "  ".join(MM_MT)), (",", ",".join(MM_MT)), (";", "X;Y;Z;Bx;By;Bz\nmm;mm;mm;mT;mT;mT"),
-        (" ", "# x y z Bx By Bz"), (",", "r[mm],phi[deg],z[mm],Br[T],Bphi[T],Bz[T]")))
+        (" ", "# x y z Bx By Bz"), (",", "r[mm],phi[deg],z[mm],Br[mT],Bphi[mT],Bz[mT]")))
     foreign = Reader("", "hall.txt", (), imported(""), MeasurementError,
                      lambda found: check_map(found.data), FORMAT)
     return (
         Reader("study", "study.toml", (*studies, RICH), read_study, StudyError, check_study, TOML,
                document),
-        replace(table),
         Reader("changed study", "study.toml", (*studies, RICH), changed_study, StudyError,
                check_changed, TOML, document),
+        table,
         Reader("map (CSV)", "map.csv", (MAP_CSV, written(".csv", write_map, a_map())), read_map,
                MeasurementError, check_map, COLUMNS),
         Reader("map (HDF5)", "map.h5", (written(".h5", write_map, a_map()), compact_hdf5()),
@@ -435,6 +434,3 @@ def _ascii(binary: bytes, path: Path) -> None:
 def by_name(name: str) -> Reader:
     """One of them."""
     return next(reader for reader in readers() if reader.name == name)
-
-
-__all__ = ["AXES", "NotConvergedError", "by_name", "json", "readers"]
