@@ -6,6 +6,7 @@ is read here, and the number of unknowns that GetDP must find is derived from it
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -182,15 +183,14 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
 
 def _read(path: Path) -> meshio.Mesh:
     try:
-        with path.open("rb") as file:
-            head = file.read(32)
-            file.seek(max(0, path.stat().st_size - 32))
-            tail = file.read()
+        raw = path.read_bytes()
     except OSError as error:
         raise MeshError(f"Cannot read mesh {path}: {error.strerror}.") from None
-    if not head.startswith(b"$MeshFormat") or b"2.2" not in head:
+    if not raw.startswith(b"$MeshFormat") or b"2.2" not in raw[:32]:
         raise MeshError(f"Mesh {path} is not an MSH 2.2 file, the newest that GetDP reads.")
-    if not tail.rstrip().endswith(b"$EndElements"):
+    counts = re.findall(rb"\$(?:Nodes|Elements)\s+(\d{1,20})", raw)
+    if not raw[-32:].rstrip().endswith(b"$EndElements") or max(map(int, counts), default=0) > len(
+            raw):
         raise MeshError(f"Mesh {path} is truncated; mesh the study again.")
     try:
         mesh = foreign.mesh(path)

@@ -1,6 +1,7 @@
 """Small files that promise much: ``python -m tests.fuzz.bombs`` reads them with little memory.
 
-Prints what is said against each, as JSON. It is a program of its own since the limit is that of a process.
+Prints what is said against each, as JSON. It is a program of its own since the limit is that of a
+process.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def _promise(file: h5py.File) -> None:
 
 
 def _zeros(file: h5py.File) -> None:
-    file.create_dataset("B_T", data=np.zeros((10_000_000, 3)), chunks=(100_000, 3),
+    file.create_dataset("B_T", data=np.zeros((3_000_000, 3)), chunks=(100_000, 3),
                         compression="gzip", compression_opts=9)
 
 

@@ -13,7 +13,7 @@ RICH = b"""
 name = "rich"
 description = "all tables"
 dimension = 3
-plan = { points = 3, candidates = [{ kind = "line", start_m = [0, 0, 0], end_m = [0, 0, 1], count = 4 }] }
+plan = { points = 3, candidates = [{ kind = "points", points_m = [[0, 0, 0], [0, 0, 1]] }] }
 
 [array]
 multipole_order = 1
