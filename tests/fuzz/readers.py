@@ -314,7 +314,8 @@ COLUMNS = (b"x_m", b"y_m", b"z_m", b"Bx_T", b"By_T", b"Bz_T", b"sigma_T", b"sigm
            b"volume_m3", b"temperature_C")
 FORMAT = (b"[mm]", b"(mT)", b"X", b"Bx", b"Br", b"phi", b"r", b"[METRE]", b"[LENGU]",
           b"% Grid\n", b"% Data\n", b"% Coordinates\n", b"% Elements\n", b"% Nodes: 24\n",
-          b"% Length unit: mm\n", b" 0\n", b" 7 BW [TESLA]\n", b"2 3 4 2\n", b"@ t=0", b"mf.Bx (T)", b"100000 100000 1\n")
+          b"% Length unit: mm\n", b" 0\n", b" 7 BW [TESLA]\n", b"2 3 4 2\n", b"@ t=0", b"mf.Bx (T)",
+          b"100000 100000 1\n")
 XML = (b"<DataArray", b"</DataArray>", b"NumberOfComponents", b'"1000000000"', b'format="ascii"',
        b'format="appended"', b"<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]>", b"&b;",
        b"vtkLZMADataCompressor", b"header_type='UInt64'", b"<AppendedData>", b"Float32", b"Int8",
@@ -348,7 +349,8 @@ def readers() -> tuple[Reader, ...]:
     sheet = (COMSOL + SPREADSHEET + rows(field=FIELD * [1, 1, 1000])).encode()
     columns = tuple(f"{header}\n{rows(mark)}".encode() for mark, header in (
         ("  ", "  ".join(MM_MT)), (",", ",".join(MM_MT)),
-        (";", "X;Y;Z;Bx;By;Bz\nmm;mm;mm;mT;mT;mT"), (" ", "# x y z Bx By Bz"), (",", "r[mm],phi[deg],z[mm],Br[mT],Bphi[mT],Bz[mT]")))
+        (";", "X;Y;Z;Bx;By;Bz\nmm;mm;mm;mT;mT;mT"), (" ", "# x y z Bx By Bz"),
+        (",", "r[mm],phi[deg],z[mm],Br[mT],Bphi[mT],Bz[mT]")))
     foreign = Reader("", "hall.txt", (), imported(""), MeasurementError,
                      lambda found: check_map(found.data), FORMAT)
     return (

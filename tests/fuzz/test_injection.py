@@ -1,5 +1,4 @@
-"""Study files are data: nothing in them becomes GetDP's code, a path, HTML or a terminal's command.
-"""
+"""Study files are data: nothing in them becomes code of GetDP, a path, HTML, or a command."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
 
 # Later rooms may import earlier ones, never the other way round.
 ORDER = ["errors", "cells", "foreign", "analytic", "materials", "study", "study_file", "blocks",
-         "symmetry", "extent", "regions", "exact_field", "external", "geo", "mesh", "field_map", "formats", "new_study",
+         "symmetry", "extent", "regions", "exact_field", "external", "geo", "mesh", "field_map",
+         "formats", "new_study",
          "instrument", "block_table", "getdp", "solutions", "evaluation", "condensed", "inference",
          "measured_prior", "solve", "azimuthal", "routes", "observation", "discretization",
          "response", "nonlinear", "update", "sampled",
