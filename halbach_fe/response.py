@@ -184,8 +184,9 @@ def _read(path: Path, key: str) -> Response | None:
         names = tuple(map(str, data["parameter"].values))
         readings, parameters = (len(data["offset"]),), (len(names),)
         return Response(foreign.numbers(data["H"], readings + parameters), names,
-                        *(foreign.numbers(data[name], shape) for name, shape in (
-                            ("nominal", parameters), ("offset", readings), ("error", readings))),
+                        foreign.numbers(data["nominal"], parameters),
+                        foreign.numbers(data["offset"], readings),
+                        foreign.numbers(data["error"], readings),
                         float(data.attrs["superposition_error"]), reused=True)
     except (OSError, KeyError, ValueError, TypeError):
         return None
