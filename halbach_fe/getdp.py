@@ -387,7 +387,8 @@ def _residual(text: str, folder: Path) -> float:
     with contextlib.suppress(ValueError):
         if np.isfinite(residual := float(text)):
             return residual
-    raise _failure(f"a linear solve left a residual of '{text}', which is no number", folder)
+    raise _failure(f"a linear solve left a residual of '{text[:40]}', which is no number: the "
+                   "linear solver did not converge", folder)
 
 
 def _name_of(text: str, otherwise: str) -> str:

@@ -18,7 +18,7 @@ from halbach_fe.diagnose import Diagnosis
 from halbach_fe.diagnosed import rivals
 from halbach_fe.diagnosis.residuals import Group
 from halbach_fe.diagnosis.selection import FOUND
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, plain
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
 from halbach_fe.report.prediction import places
 from halbach_fe.update import COVERAGE_Z, Update
 
@@ -79,7 +79,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
                               state.marker, ms=6, color=state.colour, clip_on=False,
                               mfc=state.colour if one.disagrees else "white")
             axis.plot([], [], state.marker, color=state.colour, label=state.when)
-        axis.set_yticks(range(len(names)), list(map(plain, names)), fontsize="small")
+        axis.set_yticks(range(len(names)), names, fontsize="small")
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.set_title(GROUP_TITLES.get(kind, kind), fontsize="medium", loc="left")
         axis.grid(alpha=0.3, axis="x")

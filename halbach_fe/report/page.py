@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import platform
-import warnings
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -38,9 +37,7 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
     pictures = []
     for name, (figure, text) in figures.items():
         buffer = io.BytesIO()
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Glyph .* missing")  # of names in other scripts
-            figure.savefig(buffer, format="png", dpi=130)
+        figure.savefig(buffer, format="png", dpi=130)
         with atomic(folder / name) as temporary:
             temporary.write_bytes(buffer.getvalue())
         pictures.append((base64.b64encode(buffer.getvalue()).decode(), text))
@@ -64,11 +61,6 @@ def write_page(
     write_text(path, environment.get_template(template).render(
         pictures=pictures, study=study, study_text=text, provenance={**(provenance or {}),
             "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
-
-
-def plain(name: str) -> str:
-    """A name as the label of a figure, where dollars would begin a formula."""
-    return name.replace("$", r"\$")
 
 
 def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
