@@ -40,13 +40,12 @@ def dataset(path: Path, group: str | None = None) -> xr.Dataset:
     ValueError
         If it is damaged, or refused as `hdf5` says.
     """
-    raw = path.read_bytes()
-    with _refusing():
-        with hdf5(raw):
-            pass
-        with xr.open_dataset(io.BytesIO(raw), group=group, engine="h5netcdf",
-                             phony_dims="sort") as opened:
-            return opened.load()
+    size = path.stat().st_size
+    with hdf5(path, size):
+        pass
+    with _refusing(), xr.open_dataset(path, group=group, engine="h5netcdf",
+                                      phony_dims="sort") as opened:
+        return opened.load()
 
 
 def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -58,8 +57,8 @@ def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 @contextlib.contextmanager
-def hdf5(raw: bytes) -> Iterator[Any]:
-    """Open HDF5 data.
+def hdf5(file: Path | io.BytesIO, size: int) -> Iterator[Any]:
+    """Open an HDF5 file of so many bytes.
 
     Raises
     ------
@@ -68,11 +67,11 @@ def hdf5(raw: bytes) -> Iterator[Any]:
         datasets), hold objects that are no text, or promise more than a file of this size can hold.
     """
     with _refusing():
-        file = h5py.File(io.BytesIO(raw), "r")
-    with file, np.errstate(all="ignore"):
+        opened = h5py.File(file, "r")
+    with opened, np.errstate(all="ignore"):
         with _refusing():
-            _check(file, max(SMALL, MOST_COMPRESSED * len(raw)))
-        yield file
+            _check(opened, max(SMALL, MOST_COMPRESSED * size))
+        yield opened
 
 
 def mesh(path: Path) -> meshio.Mesh:

@@ -112,7 +112,7 @@ def warns(path):
 @pytest.mark.parametrize(("read", "kind"), [
     (key_error, "KeyError"), (writes, "it writes"), (writes_above, "it writes"),
     (changes, "it writes"), (hangs, "TimeoutError"), (wrong_error, "GetDPError"),
-    (lambda path: sys.stdout.write("hello"), "it prints"), (warns, "UserWarning"),
+    (lambda path: sys.stdout.write("hello") and None, "it prints"), (warns, "UserWarning"),
     (escapes, "control"),
     (refuses("Input content must be a map; instead received none."), "does not name the file"),
     (refuses(""), "too short"), (lambda path: "not valid", "IndexError"),
