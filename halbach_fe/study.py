@@ -810,9 +810,9 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
     if ring is None or ring.curve is None or ring.curve.kind != "table" or not ring.curve.file:
         return study
     path = folder / ring.curve.file
-    if path.exists() and not (path.is_file() or path.is_dir()):  # a device has no end
-        raise StudyError(must_be("`iron_ring.curve.file`", where, "a file", repr(str(path))))
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ValueError("it must be a file")  # a device may have no end
         field, flux_density = materials.read_table(path)
         table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:

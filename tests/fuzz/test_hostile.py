@@ -28,6 +28,8 @@ FOUND = {
     "a key of 5000 letters": ("study", STUDY + b"\n" + b"a" * 5000 + b" = 1\n", "aaa..."),
     "a device for a table": ("study", WITH_STEEL.replace("steel.csv", "/dev/zero").encode(),
                              "must be a file"),
+    "a name of 300 letters": ("study", WITH_STEEL.replace("steel.csv", "a" * 300).encode(),
+                              "File name too long"),
     "an underscore in H": ("steel", STEEL.replace(b"100.0", b"1_00.0"), "line 3 must hold two"),
     "digits of another script in H": ("steel", STEEL.replace(b"100.0", "١٠٠".encode()), "line 3"),
     "an underscore in a map": ("map (CSV)", MAP_CSV.replace(b"0.25", b"0.2_5"), "'0.2_5'"),
