@@ -101,7 +101,8 @@ coercivity_coefficient_per_K = -0.006
 HOSTILE = ("", " ", "a\nb", "}; Exit; Group {", "../../../etc/passwd", "/etc/passwd", "\x1b[31mred",
            "<script>alert(1)</script>", "</script><!--", "{{ 7*7 }}", "<< 7*7 >>", "<% raise %>",
            "$\\frac$", "[red]bold[/red]", "\x00", "\x7f", "\u202e", "\ud7ff", "日本語", "nan",
-           "a" * 5000, "%s%n", "=1+1", "_hidden", "`id`", "$(id)", "a\\", "\u2028", "\r", "0", "x")
+           "a" * 300, "a" * 5000, "%s%n", "=1+1", "_hidden", "`id`", "$(id)", "a\\", "\u2028",
+           "\r", "0", "x")
 ODD: tuple[Any, ...] = (
     0, -1, 1, 2, 10**6, 10**9, 2**63, -2**63, 10**20, 10**400, 0.0, -0.0, 1e308, -1e308, 5e-324,
     float("nan"), float("inf"), -float("inf"), True, False, "", "1", [], {}, [[]], [{}], {"a": 1},
