@@ -1,4 +1,4 @@
-"""What was found, each by name; small files that promise much; names that are code elsewhere."""
+"""What was found, each by name, and small files that promise much."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import json
 import subprocess
 import sys
 
+import h5py
 import pytest
 
+from halbach_fe.errors import MeasurementError
+from halbach_fe.field_map import read_map
 from tests.conftest import ROOT
-from tests.fuzz.bombs import BOMBS
+from tests.fuzz.bombs import BOMBS, SECRET
 from tests.fuzz.contract import refusal
 from tests.fuzz.readers import BLOCKS_CSV, LOG, MAP_CSV, STEEL, WITH_STEEL, by_name, run_of_getdp
 
@@ -112,8 +115,20 @@ def test_small_files_that_promise_much():
         assert said[name], name
         assert not said[name].startswith("broken"), said[name]
         assert not any(word in said[name].lower() for word in ("memory", "alloc")), said[name]
+        assert SECRET[:6].decode() not in said[name]
     assert "MemoryError" in said["rows that are not there, unguarded"]
     for name in ("data of another file", "a link to another file", "a view of another file"):
         assert "another file" in said[name]
     for name in ("rows that are not there", "rows of zeros, compressed"):
         assert "bytes, in a file too small" in said[name]
+
+
+def test_hdf5_would_show_another_file(folder, monkeypatch):
+    """What the guard is for: h5py itself reads the secret, as numbers."""
+    monkeypatch.chdir(folder)
+    (folder / "secret.txt").write_bytes(SECRET)
+    (folder / "map.h5").write_bytes(BOMBS["data of another file"][1])
+    with h5py.File(folder / "map.h5") as file:
+        assert file["B_T"][()].tobytes() == SECRET[:48]
+    with pytest.raises(MeasurementError, match="takes its data from another file"):
+        read_map(folder / "map.h5")
