@@ -105,12 +105,18 @@ def _check(file: Any, limit: int) -> None:
             elif isinstance(node, h5py.Dataset):
                 if node.external or node.is_virtual:
                     raise ValueError(f"`{name}` takes its data from another file")
-                if node.dtype.hasobject and h5py.check_string_dtype(node.dtype) is None:
-                    raise ValueError(f"`{name}` holds neither numbers nor text")
+                _check_kind(node.dtype, name)
                 promised += (node.size or 0) * max(1, node.dtype.itemsize)
                 if promised > limit:
                     raise ValueError(f"`{name}` would be {promised:.2g} bytes, in a file too small "
                                      "for that")
+
+
+def _check_kind(kind: np.dtype[Any], name: str) -> None:
+    """Refuse what is neither numbers nor text: fields that overlap crash the HDF5 library."""
+    if h5py.check_string_dtype(kind) is None and (kind.kind not in "biufcS" or (
+            kind.itemsize > (16 if kind.kind == "c" else 8))):
+        raise ValueError(f"`{name}` holds neither numbers nor text")
 
 
 @contextlib.contextmanager

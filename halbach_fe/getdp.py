@@ -368,7 +368,7 @@ def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
     found = 0
     last = np.nan
     for line in [*lines, "  0 KSP Residual norm 0"]:
-        match = re.search(r"(\d+) KSP Residual norm (\S+)", line)
+        match = re.search(r"(\d{1,9}) KSP Residual norm (\S+)", line)
         if not match:
             continue
         residual = _residual(match[2], folder)

@@ -59,6 +59,8 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
             raise ValueError("an entity or unknown beyond all others")
         table = table.astype(int)
         count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
+        if count < 1:
+            raise ValueError("no unknowns")
         functions = []
         for kind in np.unique(table[:, 0]):
             mine = table[table[:, 0] == kind]

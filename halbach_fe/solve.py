@@ -501,7 +501,8 @@ def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
     """Relative residuals of Newton's method in a log of GetDP, by sample and step."""
     found: list[list[float]] = []
     for line in lines:
-        match = re.search(r"NEWTON \d+ (\d+) ([-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf))\b", line)
+        match = re.search(
+            r"NEWTON \d+ (\d+) (\d{1,20}(?:\.\d{1,20})?(?:e[-+]?\d+)?|nan|inf)\b", line)
         if match and (found or match[1] == "0"):
             if match[1] == "0":
                 found.append([])

@@ -54,6 +54,15 @@ def _objects(file: h5py.File) -> None:
     file.create_dataset("B_T", (2, 3), h5py.vlen_dtype(np.dtype("f8")))
 
 
+def _compound(file: h5py.File) -> None:
+    """Numbers of two parts; where parts overlap, the HDF5 library writes where it must not."""
+    kind = h5py.h5t.create(h5py.h5t.COMPOUND, 16)
+    kind.insert(b"r", 0, h5py.h5t.IEEE_F64LE)
+    kind.insert(b"i", 8, h5py.h5t.IEEE_F64LE)
+    kind.set_size(24)
+    h5py.h5d.create(file.id, b"B_T", kind, h5py.h5s.create_simple((2, 3)))
+
+
 def _promise(file: h5py.File) -> None:
     file.create_dataset("B_T", (10**11, 3), "f8", chunks=(1024, 3))
 
@@ -100,6 +109,7 @@ BOMBS: dict[str, tuple[str, bytes]] = {
     "rows of zeros, compressed": ("map (HDF5)", hdf5(_zeros)),
     "groups in a circle": ("map (HDF5)", hdf5(_cycle)),
     "lists of numbers in each cell": ("map (HDF5)", hdf5(_objects)),
+    "numbers made of parts": ("map (HDF5)", hdf5(_compound)),
     "data of another file": ("map (HDF5)", hdf5(lambda file: file.create_dataset(
         "B_T", (2, 3), "f8", external=[("secret.txt", 0, 48)]))),
     "a link to another file": ("map (HDF5)", hdf5(lambda file: file.__setitem__(

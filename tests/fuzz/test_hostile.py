@@ -58,6 +58,8 @@ FOUND = {
     "nothing at all": ("GetDP: vectors", b"\n", "holds 0 rows"),
     "a residual that is no number": ("GetDP: log", LOG[2], "which is no number"),
     "a residual that is infinite": ("GetDP: log", b"KSP Residual norm inf", "which is no number"),
+    "a line of 50 000 digits": ("GetDP: log", b"KSP\n" + b"1" * 50_000 + b" KSP Residual norm x",
+                                "which is no number"),
     "a count of 5000 digits": ("GetDP: log", LOG[4], "no unknowns"),
 }
 
