@@ -20,8 +20,12 @@ import h5py
 import numpy as np
 import xarray as xr
 
+from halbach_fe.field_map import field_map
+from halbach_fe.formats.grid import grid_of
+from halbach_fe.formats.openpmd import content as openpmd_content
 from tests.fuzz.contract import BrokenError, refusal
 from tests.fuzz.readers import by_name, edge_elements
+from tests.unit.test_import_map import FIELD, POINTS
 
 SECRET = b"root:x:0:0:what no reader may show, 0123456789" * 3
 MEMORY = 1 << 29
@@ -100,6 +104,16 @@ def foreign_entity(target: str) -> bytes:
             '<VTKFile type="UnstructuredGrid">&b;</VTKFile>').encode()
 
 
+def overlapping() -> bytes:
+    """Complex numbers, of which one part is longer than its place: its exponent has another bias.
+
+    Read as they are, they crash the program.
+    """
+    usual, other = (1023).to_bytes(4, "little"), (1792).to_bytes(4, "little")
+    parts = openpmd_content(grid_of(field_map(POINTS, FIELD), "map")).split(usual)
+    return usual.join(parts[:-4]) + other + usual.join(parts[-4:])  # that of the z component
+
+
 PETSC = np.array([1211214, 2**31 - 1], ">i4").tobytes()
 MATRIX = np.array([1211216, 3, 3, 2**31 - 1, 1, 1, 1], ">i4").tobytes()
 STUDY = b'name = "a"\ndimension = 3\n'
@@ -109,6 +123,7 @@ BOMBS: dict[str, tuple[str, bytes]] = {
     "rows of zeros, compressed": ("map (HDF5)", hdf5(_zeros)),
     "groups in a circle": ("map (HDF5)", hdf5(_cycle)),
     "lists of numbers in each cell": ("map (HDF5)", hdf5(_objects)),
+    "numbers that overlap": ("import: openpmd", overlapping()),
     "numbers made of parts": ("map (HDF5)", hdf5(_compound)),
     "data of another file": ("map (HDF5)", hdf5(lambda file: file.create_dataset(
         "B_T", (2, 3), "f8", external=[("secret.txt", 0, 48)]))),
