@@ -16,8 +16,7 @@ from typing import Any
 from halbach_fe.errors import MAX_SENTENCE, HalbachError
 
 TIME_LIMIT_S = 10
-"""Inputs are of at most `halbach_fe` times some tens of kilobytes, which take milliseconds; the
-limit leaves room for a machine that is busy with something else."""
+"""Inputs of some tens of kilobytes take milliseconds; the limit leaves room for a busy machine."""
 
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import io
 import tempfile
+import tomllib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import meshio
 import numpy as np
 import xarray as xr
 
 from halbach_fe import sampled
 from halbach_fe import solve as solving
 from halbach_fe.block_table import BlockTable, read_blocks, write_blocks
+from halbach_fe.blocks import blocks_of
 from halbach_fe.errors import (
     GetDPError,
     MeasurementError,
@@ -36,7 +39,7 @@ from halbach_fe.routes import finite_element_part
 from halbach_fe.sampled import _Run
 from halbach_fe.solutions import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, curve_of, parse_study, read_study
+from halbach_fe.study import Study, _with_table, curve_of, parse_study, read_study
 from halbach_fe.study_file import amended
 from halbach_fe.update import read_posterior
 from tests.conftest import DIPOLE, ROOT, changed, circle
@@ -59,7 +62,6 @@ TINY = parse_study(changed(
     DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__growth=4.0,
     open_boundary={"radius_m": 0.3}))
 PLACES = circle(0.05, 3)
-NONE = Path("/nonexistent")
 
 STEEL = b"""# made up
 H_A_per_m,B_T
@@ -116,12 +118,9 @@ def compact_hdf5() -> bytes:
         "B_T": {"dtype": ">f4", "zlib": True, "shuffle": True, "chunksizes": (2, 3)}}))
 
 
-def posterior(dimension: int = 2) -> bytes:
-    study = TINY
-    count = 4 * dimension
-    from halbach_fe.blocks import blocks_of
-
-    nominal = np.concatenate([block.magnetization[:dimension] for block in blocks_of(study)])
+def posterior() -> bytes:
+    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(TINY)])
+    count = len(nominal)
     data = xr.Dataset(
         {name: ("parameter", nominal * factor) for name, factor in (
             ("nominal", 1), ("prior_mean", 1), ("prior_sd", 0.01), ("posterior_mean", 1.01),
@@ -191,6 +190,10 @@ def check_map(data: xr.Dataset) -> None:
         str(value)
 
 
+def check_finite(found) -> None:
+    assert np.isfinite(found).all()
+
+
 def check_blocks(table: BlockTable) -> None:
     written(".csv", write_blocks, table)
 
@@ -203,10 +206,8 @@ def check_study(study: Study) -> None:
 
 def with_table(path: Path) -> Study:
     """The study beside a table of H(B)."""
-    document = parse_study(__import__("tomllib").loads(WITH_STEEL))
-    from halbach_fe.study import _with_table
-
-    return _with_table(document, path.parent, "study file study.toml")
+    study = parse_study(tomllib.loads(WITH_STEEL))
+    return _with_table(study, path.parent, "study file study.toml")
 
 
 def changed_study(path: Path) -> tuple[str, Study]:
@@ -225,7 +226,7 @@ def changed_study(path: Path) -> tuple[str, Study]:
 def check_changed(found: tuple[str, Study]) -> None:
     text, study = found
     if text:
-        assert parse_study(__import__("tomllib").loads(text)) == study
+        assert parse_study(tomllib.loads(text)) == study
 
 
 VARIANTS = (
@@ -395,13 +396,14 @@ def readers() -> tuple[Reader, ...]:
                (b"$DofData", b"$EndDofData", b"$ElementsXEdges", b"$ElementsXFacets")),
         Reader("GetDP: solutions", "x.bin", (vectors(SOLUTIONS),),
                lambda path: read_solutions(path, 3, 2), GetDPError,
-               lambda found: np.isfinite(found.sum()) or 1),
+               check_finite),
         Reader("GetDP: saved solutions", "x.res", (saved(SOLUTIONS).encode(),),
-               lambda path: read_saved(path, 3, 2), GetDPError, tokens=(b"$Solution", b"$End")),
+               lambda path: read_saved(path, 3, 2), GetDPError, check_finite,
+               (b"$Solution", b"$End")),
         Reader("GetDP: matrix", "m.bin", (matrix(ROWS),), lambda path: read_matrix(path, 3),
                GetDPError, lambda found: found @ np.ones(3)),
         Reader("GetDP: vectors", "flux_density.txt", (left["vectors"],),
-               lambda path: read_vectors(path, places), GetDPError),
+               lambda path: read_vectors(path, places), GetDPError, check_finite),
         Reader("GetDP: log", "getdp.log", (left["log"],), log_of, GetDPError, tokens=LOG),
     )
 
@@ -426,8 +428,6 @@ def ascii_vtu() -> bytes:
 
 def _ascii(binary: bytes, path: Path) -> None:
     """The same mesh as text."""
-    import meshio
-
     source = path.with_name("source.msh")
     source.write_bytes(binary)
     meshio.write(path, meshio.read(source), file_format="gmsh22", binary=False)
