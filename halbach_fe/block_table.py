@@ -146,12 +146,12 @@ def _check(table: BlockTable) -> None:
         raise MeasurementError(must_be(f"{what} of block {table.serial[number]}", table.source,
                                        expected, received, hint))
 
-    for number in range(len(table)):
-        given = np.abs([*table.moment[number], table.sigma[number]])
-        if not np.isfinite(given).all():
+    given = np.abs(np.column_stack([table.moment, table.sigma]))
+    for number in np.flatnonzero(~(given <= MAX_MOMENT).all(axis=1)).tolist():
+        if not np.isfinite(given[number]).all():
             refuse(number, "moment and sigma", "finite numbers", "an infinite or missing one")
-        if given.max() > MAX_MOMENT:
-            refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2", f"{given.max():g}")
+        refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2",
+               f"{given[number].max():g}")
     size = np.linalg.norm(table.moment, axis=1)
     for number in range(len(table)):
         if not table.sigma[number] > 0:

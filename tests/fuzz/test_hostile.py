@@ -11,6 +11,7 @@ import pytest
 
 from halbach_fe.errors import MeasurementError
 from halbach_fe.field_map import read_map
+from halbach_fe.solve import newton_residuals
 from tests.conftest import ROOT
 from tests.fuzz.bombs import BOMBS, SECRET
 from tests.fuzz.contract import refusal
@@ -48,6 +49,8 @@ FOUND = {
     "a moment of 1e308": ("block table", BLOCKS_CSV.replace(b"500.0", b"1e308"), "below 1e+12"),
     "a serial number that is a comment": ("block table", BLOCKS_CSV.replace(b"A-001", b'"#1"'),
                                           "not begin with #"),
+    "a table of 40 000 blocks": ("block table", b"serial,type,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2\n"
+                                 + b"".join(b"%d,a,1,0,0,0.1\n" % n for n in range(40_000)), ""),
     "a mesh that ends the program": ("mesh", b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n"
                                      b"1 0 0 0\n$EndNodes\n$x\n$Elements\n0\n$EndElements", "Mesh"),
     "elements of two types": ("mesh", None, "in place of one"),
@@ -104,8 +107,17 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("name", FOUND)
 def test_what_was_found(name, folder):
+    """Where nothing is said, it took too long."""
     reader, content, said = found(name)
-    assert said in refusal(by_name(reader), content, folder)
+    answer = refusal(by_name(reader), content, folder)
+    assert said in answer
+    assert bool(said) == bool(answer)
+
+
+def test_residuals_of_newton_that_are_none():
+    found = newton_residuals(["NEWTON 1 3 1e-9", "NEWTON 1 0 x", "NEWTON 1 0 1e-2",
+                              "NEWTON 1 1 1.5e-08", "NEWTON 1 2 " + "1" * 50_000 + "x"])
+    assert found == [[1e-2, 1.5e-8]]
 
 
 def test_small_files_that_promise_much():
