@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import meshio
@@ -40,8 +41,7 @@ def dataset(path: Path, group: str | None = None) -> xr.Dataset:
     ValueError
         If it is damaged, or refused as `hdf5` says.
     """
-    size = path.stat().st_size
-    with hdf5(path, size):
+    with path.open("rb") as file, hdf5(file):
         pass
     with _refusing(), xr.open_dataset(path, group=group, engine="h5netcdf",
                                       phony_dims="sort") as opened:
@@ -57,8 +57,8 @@ def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 @contextlib.contextmanager
-def hdf5(file: Path | io.BytesIO, size: int) -> Iterator[Any]:
-    """Open an HDF5 file of so many bytes.
+def hdf5(file: BinaryIO) -> Iterator[Any]:
+    """Open an HDF5 file.
 
     Raises
     ------
@@ -67,6 +67,7 @@ def hdf5(file: Path | io.BytesIO, size: int) -> Iterator[Any]:
         datasets), hold objects that are no text, or promise more than a file of this size can hold.
     """
     with _refusing():
+        size = _check_heaps(file)
         opened = h5py.File(file, "r")
     with opened, np.errstate(all="ignore"):
         with _refusing():
@@ -86,7 +87,28 @@ def mesh(path: Path) -> meshio.Mesh:
         return meshio.read(path)
 
 
+def _check_heaps(file: BinaryIO) -> int:
+    """Refuse heaps in which HDF5 2.0 would go round for ever; return the size of the file.
+
+    A heap is a chain of objects, each with index and length in 16 bytes before it; one of index 0
+    is free space, its length that of all (HDF5 File Format Specification, III.E).
+    """
+    raw = file.read()
+    for heap in re.finditer(rb"GCOL\x01\0{3}", raw):
+        place, end = heap.end() + 8, heap.start() + int.from_bytes(
+            raw[heap.end():heap.end() + 8], "little")
+        while place + 16 <= min(end, len(raw)):
+            free = raw[place:place + 2] == b"\0\0"
+            length = int.from_bytes(raw[place + 8:place + 16], "little")
+            if free and length < 16:
+                raise ValueError("it has a heap without end")
+            place += length if free else 16 + -(-length // 8) * 8
+    return len(raw)
+
+
 def _check(file: Any, limit: int) -> None:
+    if file.id.get_create_plist().get_sizes() != (8, 8):
+        raise ValueError("its addresses are not of eight bytes")
     waiting, found, promised = [file], 0, 0
     while waiting:
         group = waiting.pop()

@@ -43,7 +43,7 @@ def read(raw: bytes, declared: Declared, where: str) -> Table:
         rectangular grid.
     """
     try:
-        with foreign.hdf5(io.BytesIO(raw), len(raw)) as file:
+        with foreign.hdf5(io.BytesIO(raw)) as file:
             return _table(_only_mesh(file, where), where)
     except MeasurementError:
         raise

@@ -133,6 +133,7 @@ def test_small_files_that_promise_much():
     assert "MemoryError" in said["rows that are not there, unguarded"]
     for name in ("data of another file", "a link to another file", "a view of another file"):
         assert "another file" in said[name]
+    assert "a heap without end" in said["a heap without end"]
     for name in ("rows that are not there", "rows of zeros, compressed"):
         assert "bytes, in a file too small" in said[name]
 
