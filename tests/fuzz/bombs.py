@@ -115,7 +115,7 @@ def overlapping() -> bytes:
 
 
 def endless() -> bytes:
-    """A map, in a heap of which free space is nothing long; reading it, HDF5 goes round for ever."""
+    """A map with a heap whose free space is nothing long: reading it, HDF5 goes round for ever."""
     sound = hdf5(lambda file: file.attrs.__setitem__("note", "text of any length"))
     place = sound.index(b"GCOL\1\0\0\0") + 16
     return sound[:place] + bytes(16) + sound[place + 16:]
