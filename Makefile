@@ -1,5 +1,6 @@
 # make demo     the main job: the FASER dipole, before and after its measurement
 # make test     all tests
+# make fuzz     every reader of files, on files that are damaged or made up; half an hour
 # make verify-calibration  are the posteriors as sure as they may be?
 # make verify-diagnosis    are hidden effects found, and only those?
 # make study-faser           the published profile, and the synthetic twin of the whole campaign
@@ -11,7 +12,7 @@
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test benchmark lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test fuzz benchmark lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -51,6 +52,12 @@ study-sensitivity: setup
 
 test: setup-test
 	.venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# What breaks a promise of tests/fuzz/contract.py is kept in build/fuzz; SEED=2 tries other files.
+SECONDS = 60
+SEED = 1
+fuzz: setup-test
+	.venv/bin/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test

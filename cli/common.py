@@ -25,14 +25,20 @@ from pathlib import Path
 import numpy as np
 import scipy.linalg as linalg
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from halbach_fe.cache import Cache, default_cache
 from halbach_fe.cluster import connected
 from halbach_fe.cost import TIME_FACTOR, Estimate
-from halbach_fe.errors import OUT_OF_MEMORY, HalbachError, HalbachWarning
+from halbach_fe.errors import (
+    MAX_QUOTED,
+    OUT_OF_MEMORY,
+    HalbachError,
+    HalbachWarning,
+    printable,
+)
 from halbach_fe.getdp import find_getdp
 from halbach_fe.multipoles import DEFAULT_ORDERS, Reference
 from halbach_fe.solve import Workshop
@@ -339,10 +345,15 @@ def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
     console = Console(width=None if sys.stdout.isatty() else 140)
     table = Table(title=title or None, title_justify="left")
     for number, name in enumerate(rows[0]):
-        table.add_column(name, justify="left" if number < 2 else "right")
+        table.add_column(_text(name), justify="left" if number < 2 else "right")
     for row in rows:
-        table.add_row(*(escape(value) for value in row.values()))
+        table.add_row(*map(_text, row.values()))
     console.print(table)
+
+
+def _text(value: str) -> Text:
+    """As it is: names of files and columns are no markup, nor commands to the terminal."""
+    return Text(printable(value, MAX_QUOTED))
 
 
 def say(text: str) -> None:

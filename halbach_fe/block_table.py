@@ -23,6 +23,11 @@ REQUIRED_COLUMNS = ("serial", "type", *MOMENT_COLUMNS, "sigma_A_m2")
 COLUMNS = (*REQUIRED_COLUMNS[:2], "ring", "slot", *REQUIRED_COLUMNS[2:], "volume_m3",
            "temperature_C")
 
+MAX_PLACE = 100_000
+"""Ring or slot."""
+MAX_MOMENT = 1e12
+"""In A m^2; a larger one is no number of a magnet, and its square none of this machine."""
+
 
 @dataclass(frozen=True)
 class BlockTable:
@@ -97,9 +102,10 @@ def read_blocks(path: str | Path) -> BlockTable:
 
     def texts(name: str) -> tuple[str, ...]:
         for number, row in lines:
-            if not row[name]:
-                raise MeasurementError(must_be(f"{name} in line {number}", where, "given",
-                                               "an empty cell"))
+            if not row[name] or row[name].startswith("#"):  # which begins a comment
+                raise MeasurementError(must_be(f"{name} in line {number}", where,
+                                               "given, and not begin with #",
+                                               f"'{row[name]}'" if row[name] else "an empty cell"))
         return tuple(row[name] for _, row in lines)
 
     return BlockTable(
@@ -125,9 +131,9 @@ def _whole(
 ) -> Ints:
     """Counts from 1; 0 for an empty cell."""
     for value, (number, row) in zip(values, lines, strict=True):
-        if row.get(name) and (value < 1 or value != int(value)):
+        if row.get(name) and not (1 <= value <= MAX_PLACE and value == int(value)):
             raise MeasurementError(must_be(f"{name} in line {number}", where,
-                                           "a whole number from 1", row[name]))
+                                           f"a whole number from 1 to {MAX_PLACE}", row[name]))
     return values.astype(int)
 
 
@@ -140,10 +146,14 @@ def _check(table: BlockTable) -> None:
         raise MeasurementError(must_be(f"{what} of block {table.serial[number]}", table.source,
                                        expected, received, hint))
 
+    given = np.abs(np.column_stack([table.moment, table.sigma]))
+    for number in np.flatnonzero(~(given <= MAX_MOMENT).all(axis=1)).tolist():
+        if not np.isfinite(given[number]).all():
+            refuse(number, "moment and sigma", "finite numbers", "an infinite or missing one")
+        refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2",
+               f"{given[number].max():g}")
     size = np.linalg.norm(table.moment, axis=1)
     for number in range(len(table)):
-        if not np.isfinite([*table.moment[number], table.sigma[number]]).all():
-            refuse(number, "moment and sigma", "finite numbers", "an infinite or missing one")
         if not table.sigma[number] > 0:
             refuse(number, "sigma_A_m2", "positive", f"{table.sigma[number]:g}")
         if table.sigma[number] >= size[number]:
@@ -157,10 +167,13 @@ def _check(table: BlockTable) -> None:
         if (table.ring[number] > 0) != (table.slot[number] > 0):
             refuse(number, "place", "ring and slot together", "one of them alone",
                    "Leave both empty where the place is not known.")
+    serials: set[str] = set()
+    blocks: dict[tuple[int, int], str] = {}
     for number, (serial, place) in enumerate(zip(table.serial, table.places, strict=True)):
-        if serial in table.serial[:number]:
+        if serial in serials:
             refuse(number, "serial", "that of one block", "the same again", "Remove a row.")
-        if place[0] and place in table.places[:number]:
-            other = table.serial[table.places.index(place)]
+        if place[0] and place in blocks:
             refuse(number, "place", "that of one block",
-                   f"ring {place[0]}, slot {place[1]}, where block {other} is")
+                   f"ring {place[0]}, slot {place[1]}, where block {blocks[place]} is")
+        serials.add(serial)
+        blocks[place] = serial

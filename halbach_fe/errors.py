@@ -9,11 +9,20 @@ An error of any other type that reaches the command line is a bug of ours (exit 
 
 from __future__ import annotations
 
+MAX_SENTENCE, MAX_QUOTED = 3000, 1000
+"""Characters of an error, and of what it quotes, which may be a path or a list of keys."""
+
 
 class HalbachError(Exception):
-    """Base of every error that is reported as one sentence instead of a traceback."""
+    """Base of every error that is reported as one sentence instead of a traceback.
+
+    Whatever it quotes, it is one line of printable text.
+    """
 
     exit_code = 1
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(printable(sentence, MAX_SENTENCE))
 
 
 class HalbachWarning(UserWarning):
@@ -119,7 +128,18 @@ EXIT_CODES: dict[int, str] = {
 }
 
 
+def printable(text: object, most: int) -> str:
+    """What a terminal can print on one line without doing anything else; ? for other characters."""
+    try:
+        line = str(text)
+    except ValueError:  # Python does not print integers of more than 4300 digits
+        line = "a number of thousands of digits"
+    line = line if len(line) <= most else f"{line[:most]}..."
+    return "".join(c if c.isprintable() else "?" for c in line)
+
+
 def must_be(what: str, where: str, expected: str, received: object, hint: str = "") -> str:
     """Return the project's error sentence: what, where, what was expected, what to do."""
-    sentence = f"Input {what} of {where} must be {expected}; instead received {received}."
+    sentence = (f"Input {printable(what, MAX_QUOTED)} of {where} must be {expected}; instead "
+                f"received {printable(received, MAX_QUOTED)}.")
     return f"{sentence} {hint}" if hint else sentence

@@ -27,7 +27,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats
+from halbach_fe.cells import number as number_in
 from halbach_fe.errors import MeasurementError, OutputError, must_be
 from halbach_fe.in_the_making import name_in_the_making, remove_left_behind
 from halbach_fe.study import COMPONENTS, MAX_LENGTH_M
@@ -176,11 +178,15 @@ def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, 
     """Write columns by name, with attributes as comments; NaN is an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as file:
         for key, value in attributes.items():
-            file.write(f"# {key}: {' '.join(str(value).split())}\n")
+            file.write(f"# {_one_line(key)}: {_one_line(value)}\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         for row in zip(*columns.values(), strict=True):
             writer.writerow([_cell(value) for value in row])
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
 
 
 def write_hdf5(data: xr.Dataset, path: Path) -> None:
@@ -241,7 +247,7 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
 def _cell(value: object) -> str:
     if isinstance(value, float | np.floating):
         return "" if np.isnan(value) else repr(float(value))
-    return str(value)
+    return _one_line(value)
 
 
 def _write_vtu(data: xr.Dataset, path: Path) -> None:
@@ -254,11 +260,10 @@ def _write_vtu(data: xr.Dataset, path: Path) -> None:
 def _read_hdf5(path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as opened:
-            data = opened.load()
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        data = foreign.dataset(path)
+    except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
-                                       f"'{str(error).splitlines()[0]}'")) from None
+                                       f"'{error}'")) from None
     for name in ("B_T", *POSITION_COLUMNS):
         if name not in data.variables:
             raise MeasurementError(must_be("variable", where, f"`{name}`", "a file without it"))
@@ -277,6 +282,8 @@ def _read_hdf5(path: Path) -> xr.Dataset:
             continue
         numeric = name == "scan" or np.issubdtype(data[name].dtype, np.floating) or (
             np.issubdtype(data[name].dtype, np.integer))
+        if name == "scan" and data[name].dtype.kind in "OST":
+            data[name] = data[name].astype(str)
         if data[name].dims != dims or not numeric:
             raise MeasurementError(must_be(f"`{name}`", where, f"numbers labelled {dims}",
                                            f"{data[name].dtype} labelled {data[name].dims}"))
@@ -286,11 +293,11 @@ def _read_hdf5(path: Path) -> xr.Dataset:
 def _read_vtu(path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        mesh = meshio.read(path)
+        mesh = foreign.mesh(path)
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
         if "time_s" in mesh.point_data:
             data["time_s"] = ("point", mesh.point_data["time_s"])
-    except (Exception, SystemExit) as error:  # meshio raises, or exits on, whatever it meets
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
                                        f"'{error}'")) from None
     return data
@@ -326,10 +333,19 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
 
 def _cells(line: str, number: int, where: str) -> list[str]:
     try:
-        return [cell.strip() for cell in next(csv.reader([line]))]
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
         raise MeasurementError(must_be(f"line {number}", where, "comma-separated values",
                                        f"'{error}'")) from None
+    _check_printable(cells, f"line {number}", where)
+    return cells
+
+
+def _check_printable(names: Iterable[str], what: str, where: str) -> None:
+    """Serial numbers, types and scans go to terminals and into other files."""
+    for name in names:
+        if not name.isprintable():
+            raise MeasurementError(must_be(what, where, "without control characters", f"'{name}'"))
 
 
 def _check_header(header: list[str], where: str) -> None:
@@ -354,12 +370,10 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
 def finite(cell: str, what: str, where: str, hint: str = "") -> float:
     """The number in a cell; MeasurementError if it is none, or not finite."""
     try:
-        value = float(cell)
+        return number_in(cell)
     except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'", hint))
-    return value
+        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'",
+                                       hint)) from None
 
 
 def check_readings(data: xr.Dataset, path: Path) -> None:
@@ -381,6 +395,8 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
             raise MeasurementError(must_be("sigma", where, "positive for every reading",
                                            "zero, a negative or a missing one"))
+    if "scan" in data:
+        _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)
 
 

@@ -245,7 +245,9 @@ def read_vectors(path: Path, points: Floats) -> Floats:
     """
     where = path.parent
     try:
-        table = np.loadtxt(path, ndmin=2)
+        lines = path.read_text(encoding="ascii").splitlines()
+        table = np.loadtxt(lines, ndmin=2, comments=None) if "".join(lines).strip() else (
+            np.empty((0, 0)))  # of nothing NumPy warns
     except (ValueError, OSError) as error:
         raise _failure(f"{path.name} is not a table of six columns ({error}); a point outside the "
                        "mesh looks like this, and so does a full disk", where) from None
@@ -385,7 +387,7 @@ def _check_log(lines: list[str], job: Job, folder: Path) -> None:
         raise _failure(
             f"it did not run in the {job.processes} MPI processes asked for: `mpirun` must be of "
             "the MPI that GetDP is built with (Debian: openmpi-bin)", folder)
-    sizes = [int(n) for n in re.findall(r"System \d+/\d+: (\d+) Dofs", text)]
+    sizes = [int(n) for n in re.findall(r"System \d+/\d+: (\d{1,15}) Dofs", text)]
     if not sizes or 0 in sizes:
         raise _failure("the system has no unknowns: is the mesh empty?", folder)
     if job.unknowns is not None and sizes[0] != job.unknowns:
@@ -403,25 +405,27 @@ def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
     found = 0
     last = np.nan
     for line in [*lines, "  0 KSP Residual norm 0"]:
-        match = re.search(r"(\d+) KSP Residual norm (\S+)", line)
+        match = re.search(r"(\d{1,9}) KSP Residual norm (\S+)", line)
         if not match:
             continue
+        residual = _residual(match[2], folder)
         if match[1] == "0":
             if first is not None and not last <= largest * first:
                 raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
                                "linear solver did not converge", folder)
             found += first is not None
-            first, last = _residual(match[2], folder), np.inf
+            first, last = residual, np.inf
         else:
-            last = _residual(match[2], folder)
+            last = residual
     return found
 
 
 def _residual(text: str, folder: Path) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise _failure(f"its log shows '{text[:40]}' for a residual", folder) from None
+    with contextlib.suppress(ValueError):
+        if np.isfinite(residual := float(text)):
+            return residual
+    raise _failure(f"a linear solve left a residual of '{text[:40]}', which is no number: the "
+                   "linear solver did not converge", folder)
 
 
 def _name_of(text: str, otherwise: str) -> str:

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
+from halbach_fe.cells import number as number_in
+
 MU_0 = 4e-7 * math.pi
 """Vacuum permeability in T m/A; the pre-2019 value, 1.3e-10 relative from the measured one."""
 
@@ -308,6 +310,8 @@ def steels() -> dict[str, Traversable]:
 def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """H in A/m and B in T of a CSV file with the header ``H_A_per_m,B_T``; ``#`` starts a comment.
 
+    What is in it is not quoted: a study can name any file.
+
     Raises
     ------
     ValueError
@@ -324,13 +328,12 @@ def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]
         raise ValueError(f"it is empty; give the line {','.join(COLUMNS)}, and a line a point")
     header = [name.strip() for name in lines[0][1].split(",")]
     if sorted(header) != sorted(COLUMNS):
-        raise ValueError(f"its header must be {','.join(COLUMNS)}, not {lines[0][1][:60]!r}")
+        raise ValueError(f"its header must be {','.join(COLUMNS)}")
     columns: dict[str, list[float]] = {name: [] for name in header}
     for number, line in lines[1:]:
         try:
             for name, value in zip(header, line.split(","), strict=True):
-                columns[name].append(float(value))
+                columns[name].append(number_in(value.strip()))
         except ValueError:
-            raise ValueError(f"line {number} must hold two numbers and a comma between, not "
-                             f"{line[:60]!r}") from None
+            raise ValueError(f"line {number} must hold two numbers and a comma between") from None
     return tuple(columns[COLUMNS[0]]), tuple(columns[COLUMNS[1]])

@@ -6,8 +6,7 @@ is read here, and the number of unknowns that GetDP must find is derived from it
 
 from __future__ import annotations
 
-import contextlib
-import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats, Ints
 from halbach_fe.errors import MeshError, OutputError
 from halbach_fe.regions import Regions
@@ -160,11 +160,12 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
             "would solve without a boundary condition. Mesh the study again."
         )
     chosen = [_DIMENSION.get(c.type) == regions.dimension for c in mesh.cells]
-    cells = np.vstack([c.data for c, yes in zip(mesh.cells, chosen, strict=True) if yes])
-    kind = next(c.type for c, yes in zip(mesh.cells, chosen, strict=True) if yes)
+    kind, cells = _joined(files.mesh, [
+        (c.type, c.data) for c, yes in zip(mesh.cells, chosen, strict=True) if yes])
     material = np.concatenate([tags for tags, yes in zip(physical, chosen, strict=True) if yes])
-    edge, boundary = _on(mesh, physical, regions.outer_boundary)
-    axis = boundary[:0] if regions.axis is None else _on(mesh, physical, regions.axis)[1]
+    edge, boundary = _on(files.mesh, mesh, physical, regions.outer_boundary)
+    axis = boundary[:0] if regions.axis is None else _on(
+        files.mesh, mesh, physical, regions.axis)[1]
     extent = np.abs(mesh.points).max(axis=0)
     if regions.axis is not None:  # x is r, y is z
         radius, half_length = float(extent[0]), float(extent[1])
@@ -182,28 +183,38 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
 
 def _read(path: Path) -> meshio.Mesh:
     try:
-        with path.open("rb") as file:
-            head = file.read(32)
-            file.seek(max(0, path.stat().st_size - 32))
-            tail = file.read()
+        raw = path.read_bytes()
     except OSError as error:
         raise MeshError(f"Cannot read mesh {path}: {error.strerror}.") from None
-    if not head.startswith(b"$MeshFormat") or b"2.2" not in head:
+    if not raw.startswith(b"$MeshFormat") or b"2.2" not in raw[:32]:
         raise MeshError(f"Mesh {path} is not an MSH 2.2 file, the newest that GetDP reads.")
-    if not tail.rstrip().endswith(b"$EndElements"):
+    counts = re.findall(rb"\$(?:Nodes|Elements)\s+(\d{1,20})", raw)
+    if not raw[-32:].rstrip().endswith(b"$EndElements") or max(map(int, counts), default=0) > len(
+            raw):
         raise MeshError(f"Mesh {path} is truncated; mesh the study again.")
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # meshio prints
-            return meshio.read(path)
-    except Exception as error:  # meshio raises whatever its parser meets
+        mesh = foreign.mesh(path)
+    except ValueError as error:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
+    if not np.isfinite(mesh.points).all():
+        raise MeshError(f"Mesh {path} has nodes without a place; mesh the study again.")
+    return mesh
 
 
-def _on(mesh: meshio.Mesh, physical: list[Ints], tag: int) -> tuple[str, Ints]:
+def _on(path: Path, mesh: meshio.Mesh, physical: list[Ints], tag: int) -> tuple[str, Ints]:
     """Type and elements of a part of the boundary."""
-    parts = [(c.type, c.data[tags == tag]) for c, tags in zip(mesh.cells, physical, strict=True)
-             if (tags == tag).any()]
-    return parts[0][0], np.vstack([data for _, data in parts])
+    return _joined(path, [
+        (c.type, c.data[tags == tag]) for c, tags in zip(mesh.cells, physical, strict=True)
+        if (tags == tag).any()])
+
+
+def _joined(path: Path, parts: list[tuple[str, Ints]]) -> tuple[str, Ints]:
+    """Elements that are of one type, and which."""
+    kinds = {kind for kind, _ in parts}
+    if len(kinds) != 1 or not kinds <= set(_CORNERS):
+        raise MeshError(f"Mesh {path} holds elements of types {', '.join(sorted(kinds)) or 'none'} "
+                        "in place of one; mesh the study again.")
+    return kinds.pop(), np.vstack([data for _, data in parts])
 
 
 def _count(cells: Ints, kind: str) -> Entities:

@@ -6,8 +6,9 @@ Geometry writes it beside the mesh; the solve reads it and refuses a mesh that d
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from halbach_fe.errors import MeshError
 
@@ -17,27 +18,31 @@ OUTER_BOUNDARY_TAG = 10
 AXIS_TAG = 11
 FIRST_BLOCK_TAG = 1001
 
+Tag = Annotated[int, Field(ge=1, lt=2**31)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,100}$")]
+"""It goes into GetDP's files."""
+
 
 class BlockRegion(BaseModel):
     """The physical tag of one block."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    name: str
+    name: Name
     ring: int
     slot: int
-    tag: int
+    tag: Tag
 
 
 class Regions(BaseModel):
     """Names and tags of every physical group of a mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    study: str
-    dimension: int
-    air: int
-    iron: int | None
-    outer_boundary: int
-    axis: int | None = None
+    study: Name
+    dimension: Literal[2, 3]
+    air: Tag
+    iron: Tag | None
+    outer_boundary: Tag
+    axis: Tag | None = None
     blocks: tuple[BlockRegion, ...]
 
     @property

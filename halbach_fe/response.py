@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError
@@ -177,11 +178,15 @@ def _write(path: Path, key: str, built: Response) -> None:
 def _read(path: Path, key: str) -> Response | None:
     """The stored response; None if there is none, or it is of other inputs, or damaged."""
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            if data.attrs["key"] != key:
-                return None
-            return Response(data["H"].values, tuple(map(str, data["parameter"].values)),
-                            data["nominal"].values, data["offset"].values, data["error"].values,
-                            float(data.attrs["superposition_error"]), reused=True)
-    except (OSError, KeyError, ValueError, RuntimeError):
+        data = foreign.dataset(path)
+        if data.attrs["key"] != key:
+            return None
+        names = tuple(map(str, data["parameter"].values))
+        readings, parameters = (len(data["offset"]),), (len(names),)
+        return Response(foreign.numbers(data["H"], readings + parameters), names,
+                        foreign.numbers(data["nominal"], parameters),
+                        foreign.numbers(data["offset"], readings),
+                        foreign.numbers(data["error"], readings),
+                        float(data.attrs["superposition_error"]), reused=True)
+    except (OSError, KeyError, ValueError, TypeError):
         return None

@@ -20,6 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import OutputError, SamplingError
 from halbach_fe.field_map import atomic
@@ -245,20 +246,24 @@ def _store(
 
 def _resume(path: Path, key: str, runs: list[_Run]) -> int:
     """Go on from what an interrupted run stored, if it is of the same inputs; its solves."""
+    count = len(runs)
     try:
-        with xr.open_dataset(path, group="state", engine="h5netcdf") as state:
-            if state.attrs["key"] != key:
-                return 0
-            solves = int(state.attrs["solves"])
-            last, accepted = state["last"].values, state["accepted"].values
-            generators = json.loads(state.attrs["generators"])
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
-            samples = posterior["magnetization"].values
-    except (OSError, KeyError, ValueError, RuntimeError):
+        state = foreign.dataset(path, "state")
+        if state.attrs["key"] != key:
+            return 0
+        solves = int(state.attrs["solves"])
+        last = foreign.numbers(state["last"], (count, len(runs[0].last)))
+        accepted = foreign.numbers(state["accepted"], (count,))
+        stored = foreign.dataset(path, "posterior")["magnetization"]
+        samples = foreign.numbers(stored, (count, stored.shape[1], len(runs[0].last)))
+        generators = [np.random.default_rng() for _ in runs]
+        for generator, words in zip(generators, json.loads(state.attrs["generators"]), strict=True):
+            generator.bit_generator.state = words
+    except Exception:  # what is damaged, in whatever way, is as good as nothing
         return 0
     for number, run in enumerate(runs):
         run.last, run.samples, run.accepted = last[number], samples[number], float(accepted[number])
-        run.generator.bit_generator.state = generators[number]
+        run.generator.bit_generator.state = generators[number].bit_generator.state
     return solves
 
 

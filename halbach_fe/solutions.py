@@ -18,6 +18,8 @@ from halbach_fe.errors import GetDPError
 
 _VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
 _UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for
+MOST_ENTITIES = 100
+"""For each row of a list of unknowns; most nodes, edges and faces have one."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +54,25 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
     try:
         text = path.read_text(encoding="ascii")
         rows = _section(text, "DofData", skip=5)
-        table = np.array([line.split()[:5] for line in rows], float).astype(int)
+        table = np.array([line.split()[:5] for line in rows], float)
+        if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
+            raise ValueError("an entity or unknown beyond all others")
+        table = table.astype(int)
         count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
+        if count < 1:
+            raise ValueError("no unknowns")
         functions = []
         for kind in np.unique(table[:, 0]):
             mine = table[table[:, 0] == kind]
             index = np.full(np.abs(mine[:, 1]).max() + 1, -1)
             solved = mine[mine[:, 3] == _UNKNOWN]
+            if not ((solved[:, 4] >= 1) & (solved[:, 4] <= count)).all():
+                raise ValueError(f"an unknown that is none of {count}")
             index[np.abs(solved[:, 1])] = solved[:, 4] - 1
             functions.append(index)
         return Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
                         _entities(text, "ElementsXFacets", faces))
-    except (OSError, ValueError, IndexError) as error:
+    except (OSError, ValueError, IndexError, OverflowError) as error:
         raise GetDPError(f"GetDP's list of unknowns {path} cannot be read ({error}).") from None
 
 

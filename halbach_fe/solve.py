@@ -517,11 +517,12 @@ def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
     """Relative residuals of Newton's method in a log of GetDP, by sample and step."""
     found: list[list[float]] = []
     for line in lines:
-        match = re.search(r"NEWTON (\d+) (\d+) (\S+)", line)
-        if match:
-            if match[2] == "0":
+        match = re.search(
+            r"NEWTON \d+ (\d+) (\d{1,20}(?:\.\d{1,20})?(?:e[-+]?\d+)?|nan|inf)\b", line)
+        if match and (found or match[1] == "0"):
+            if match[1] == "0":
                 found.append([])
-            found[-1].append(float(match[3]))
+            found[-1].append(float(match[2]))
     return found
 
 

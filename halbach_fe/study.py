@@ -19,7 +19,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from halbach_fe import materials
 from halbach_fe.errors import StudyError, must_be
@@ -29,6 +37,7 @@ from halbach_fe.materials import Curve
 MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
 MAX_POINTS = 1_000_000
+MAX_EXPLAINED = 1e9  # by a wrong unit
 
 # The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
 Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
@@ -62,6 +71,23 @@ def _one_or_list(kind: Any) -> BeforeValidator:
     """Let a single value stand for a list of one."""
     return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
                            json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("control characters are not allowed here")
+    return text
+
+
+def _lines(text: str) -> str:
+    for line in text.split("\n"):
+        _one_line(line.replace("\t", " "))
+    return text
+
+
+Line = Annotated[str, AfterValidator(_one_line)]
+"""Text that is shown on terminals, in pages, in tables."""
+Lines = Annotated[str, AfterValidator(_lines)]
 
 
 class _Model(BaseModel):
@@ -193,7 +219,7 @@ class TableCurve(_Model):
     """
 
     kind: Literal["table"]
-    file: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
+    file: Annotated[Line, Field(min_length=1, max_length=4000)] | None = None
     H_A_per_m: tuple[float, ...] = ()
     B_T: tuple[float, ...] = ()
 
@@ -478,7 +504,7 @@ class NoiseRegion(_Model):
     name are one region in reports.
     """
 
-    name: Annotated[str, Field(min_length=1, max_length=100)]
+    name: Annotated[Line, Field(min_length=1, max_length=100)]
     z_min_m: Coordinate | None = None
     z_max_m: Coordinate | None = None
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
@@ -533,7 +559,7 @@ class Prior(_Model):
     direction_sd_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 1.0
     common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
-    types: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}
+    types: dict[Line, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}
     temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
     reference_temperature_C: Temperature | None = None
 
@@ -662,7 +688,7 @@ class Study(_Model):
     """A magnet, how it is discretized, how it is measured, and what is known beforehand."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
-    description: str = ""
+    description: Lines = ""
     dimension: Literal[2, 3] = 3
     array: Array
     iron_ring: IronRing | None = None
@@ -734,7 +760,10 @@ def read_study(path: str | Path) -> Study:
         ) from None
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise StudyError(must_be("syntax", where, "TOML of a few levels", "hundreds of them")
+                         ) from None
+    except ValueError as error:  # of TOML, or of an integer with thousands of digits
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
         ) from None
@@ -782,6 +811,8 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
         return study
     path = folder / ring.curve.file
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ValueError("it must be a file")  # a device may have no end
         field, flux_density = materials.read_table(path)
         table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:
@@ -823,7 +854,7 @@ def _sentence(error: ValidationError, where: str) -> str:
     else:
         expected = first["msg"].removeprefix("Input should be ").lower()
         if isinstance(received, int | float) and not isinstance(received, bool):
-            hint = _unit_hint(key, float(received))
+            hint = _unit_hint(key, received)
         elif isinstance(received, dict | list):
             received = "a table" if isinstance(received, dict) else "a list"
         else:
@@ -837,6 +868,8 @@ def _more(errors: list[Any]) -> str:
 
 def _unit_hint(key: str, value: float) -> str:
     """Guess a unit that is wrong by a factor of 1000."""
+    if not abs(value) < MAX_EXPLAINED:
+        return "Correct the value."
     wrong = {"_m": "millimetres", "_T": "millitesla"}
     key = key.partition("[")[0] if key.endswith("]") else key
     for suffix, unit in wrong.items():

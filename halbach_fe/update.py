@@ -20,6 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from halbach_fe import foreign
 from halbach_fe.block_table import BlockTable
 from halbach_fe.blocks import Floats, blocks_of, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
@@ -406,11 +407,12 @@ def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
     """
     nominal = np.concatenate([block.magnetization[:study.dimension] for block in blocks_of(study)])
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            own = data["nominal"].values
-            found = {name: Gaussian(data[f"{name}_mean"].values, _root(
-                data[f"{name}_covariance"].values)) for name in ("prior", "posterior")}
-    except (OSError, KeyError, ValueError, RuntimeError):
+        data = foreign.dataset(path)
+        own = foreign.numbers(data["nominal"], data["nominal"].shape)
+        found = {name: Gaussian(foreign.numbers(data[f"{name}_mean"], own.shape), _root(
+            foreign.numbers(data[f"{name}_covariance"], own.shape * 2)))
+            for name in ("prior", "posterior")}
+    except (OSError, KeyError, ValueError, TypeError):
         raise MeasurementError(must_be(
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
             "none that can be read")) from None

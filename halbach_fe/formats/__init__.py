@@ -9,7 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from halbach_fe.errors import OutputError, must_be
+from halbach_fe.errors import OutputError, must_be, printable
 from halbach_fe.field_map import atomic, check_readings, file_bytes, write_map
 from halbach_fe.formats import bdsim, columns, comsol, geant4, openpmd, opera
 from halbach_fe.formats.declared import Declared
@@ -24,6 +24,8 @@ GRIDS: dict[str, Callable[[Grid], bytes]] = {
     "geant4": lambda grid: _joined(geant4.lines(grid))}
 SUFFIXES = {"csv": ".csv", "vtu": ".vtu"}
 WRITERS = (*GRIDS, *SUFFIXES)
+MAX_NAME = 255
+"""Characters of a file's name."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ def import_map(path: Path, declared: Declared, name: str = "") -> Found:
     found = to_map(READERS[name](raw, declared, where), declared)
     data = found.data
     check_readings(data, path)
-    data.attrs |= {"imported_from": _printable(path.name), "imported_as": name,
+    data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
                    "imported_sha256": hashlib.sha256(raw).hexdigest()}
     return Found(found, name)
 
@@ -92,7 +94,3 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
 
 def _joined(lines: Iterable[str]) -> bytes:
     return "\n".join([*lines, ""]).encode()
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)

@@ -16,6 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from halbach_fe import foreign
 from halbach_fe.blocks import Floats
 from halbach_fe.errors import MeasurementError, must_be
 from halbach_fe.formats.declared import Declared
@@ -42,7 +43,7 @@ def read(raw: bytes, declared: Declared, where: str) -> Table:
         rectangular grid.
     """
     try:
-        with h5py.File(io.BytesIO(raw), "r") as file, np.errstate(all="ignore"):
+        with foreign.hdf5(io.BytesIO(raw)) as file:
             return _table(_only_mesh(file, where), where)
     except MeasurementError:
         raise

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.blocks import Floats
+from halbach_fe.cells import MAX_CELL
+from halbach_fe.cells import number as number_in
 from halbach_fe.errors import MeasurementError, must_be
 from halbach_fe.formats.declared import Declared
 
 COMMENTS = "#%!"
 MAX_COMMENTS = 2000
-MAX_CELL = 60
-"""Characters; no number has more, and patterns are slow on longer ones."""
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d{1,4})?")
-"""Numbers as programs print them, Fortran's D included; no ``1_000``, which Python would take."""
 
 Line = tuple[int, str]
 
@@ -85,12 +83,7 @@ def number(cell: str, decimal_comma: bool = False) -> float:
         cell = cell.replace(",", ".")
     if not cell or cell.lower() == "nan":
         return np.nan
-    if len(cell) > MAX_CELL or not NUMBER.fullmatch(cell):
-        raise ValueError(cell)
-    value = float(cell.replace("D", "e").replace("d", "e"))
-    if not np.isfinite(value):
-        raise ValueError(cell)
-    return value
+    return number_in(cell)
 
 
 def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:

@@ -263,7 +263,7 @@ TABLE = "H_A_per_m,B_T\n0,0\n100,0.1\n160,0.25\n382,1.0\n758,1.3\n1837,1.5\n"
     (("0,0\n100,0.1\n160,0.25\n382,1.0\n", ""), "not 2; give more"),
     ((",1.5", ",1500"), "mT or gauss"), ((",1.5", ",15000"), "mT or gauss"),
     (("1837,", "1.837,"), "H must rise"), ((",0.1\n", ",-0.1\n"), "is negative"),
-    (("H_A_per_m,B_T", "B_T,H_A_per_m"), "exchanged"), (("382", "inf"), "is not finite"),
+    (("H_A_per_m,B_T", "B_T,H_A_per_m"), "exchanged"), (("382", "inf"), "must hold two numbers"),
     (("H_A_per_m", "H"), "its header must be H_A_per_m,B_T"), (("160", "many"), "line 4 must hold"),
     ((TABLE, ""), "it is empty"), ((TABLE, "Fr\xf6hlich"), "UTF-8"), (None, "No such file")])
 def test_bad_iron(study, tmp_path, capsys, monkeypatch, edit, said):
