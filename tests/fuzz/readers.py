@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import tempfile
 import tomllib
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,8 +19,10 @@ from halbach_fe import sampled
 from halbach_fe import solve as solving
 from halbach_fe.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.blocks import blocks_of
+from halbach_fe.cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.errors import (
     GetDPError,
+    HalbachWarning,
     MeasurementError,
     MeshError,
     StudyError,
@@ -29,7 +33,7 @@ from halbach_fe.formats import import_map
 from halbach_fe.formats.declared import Declared
 from halbach_fe.formats.grid import grid_of
 from halbach_fe.formats.openpmd import content as openpmd_content
-from halbach_fe.getdp import Job, _check_log, find_getdp, read_vectors
+from halbach_fe.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
 from halbach_fe.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.regions import Regions
 from halbach_fe.response import Response
@@ -303,6 +307,45 @@ def log_of(path: Path) -> None:
         raise GetDPError(f"{error} {path.name}") from None
 
 
+CACHED = {"getdp.log": b"-solve R\nInfo\n", "out.txt": b"1 2 3\n"}
+
+
+def manifest() -> bytes:
+    """Of an entry of the cache that holds `CACHED`."""
+    return Manifest(
+        problem="p.pro", resolution="R", unknowns=7, solves=1, getdp="3.2.0",
+        files={name: Kept(bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
+               for name, content in CACHED.items()}).model_dump_json(indent=1).encode()
+
+
+def restored(path: Path) -> tuple[bool, set[str], set[str]]:
+    """Whether the cache gives an answer by a manifest, and the files in the run folder, and in
+    the one above it.
+    """
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        root, run = Path(name), Path(name, "run")
+        run.mkdir()
+        (run / "p.pro").write_text("given")
+        entry = Cache(root / "cache").entry(
+            GetDP(Path("getdp"), "3.2.0", (), ""), Job("p.pro", "mesh.msh", "R", ()), run)
+        entry.folder.mkdir(parents=True)
+        for file, content in CACHED.items():
+            (entry.folder / file).write_bytes(content)
+        (entry.folder / MANIFEST).write_bytes(path.read_bytes())
+        answered = entry.restore(lambda line: None)
+        assert all(issubclass(one.category, HalbachWarning) for one in said)
+        assert bool(said) != answered
+        assert (run / "p.pro").read_text() == "given"
+        return answered, {one.name for one in run.iterdir()}, {one.name for one in root.iterdir()}
+
+
+def check_restored(found: tuple[bool, set[str], set[str]]) -> None:
+    answered, here, above = found
+    assert above == {"run", "cache"}
+    assert here <= {"p.pro", *CACHED} if answered else here == {"p.pro"}
+
+
 HDF5 = (b"\x89HDF\r\n\x1a\n", b"OHDR", b"TREE", b"SNOD", b"HEAP", b"FRHP", b"GCOL", b"BTHD",
         b"_FillValue", b"scale_factor", b"add_offset", b"units", b"days since 1-1-1",
         b"coordinates", b"DIMENSION_LIST", b"_Unsigned", b"dtype", b"bool", b"B_T", b"x_m",
@@ -333,7 +376,8 @@ NAMES = (
     "import: columns", "import: opera", "import: comsol", "import: openpmd", "import as columns",
     "import as opera", "import as comsol", "import as openpmd", "posterior", "stored response",
     "stored chains", "mesh", "regions", "GetDP: unknowns", "GetDP: unknowns of edges",
-    "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log")
+    "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log",
+    "cached answer")
 """To collect tests by, without making the seeds."""
 
 
@@ -405,6 +449,9 @@ def readers() -> tuple[Reader, ...]:
         Reader("GetDP: vectors", "flux_density.txt", (left["vectors"],),
                lambda path: read_vectors(path, places), GetDPError, check_finite),
         Reader("GetDP: log", "getdp.log", (left["log"],), log_of, GetDPError, tokens=LOG),
+        Reader("cached answer", "manifest.json", (manifest(),), restored, None, check_restored,
+               (b'"out.txt"', b'"../out.txt"', b'"/etc/passwd"', b'"p.pro"', b'""', b'"."', b'".."',
+                b"null", b'"\\u0000"')),
     )
 
 
