@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -135,7 +136,11 @@ def test_work_of_a_lost_worker_is_done_again(grid, cluster, workshop, dipole, tm
 
 def children_of(pid):
     """Runs of GetDP that a process has started; asking for the version is none."""
-    return [child for child in psutil.Process(pid).children() if "-solve" in child.cmdline()]
+    found = []
+    for child in psutil.Process(pid).children():
+        with suppress(psutil.Error):  # it has just ended
+            found += [child] * ("-solve" in child.cmdline())
+    return found
 
 
 def test_what_nobody_waits_for_ends(grid, cluster, workshop, dipole, tmp_path):
