@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import plotly.graph_objects as go
 import plotly.io
+import scipy.sparse as sparse
 from markupsafe import Markup
 from scipy.spatial import Delaunay
 
@@ -127,9 +128,10 @@ def of_update(update: Update) -> Markup:
     easy = nominal / np.linalg.norm(nominal, axis=1)[:, None]
     length = np.einsum("ij,ij->i", nominal, easy)
     mean = update.posterior.mean.reshape(-1, size)
-    along = np.einsum("ij,ijk->ik", easy, update.posterior.root.reshape(*easy.shape, -1))
+    number = np.arange(len(easy) + 1)
+    along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
     change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
-    sd = 100 * np.linalg.norm(along, axis=1) / length
+    sd = 100 * update.posterior.sd_of(along) / length
     known = Known(mean, Colours(change, "posterior change<br>along the easy axis in %", [
         f"{one:+.2f} ± {error:.2f} % along the easy axis"
         for one, error in zip(change, sd, strict=True)]))
