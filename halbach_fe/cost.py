@@ -334,7 +334,9 @@ def posed(
     if route == "azimuthal_modes":
         weights = nominal_waves(study, modes_needed(study, points))
         rings = len({number // study.array.blocks_per_ring for number in blocks})
-        spans = [(first, last - first + 1) for first, last in spans_of(weights, bool(blocks))]
+        each = (NOMINAL_SOURCES - 1 + 3 * rings) * unknowns_of(mesh.inner, mesh.axis, 1)
+        spans = [(first, last - first + 1) for first, last in spans_of(
+            weights, bool(blocks), each)]
         return [problem(unknowns_of(mesh.inner, mesh.axis, first), PLANE, variants, modes,
                         modes * (NOMINAL_SOURCES + 3 * rings)) for first, modes in spans]
     formulation = formulation_of(study, route)

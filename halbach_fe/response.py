@@ -264,5 +264,5 @@ def _read(path: Path, key: str) -> Response | None:
             return Response(matrix, tuple(map(str, data["parameter"].values)),
                             data["nominal"].values, data["offset"].values, data["error"].values,
                             float(data.attrs["superposition_error"]), reused=True)
-    except (OSError, KeyError, ValueError, RuntimeError):
+    except (OSError, EOFError, KeyError, ValueError, RuntimeError):
         return None
