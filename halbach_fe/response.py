@@ -108,6 +108,11 @@ class Response:
     superposition_error: float
     reused: bool = False
 
+    @property
+    def whole(self) -> Floats:
+        """The matrix in memory, however large."""
+        return self.matrix[np.arange(len(self.matrix))]
+
 
 def parameter_names(study: Study) -> tuple[str, ...]:
     """Names of the parameters p, block by block; the cross-section has no M_z."""

@@ -404,9 +404,9 @@ def _nominal(study: Study, mounts: Mounts) -> Spares:
     vectors = np.array([block.magnetization for block in blocks_of(as_meant(study))])
     prior = block_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
                         settings.direction_sd_deg, settings.common_mode_sd)
+    roots = np.asarray(prior.root).reshape(len(vectors), size, -1)
     own = np.zeros((len(vectors), 3, 3))
-    for number in range(len(vectors)):
-        rows = prior.root[number * size:(number + 1) * size]
+    for number, rows in enumerate(roots):
         back = mounts.frames[number, :size, :size].T
         own[number, :size, :size] = back @ rows @ rows.T @ back.T
     return Spares(("nominal",) * len(vectors), np.einsum("nji,nj->ni", mounts.frames, vectors), own,

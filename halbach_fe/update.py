@@ -458,7 +458,8 @@ def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
 
 def _read_root(data: xr.Dataset, name: str, prior: Gaussian | None) -> Floats | Root:
     if f"{name}_left" in data and prior is not None:
-        return Root(entries(prior.root), data[f"{name}_directions"].values, data[f"{name}_left"].values)
+        return Root(entries(prior.root), data[f"{name}_directions"].values,
+                    data[f"{name}_left"].values)
     start = data[f"{name}_root_row_start"]
     return beside(sparse.csr_array(
         (data[f"{name}_root"].values, data[f"{name}_root_column"].values, start.values),

@@ -202,7 +202,7 @@ def inform(parts: Iterable[Floats]) -> Information:
             continue
         held = np.vstack(waiting)
         if enough * columns <= NUMBERS_HELD:
-            held = np.linalg.qr(held, mode="r")
+            held = np.asarray(np.linalg.qr(held, mode="r"))
         else:
             held, (noise, little) = _compressed(held)
             rest, left_out = rest + noise, left_out + little

@@ -63,9 +63,9 @@ class Root:
         across = 0.0 if columns == rows else np.maximum(0, _squares(seen) - _squares(along))
         return np.asarray(across + _squares(along * self.left))
 
-    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> Floats:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Floats:
         """L as an array."""
-        outer = self.outer.toarray() if sparse.issparse(self.outer) else self.outer
+        outer = self.outer if isinstance(self.outer, np.ndarray) else self.outer.toarray()
         return np.asarray(self._contracted(outer), dtype)
 
     def _contracted(self, rows: Numbers) -> Numbers:
@@ -77,9 +77,9 @@ class Root:
 
 def _squares(rows: Floats | sparse.csr_array) -> Floats:
     """Sums of squares (n,) of rows (n, k)."""
-    if sparse.issparse(rows):
-        return np.asarray(rows.power(2).sum(axis=1)).ravel()
-    return np.einsum("ij,ij->i", rows, rows)
+    if isinstance(rows, np.ndarray):
+        return np.einsum("ij,ij->i", rows, rows)
+    return np.asarray(rows.power(2).sum(axis=1)).ravel()
 
 
 @dataclass(frozen=True)
@@ -136,13 +136,13 @@ def block_prior(
         Of each direction across the easy axis; a small angle, so the deviation is M times it.
     """
     roots = np.zeros((nominal.size // dimension, dimension, dimension))
-    for own, vector in zip(roots, nominal.reshape(-1, dimension), strict=True):
+    for root, vector in zip(roots, nominal.reshape(-1, dimension), strict=True):
         magnitude = float(np.linalg.norm(vector))
         if magnitude == 0:
             continue  # a block that is missing is known not to be there
         axis = (vector / magnitude)[:, None]
         across = linalg.null_space(axis.T)
-        own[:] = magnitude * np.hstack(
+        root[:] = magnitude * np.hstack(
             [magnitude_sd * axis, np.radians(direction_sd_deg) * across])
     own = by_block(roots)
     return Gaussian(nominal, beside(own, common_mode_sd * nominal[:, None])

@@ -193,7 +193,8 @@ def _few(study: Study, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
               for first in range(0, len(blocks), step * slots) for slot in range(slots)]
     colours = known.colours
     if colours is not None:
-        worst = [max(group, key=lambda one: abs(colours.values[one])) for group in groups]
+        size = np.abs(colours.values)
+        worst = [group[int(np.argmax(size[group]))] for group in groups]
         colours = replace(colours, values=colours.values[worst], words=[
             f"most in ring {blocks[one].ring}: {colours.words[one]}" for one in worst])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],

@@ -223,8 +223,7 @@ def long_array(generator, workshop):
 
 
 def test_two_thousand_blocks(long_array, tmp_path):
-    """Truth by magpylib: what was held out is predicted as well as is said; files and page hold it.
-    """
+    """Truth by magpylib: what was held out is predicted as well as is said; files stay small."""
     update, truth = long_array
     unseen = update.scores[1]
     # 48 readings: sd 0.2
