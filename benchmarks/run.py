@@ -14,21 +14,23 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import diagnosis, inference, nonlinear, response
+from benchmarks import diagnosis, inference, nonlinear, response, scaling
 from halbach_fe.cli import common
 from halbach_fe.update import write_text
 
 RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
-         "inference": inference.run, "diagnosis": diagnosis.run}
+         "inference": inference.run, "diagnosis": diagnosis.run, "scaling": scaling.run}
+ALONE = ("scaling",)
+"""Parts that are measured only when they are named: they take long."""
 
 
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", metavar="PART",
-                        help=f"of {', '.join(PARTS)} (default: all)")
-    chosen = parser.parse_args().parts or list(PARTS)
+                        help=f"of {', '.join(PARTS)} (default: all but {', '.join(ALONE)})")
+    chosen = parser.parse_args().parts or [part for part in PARTS if part not in ALONE]
     results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
 
     def note(name: str, value: float, unit: str, against: str) -> None:

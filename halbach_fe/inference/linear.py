@@ -31,8 +31,8 @@ from halbach_fe.inference.prior import Gaussian, Root, entries
 READINGS_AT_ONCE = 8192
 """Rows whitened at a time: memory does not grow with the readings."""
 
-NUMBERS_AT_ONCE = 2**25
-"""In one part of a matrix, 256 MB: of many parameters fewer rows are taken at a time."""
+NUMBERS_AT_ONCE = 2**24
+"""In one part of a matrix, 128 MB: of many parameters fewer rows are taken at a time."""
 
 NUMBERS_HELD = 2**26
 """In the square root of the information, 512 MB, before it is compressed. No more rows are needed
