@@ -52,7 +52,7 @@ READINGS = (42, 420, 4200, 41_700)
 BOTH = ((64, 42), (64, 420), (640, 126))
 """Rings and circles: 3 072 parameters from 1 008 and 10 080 readings, 30 720 from 3 024."""
 
-MESHES = (0.016, 0.008, 0.004, 0.002)
+MESHES = (0.016, 0.008, 0.004)
 """Elements in m of the half-plane, of a dipole of 12 rings: 36 columns and the nominal array."""
 
 SOLIDS = (0.035, 0.025, 0.018)

@@ -133,7 +133,8 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
     def rows() -> Iterator[Floats]:
-        for some in parts_of(len(observation), dimension * len(blocks)):
+        # as many at once as memory takes: they share integrals
+        for some in parts_of(len(observation), dimension * len(blocks), len(observation)):
             matrix, total[some], magnitude[some] = _rows(study, observation, parts, some)
             yield matrix
 

@@ -181,9 +181,11 @@ def whitened_parts(
                          @ rows(needed))
 
 
-def parts_of(count: int, columns: int) -> Iterator[slice]:
-    """Slices of the rows of a matrix (count, columns), a part at a time."""
-    step = min(READINGS_AT_ONCE, max(1, NUMBERS_AT_ONCE // max(1, columns)))
+def parts_of(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
+    """Slices of the rows of a matrix (count, columns), a part at a time, of at most so many rows
+    (default: `READINGS_AT_ONCE`).
+    """
+    step = min(most or READINGS_AT_ONCE, max(1, NUMBERS_AT_ONCE // max(1, columns)))
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 

@@ -50,6 +50,8 @@ class Root:
 
     def __rmatmul__(self, matrix: Numbers) -> Numbers:
         """A matrix (n, m) times L."""
+        if np.iscomplexobj(matrix):  # without complex copies of the directions
+            return (matrix.real @ self) + 1j * (matrix.imag @ self)
         return self._contracted(matrix @ self.outer)
 
     def variances(self, matrix: Floats | sparse.csr_array | None = None) -> Floats:

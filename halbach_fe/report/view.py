@@ -212,8 +212,8 @@ def _blocks(study: Study, blocks: Sequence[MagnetBlock], known: Known) -> go.Mes
         owner += [number] * len(corners)
         first += len(corners)
     points, faces = np.vstack(vertices), np.vstack(triangles)
-    last = _rings_in_one(study) - 1
-    words = [_words(block, last, known, number) for number, block in enumerate(blocks)]
+    more = _rings_in_one(study) - 1
+    words = [_words(block, min(more, study.array.rings - block.ring), known, number) for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
     if known.colours is not None:
         values = known.colours.values

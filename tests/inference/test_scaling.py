@@ -191,7 +191,7 @@ def test_a_matrix_on_the_disk(monkeypatch, workshop, tmp_path):
     observation = observe(study, points, np.ones_like(points, bool))
     whole = response(study, observation, workshop)
     monkeypatch.setattr(response_module, "LOADED_BYTES", 1000)
-    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(linear, "NUMBERS_AT_ONCE", 700)
     (workshop.folder / "response.h5").unlink()
     parts = response(study, observation, workshop)
     assert isinstance(parts.matrix, StoredMatrix)
