@@ -213,7 +213,8 @@ def _blocks(study: Study, blocks: Sequence[MagnetBlock], known: Known) -> go.Mes
         first += len(corners)
     points, faces = np.vstack(vertices), np.vstack(triangles)
     more = _rings_in_one(study) - 1
-    words = [_words(block, min(more, study.array.rings - block.ring), known, number) for number, block in enumerate(blocks)]
+    words = [_words(block, min(more, study.array.rings - block.ring), known, number)
+             for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
     if known.colours is not None:
         values = known.colours.values
