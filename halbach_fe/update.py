@@ -53,6 +53,9 @@ TRAINING, HELD_OUT, HELD_OUT_MAP = "training", "held out", "held-out map"
 LINEAR_ENOUGH = 0.3
 """Of the error bar: what linearizing the iron may move a reading without a word."""
 
+LEFT_OUT = 0.02
+"""Of a variance, 1 % of a standard deviation: what may be left out without a word."""
+
 WRITTEN_COVARIANCE = 2000
 """Parameters, at most, whose covariance is written too: 32 MB."""
 
@@ -108,7 +111,8 @@ class Update:
 
     ``parts`` and ``regions`` are those of each reading: training, held out, or of a map that is
     only predicted; and the noise region. ``measured_blocks`` is how many blocks the prior was
-    measured of; None if it is the study's.
+    measured of; None if it is the study's. ``left_out`` is that of
+    `halbach_fe.inference.linear.LinearPosterior`.
     """
 
     study: Study
@@ -127,6 +131,7 @@ class Update:
     log_evidence: float
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
+    left_out: float = 0.0
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:
@@ -280,6 +285,11 @@ def infer(
         model.matrix, (readings - model.offset)[~keep], errors.part(~keep), before,
         np.flatnonzero(~keep))
     after = learnt.distribution
+    if learnt.left_out > LEFT_OUT:
+        warnings.warn(
+            f"Of so many parameters and readings of study {study.name} some combinations were left "
+            f"out, which together may change a variance by {learnt.left_out:.1g} of itself.",
+            HalbachWarning, stacklevel=2)
     if is_nonlinear(study) and not linearized_only:
         _check_linearization(study, observation, workshop, model, after.mean, errors.sd)
     return Update(
@@ -289,7 +299,8 @@ def infer(
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
         log_evidence=learnt.log_evidence,
         kind="linearized" if is_nonlinear(study) else "closed form",
-        measured_blocks=of_blocks.count if of_blocks and not prior else None)
+        measured_blocks=of_blocks.count if of_blocks and not prior else None,
+        left_out=learnt.left_out)
 
 
 def observed(
@@ -483,6 +494,7 @@ def summary(update: Update) -> dict[str, object]:
         "prior_conflict_limit": update.conflict_limit,
         "parameters_learnt": update.parameters_learnt,
         "log_evidence": update.log_evidence,
+        "information_left_out": update.left_out,
         "contraction_by_block": linear.contraction(
             update.prior, update.posterior, update.study.dimension).round(6).tolist(),
         "largest_shift_A_per_m": float(np.abs(shift).max()),
