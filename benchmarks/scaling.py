@@ -46,8 +46,8 @@ FEW = 42  # circles of 8 points: 1008 readings
 BLOCKS = (1, 4, 16, 64, 160, 320, 640)
 """Rings of 16 blocks."""
 
-READINGS = (42, 420, 4200, 41_700)
-"""Circles of 8 points and 24 readings, of a dipole of three rings."""
+READINGS = ((42, 8), (140, 24), (420, 80), (1302, 256))
+"""Circles and points on each, of a dipole of three rings: three readings a point."""
 
 BOTH = ((64, 42), (64, 420), (640, 126))
 """Rings and circles: 3 072 parameters from 1 008 and 10 080 readings, 30 720 from 3 024."""
@@ -118,9 +118,9 @@ def infer(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         "disk_MiB": sum(written.values()), "page_MiB": written["report.html"]}
 
 
-def campaign(rings: int, circles: int) -> dict[str, Any]:
+def campaign(rings: int, circles: int, angles: int = 8) -> dict[str, Any]:
     """Time of an inference from a map of magpylib."""
-    document = long_dipole(rings, circles)
+    document = long_dipole(rings, circles, angles)
     with tempfile.TemporaryDirectory() as name:
         measured(write_campaign, document, Path(name))
         found = measured(infer, document, Path(name))
@@ -186,7 +186,7 @@ def measure(quick: bool) -> dict[str, list[dict[str, Any]]]:
 
     return {
         "blocks": [campaign(rings, FEW) for rings in some(BLOCKS)],
-        "readings": [campaign(3, circles) for circles in some(READINGS)],
+        "readings": [campaign(3, *circles) for circles in some(READINGS)],
         "both": [campaign(rings, circles) for rings, circles in some(BOTH)],
         "azimuthal modes": [measured(modes, size, 1) for size in some(MESHES)],
         "scalar potential": [measured(solid, size) for size in some(SOLIDS)],
