@@ -56,7 +56,7 @@ MESHES = (0.016, 0.008, 0.004)
 """Elements in m of the half-plane, of a dipole of 12 rings: 36 columns and the nominal array."""
 
 SOLIDS = (0.035, 0.025, 0.018)
-"""Elements in m of the 3D mesh of two rings: the nominal array, by conjugate gradients."""
+"""Elements in m of the 3D mesh of two rings: the nominal array, factorized."""
 
 SLOPE_FROM = {"blocks": 2560, "readings": 10_000, "azimuthal modes": 0, "scalar potential": 0}
 """Sizes from which on growth is that of the work itself, not of what every run takes."""

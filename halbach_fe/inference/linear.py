@@ -7,11 +7,13 @@ Pattern Recognition and Machine Learning, eq. 2.117, in whitened coordinates). N
 inverted, C_0 may be singular, and of many parameters only as many directions are kept as there are
 readings.
 
-W itself need not fit into memory. It is made a part at a time, and what was read of it is held as
-a square root of its information (G. J. Bierman, Factorization Methods for Discrete Sequential
-Estimation, 1977): rows with the same W'W and W'y, at most one more than there are parameters, by
-QR. Where that is still too much, as with tens of thousands of parameters, those combinations of
-readings are left out that say hardly anything, see `NEGLIGIBLE`.
+W itself need not fit into memory: it is made a part at a time. Of more readings than parameters the
+one product W'W is summed, and its eigenvectors are V. Where readings are so exact that rounding of
+the product would matter, and of fewer readings than parameters, rows are kept instead, as a square
+root of the information (G. J. Bierman, Factorization Methods for Discrete Sequential Estimation,
+1977): no more than there are parameters, by QR. Where that is still too much, as with tens of
+thousands of parameters, those combinations of readings are left out that say hardly anything, see
+`NEGLIGIBLE`.
 """
 
 from __future__ import annotations
@@ -34,9 +36,13 @@ READINGS_AT_ONCE = 8192
 NUMBERS_AT_ONCE = 2**24
 """In one part of a matrix, 128 MB: of many parameters fewer rows are taken at a time."""
 
+WORST_CONDITION = 1e10
+"""Of the precision of z, I + W'W, for the product: its rounding then moves the posterior by some
+1e-6 of its sd."""
+
 NUMBERS_HELD = 2**26
-"""In the square root of the information, 512 MB, before it is compressed. No more rows are needed
-than there are parameters, so that nothing is left out below 8000 of them."""
+"""In W'W, or in the square root of the information before it is compressed, 512 MB. No more rows
+are needed than there are parameters, so that nothing is left out below 8000 of them."""
 
 NEGLIGIBLE = 1e-4
 """Singular values of W that may be left out: an unknown combination of readings is then known to
@@ -90,24 +96,19 @@ class Information:
         V.
     values : ndarray, shape (r,)
         s.
-    seen : ndarray, shape (r,)
-        U'y.
-    rest : float
-        Sum of squares of y that U does not have.
+    pulled : ndarray, shape (r,)
+        V' W' y.
+    chi2 : float
+        y' (I + W W')^-1 y.
     left_out : float
         Sum of squares of the singular values that were left out.
     """
 
     directions: Floats
     values: Floats
-    seen: Floats
-    rest: float
-    left_out: float
-
-    @property
-    def chi2(self) -> float:
-        """y' (I + W W')^-1 y."""
-        return self.rest + float(np.sum(self.seen**2 / (1 + self.values**2)))
+    pulled: Floats
+    chi2: float
+    left_out: float = 0.0
 
 
 def update(
@@ -132,10 +133,11 @@ def update(
         own = matrix[some if rows is None else rows[some]]
         return np.column_stack([own @ prior.root, readings[some] - own @ prior.mean])
 
-    found = inform(whitened_parts(both, noise, prior.root.shape[1] + 1))
+    columns = prior.root.shape[1] + 1
+    found = inform(lambda: whitened_parts(both, noise, columns), (len(readings), columns))
     values = found.values
     left = 1 / np.sqrt(1 + values**2)
-    shift = found.directions @ (values * found.seen / (1 + values**2))
+    shift = found.directions @ (found.pulled / (1 + values**2))
     log_size = float(-np.log(left).sum() + noise.log_size
                      + len(readings) / 2 * np.log(2 * np.pi))
     return LinearPosterior(
@@ -189,8 +191,35 @@ def parts_of(count: int, columns: int, most: int | None = None) -> Iterator[slic
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
-def inform(parts: Iterable[Floats]) -> Information:
-    """What whitened readings tell, from their rows and themselves, parts (c, k + 1) of [W y]."""
+def inform(parts: Callable[[], Iterable[Floats]], shape: tuple[int, int]) -> Information:
+    """What whitened readings tell.
+
+    Parameters
+    ----------
+    parts : callable
+        Gives the rows of [W y], parts (c, k + 1), one after the other.
+    shape : tuple of int
+        Of all rows, (n, k + 1).
+    """
+    rows, columns = shape
+    if rows > columns and columns**2 <= NUMBERS_HELD:
+        found = _by_product(parts(), columns)
+        if found.values.max(initial=0) ** 2 < WORST_CONDITION:
+            return found
+    return _by_rows(parts())
+
+
+def _by_product(parts: Iterable[Floats], columns: int) -> Information:
+    product = np.zeros((columns, columns))
+    for part in parts:
+        product += part.T @ part
+    squares, directions = linalg.eigh(product[:-1, :-1])
+    squares, pulled = np.maximum(squares, 0), directions.T @ product[:-1, -1]
+    return Information(directions, np.sqrt(squares), pulled,
+                       float(product[-1, -1] - np.sum(pulled**2 / (1 + squares))))
+
+
+def _by_rows(parts: Iterable[Floats]) -> Information:
     waiting: list[Floats] = []
     rows, rest, left_out = 0, 0.0, 0.0
     limit: float = np.inf
@@ -206,15 +235,16 @@ def inform(parts: Iterable[Floats]) -> Information:
         if enough * columns <= NUMBERS_HELD:
             held = np.asarray(np.linalg.qr(held, mode="r"))
         else:
-            held, (noise, little) = _compressed(held)
-            rest, left_out = rest + noise, left_out + little
+            held, less = _compressed(held)
+            rest, left_out = rest + less[0], left_out + less[1]
             limit = max(limit, 2 * len(held))
         waiting, rows = [held], len(held)
     held = np.vstack(waiting)
     u, values, directions = linalg.svd(held[:, :-1], full_matrices=False, check_finite=False)
     seen = u.T @ held[:, -1]
-    rest += max(0.0, float(held[:, -1] @ held[:, -1] - seen @ seen))
-    return Information(directions.T, values, seen, rest, left_out)
+    rest += float(np.sum((held[:, -1] - u @ seen) ** 2))
+    return Information(directions.T, values, values * seen,
+                       rest + float(np.sum(seen**2 / (1 + values**2))), left_out)
 
 
 def _compressed(held: Floats) -> tuple[Floats, tuple[float, float]]:
@@ -260,17 +290,11 @@ def whitened(
     own = noise.whiten(residual)
     if not columns:
         return own
-    found = inform(np.column_stack([part, own[place]]) for place, part in _with_place(
-        whitened_parts(root, noise, columns)))
+    found = inform(lambda: (np.column_stack([part, own[place]]) for place, part in zip(
+        parts_of(len(own), columns), whitened_parts(root, noise, columns), strict=True)),
+        (len(own), columns + 1))
     size = np.sqrt(1 + found.values**2)
     # 1/size - 1, over squares
-    toward = found.directions @ (found.values * found.seen / (size * (1 + size)))
+    toward = found.directions @ (found.pulled / (size * (1 + size)))
     return own - np.concatenate([
         part @ toward for part in whitened_parts(root, noise, columns)])
-
-
-def _with_place(parts: Iterable[Floats]) -> Iterator[tuple[slice, Floats]]:
-    first = 0
-    for part in parts:
-        yield slice(first, first + len(part)), part
-        first += len(part)

@@ -179,6 +179,31 @@ def test_chunks_of_readings_add_up(generator, monkeypatch):
                                predict(case[0], whole.distribution)[1], rtol=1e-9)
 
 
+def test_both_ways_agree(generator, monkeypatch):
+    """The product, and where it would lose digits, rows."""
+    case = problem(generator, 50, 5)
+    one = update(*case)
+    monkeypatch.setattr(linear, "WORST_CONDITION", 0.0)
+    other = update(*case)
+    np.testing.assert_allclose(other.distribution.covariance, one.distribution.covariance,
+                               rtol=1e-9)
+    assert other.learnt == pytest.approx(one.learnt)
+    assert other.log_evidence == pytest.approx(one.log_evidence)
+
+
+def test_rows_take_over_where_the_product_is_not_exact_enough(generator, monkeypatch):
+    """Many readings that tell two parameters apart by 1e-7: with the product they do not."""
+    matrix = np.tile([[1.0, 1.0], [1.0, 1.0 + 1e-7]], (25, 1))
+    truth = np.array([0.3, -0.2])
+    case = (matrix, matrix @ truth, independent(np.full(50, 1e-12)),
+            Gaussian(np.zeros(2), np.eye(2)))
+    found = update(*case)
+    np.testing.assert_allclose(found.distribution.mean, truth, atol=1e-5)
+    assert 0 <= found.conflict < 1  # no noise was added
+    monkeypatch.setattr(linear, "WORST_CONDITION", np.inf)  # negative control
+    assert np.abs(update(*case).distribution.mean - truth).max() > 1e-5
+
+
 def test_contraction_by_block(generator):
     prior = Gaussian(np.zeros(4), np.eye(4))
     after = Gaussian(np.zeros(4), np.diag([1.0, 1.0, 0.1, 0.1]))
