@@ -28,7 +28,7 @@ import scipy.sparse as sparse
 
 from halbach_fe.blocks import Floats, Ints
 from halbach_fe.inference.noise import Noise
-from halbach_fe.inference.prior import Gaussian, Root, entries
+from halbach_fe.inference.prior import Gaussian, Root, beside, entries
 
 READINGS_AT_ONCE = 8192
 """Rows whitened at a time: memory does not grow with the readings."""
@@ -131,10 +131,11 @@ def update(
     """
     def both(some: Ints) -> Floats:
         own = matrix[some if rows is None else rows[some]]
-        return np.column_stack([own @ prior.root, readings[some] - own @ prior.mean])
+        return np.column_stack([own, readings[some] - own @ prior.mean])
 
-    columns = prior.root.shape[1] + 1
-    found = inform(lambda: whitened_parts(both, noise, columns), (len(readings), columns))
+    columns = len(prior.mean) + 1
+    found = inform(lambda: whitened_parts(both, noise, columns), (len(readings), columns),
+                   prior.root)
     values = found.values
     left = 1 / np.sqrt(1 + values**2)
     shift = found.directions @ (found.pulled / (1 + values**2))
@@ -191,30 +192,34 @@ def parts_of(count: int, columns: int, most: int | None = None) -> Iterator[slic
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
-def inform(parts: Callable[[], Iterable[Floats]], shape: tuple[int, int]) -> Information:
+def inform(
+    parts: Callable[[], Iterable[Floats]], shape: tuple[int, int], root: Floats | Root
+) -> Information:
     """What whitened readings tell.
 
     Parameters
     ----------
     parts : callable
-        Gives the rows of [W y], parts (c, k + 1), one after the other.
+        Gives the rows of [A y], parts (c, m + 1), one after the other.
     shape : tuple of int
-        Of all rows, (n, k + 1).
+        Of all rows, (n, m + 1).
+    root : ndarray or Root, shape (m, k)
+        W is A times it.
     """
     rows, columns = shape
     if rows > columns and columns**2 <= NUMBERS_HELD:
-        found = _by_product(parts(), columns)
+        found = _by_product(parts(), columns, root)
         if found.values.max(initial=0) ** 2 < WORST_CONDITION:
             return found
-    return _by_rows(parts())
+    return _by_rows(np.column_stack([part[:, :-1] @ root, part[:, -1]]) for part in parts())
 
 
-def _by_product(parts: Iterable[Floats], columns: int) -> Information:
+def _by_product(parts: Iterable[Floats], columns: int, root: Floats | Root) -> Information:
     product = np.zeros((columns, columns))
     for part in parts:
         product += part.T @ part
-    squares, directions = linalg.eigh(product[:-1, :-1])
-    squares, pulled = np.maximum(squares, 0), directions.T @ product[:-1, -1]
+    squares, directions = linalg.eigh((product[:-1, :-1] @ root).T @ root)
+    squares, pulled = np.maximum(squares, 0), directions.T @ (product[-1, :-1] @ root)
     return Information(directions, np.sqrt(squares), pulled,
                        float(product[-1, -1] - np.sum(pulled**2 / (1 + squares))))
 
@@ -292,7 +297,7 @@ def whitened(
         return own
     found = inform(lambda: (np.column_stack([part, own[place]]) for place, part in zip(
         parts_of(len(own), columns), whitened_parts(root, noise, columns), strict=True)),
-        (len(own), columns + 1))
+        (len(own), columns + 1), beside(sparse.eye_array(columns, format="csr")))
     size = np.sqrt(1 + found.values**2)
     # 1/size - 1, over squares
     toward = found.directions @ (found.pulled / (size * (1 + size)))
