@@ -104,6 +104,9 @@ PART_COPIES, INFORMATION_COPIES = 4, 3
 """Of the rows of H that are taken at once, and of the square root of the information, while its
 singular values are found; measured with 48 to 30 720 parameters and 1 008 to 28 080 readings."""
 
+READING_BYTES, READING_SECONDS = 1200, 6e-5
+"""For labels, tables and pictures of every reading; a million were measured."""
+
 CHUNK_BYTES, CHUNK_PLACES, PLACE_BYTES, PLACES_AT_ONCE = 230e6, 40_000, 180, 4_000_000
 """The exact field from 96 000 and 576 000 places (see `_places`): temporary arrays, which many
 places fill, and what is kept of each."""
@@ -410,10 +413,12 @@ def _estimate(
     learning = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
                     + INFORMATION_COPIES * known)
     own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(making, learning)
+           + (READING_BYTES * readings if parameters else 0)
            + (8 * matrix if 8 * matrix <= LOADED_BYTES else 8 * NUMBERS_AT_ONCE)) / GIB
     side_by_side = 0.0
     seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(one.elements * one.processes for one in problems)
     seconds += PLACE_SECONDS * places + MATRIX_SECONDS * matrix * min(readings, parameters)
+    seconds += READING_SECONDS * readings if parameters else 0
     for what in dict.fromkeys(one.what for one in problems):
         runs = [one for problem in problems if problem.what == what
                 for one in [problem] * problem.processes]
