@@ -10,9 +10,10 @@
 # make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke
 # make study-mri           the same of an MRI array of cubes
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
+# make benchmark-scaling   time and memory by blocks, readings, unknowns of the mesh and workers
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test fuzz benchmark lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -62,6 +63,10 @@ fuzz: setup-test
 # The figures of the README, ratios measured in one run.
 benchmark: setup-test
 	.venv/bin/python -m benchmarks.run
+
+# How time and memory grow, up to 10 240 blocks and a million readings: half an hour.
+benchmark-scaling: setup-test
+	.venv/bin/python -m benchmarks.run scaling
 
 # Pages of docs/, into build/docs.
 docs: setup-test

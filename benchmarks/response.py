@@ -163,7 +163,7 @@ def symmetry(study: Study, folder: Path, note: Note) -> None:
         started = time.monotonic()
         variant = parse_study(changed(document, solver__symmetry=used))
         parts = finite_element_part(variant, points, workshop)
-        fields.append(sum(parts.block(n) @ (np.array(b.easy_axis) * b.remanence)
+        fields.append(sum(parts.block(n, slice(None)) @ (np.array(b.easy_axis) * b.remanence)
                           for n, b in enumerate(blocks_of(short))))
         seconds.append(time.monotonic() - started)
     note("response.symmetry_speedup", seconds[1] / seconds[0], "ratio",

@@ -14,21 +14,24 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import diagnosis, inference, nonlinear, recovery, response
+from benchmarks import diagnosis, inference, nonlinear, recovery, response, scaling
 from halbach_fe.cli import common
 from halbach_fe.update import write_text
 
 RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
-         "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run}
+         "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
+         "scaling": scaling.run}
+ALONE = ("recovery", "scaling")
+"""Parts that are measured only when they are named: they take long."""
 
 
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", metavar="PART",
-                        help=f"of {', '.join(PARTS)} (default: all)")
-    chosen = parser.parse_args().parts or list(PARTS)
+                        help=f"of {', '.join(PARTS)} (default: all but {', '.join(ALONE)})")
+    chosen = parser.parse_args().parts or [part for part in PARTS if part not in ALONE]
     results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
 
     def note(name: str, value: float, unit: str, against: str) -> None:

@@ -51,6 +51,9 @@ MODE_TOLERANCE = 1e-4
 """Modes fall as (r / inner radius)^m. What is left out of one block's reaction, itself a few per
 cent of its field, is below 1e-5 of that field."""
 
+SOLVED_NUMBERS = 2**28
+"""In the solutions of one run, 2 GB on the disk until they are read."""
+
 MAX_MODES = 64
 AXIS_RADIUS = 1e-8
 """Points nearer to the axis than this fraction of the bore are on it, where psi/r is a limit."""
@@ -152,7 +155,8 @@ def solve_modes(
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
     weights = nominal_waves(study, highest)
     case = _Case(study, mesh, weights, solved, located, *probes_of(mesh, located))
-    spans = spans_of(weights, all_modes=bool(blocks))
+    spans = spans_of(weights, bool(blocks),
+                     case.last_source * unknowns_of(mesh.inner, mesh.axis, 1))
     variants = [False] if study.solver.method == "direct" else [False, True]
     tasks = [_task(case, span, vacuum, workshop)
              for span in reversed(spans) for vacuum in variants]
@@ -166,23 +170,25 @@ def solve_modes(
     return _superpose(case, modes, points, where, blocks)
 
 
-def spans_of(weights: Floats, all_modes: bool) -> list[tuple[int, int]]:
+def spans_of(weights: Floats, all_modes: bool, each: int) -> list[tuple[int, int]]:
     """First and last mode of every run, by the `nominal_waves`; all modes for single blocks, or
-    only those of the nominal array.
+    only those of the nominal array. A mode's solutions are ``each`` numbers.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
     wanted = [m for m in range(len(weights)) if all_modes or size[m] > NO_REMANENCE * size.max()]
     # mode 0 has another condition on the axis, so it is a run of its own
     return [span for first in (True, False)
-            for span in _runs([m for m in wanted if (m == 0) == first])]
+            for span in _runs([m for m in wanted if (m == 0) == first],
+                              max(1, SOLVED_NUMBERS // each))]
 
 
-def _runs(modes: Sequence[int]) -> list[tuple[int, int]]:
-    """Spans (first, last) of consecutive modes."""
+def _runs(modes: Sequence[int], most: int) -> list[tuple[int, int]]:
+    """Spans (first, last) of consecutive modes, at most so many in each."""
     found = []
     for _, group in groupby(enumerate(modes), lambda pair: pair[1] - pair[0]):
         span = [mode for _, mode in group]
-        found.append((span[0], span[-1]))
+        found += [(part[0], part[-1]) for part in (
+            span[first:first + most] for first in range(0, len(span), most))]
     return found
 
 

@@ -480,17 +480,22 @@ def _check_overlaps(outlines: tuple[Outline, ...]) -> None:
     Shared faces are allowed; outlines are drawn in by 1e-6 so that rounding decides nothing.
     """
     t = np.linspace(0.0, 1.0, 9)
-    drawn_in, centres, reaches = [], [], []
+    drawn_in, centres, reaches, widths = [], [], [], []
     for outline in outlines:
         boundary = np.vstack([edge.at(t)[0][:-1] for edge in outline])
         centre = np.mean([edge.start for edge in outline], axis=0)
         drawn_in.append(centre + (1 - 1e-6) * (boundary - centre))
         centres.append(centre)
         reaches.append(1.1 * np.hypot(*(boundary - centre).T).max())  # arcs bulge between samples
+        widths.append([np.abs(_angles(polygon, centre)).max()
+                       for polygon in (drawn_in[-1], boundary)])
     places, sizes = np.array(centres), np.array(reaches)
+    inside, whole = np.where(np.array(widths) < np.pi / 2, widths, np.pi).T  # or the axis is in it
     for i, polygon in enumerate(drawn_in):
         samples = np.vstack([polygon, polygon.mean(axis=0)])
-        near = np.hypot(*(places - places[i]).T) <= sizes + sizes[i]
+        # those in other sectors about the axis are apart: with shared faces, by what is drawn in
+        near = (np.hypot(*(places - places[i]).T) <= sizes + sizes[i]) & (
+            np.abs(_angles(places, places[i])) <= inside[i] + whole)
         for j in np.flatnonzero(near).tolist():
             if i != j and (outline_contains(outlines[j], samples).any()
                            or _cross(polygon, drawn_in[j])):
@@ -499,6 +504,12 @@ def _check_overlaps(outlines: tuple[Outline, ...]) -> None:
                     f"{i + 1} and {j + 1} of a ring overlap. Reduce the block's width, or place "
                     "the blocks on a larger radius."
                 )
+
+
+def _angles(points: Floats, from_: Floats) -> Floats:
+    """Angles (n,) about the axis in rad of points (n, 2), from that of another one (2,)."""
+    turned = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(from_[1], from_[0])
+    return np.asarray((turned + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _cross(one: Floats, two: Floats) -> bool:

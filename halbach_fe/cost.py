@@ -27,8 +27,10 @@ from halbach_fe.blocks import Floats, blocks_of, position_angle_deg
 from halbach_fe.discretization import DUAL, REFINEMENT, dual, farther, refined
 from halbach_fe.errors import MeasurementError, PointsOutsideError
 from halbach_fe.extent import boundary_half_length, boundary_radius
+from halbach_fe.inference.linear import NUMBERS_AT_ONCE, READINGS_AT_ONCE
 from halbach_fe.mesh import Entities, meridian_size
 from halbach_fe.observation import Observation, points_from
+from halbach_fe.response import LOADED_BYTES
 from halbach_fe.routes import (
     MESHES,
     check_points,
@@ -98,15 +100,20 @@ PYTHON_BYTES, ELEMENT_BYTES = 0.27 * GIB, 2000
 """This program, its libraries, and what it reads of a mesh and its unknowns: measured 1000 to 2100
 by element, of 10 000 to 208 000."""
 
-MATRIX_COPIES = 1.5
-"""Of H, 28 080 readings by 576 parameters, at the peak of an inference."""
+PART_COPIES, INFORMATION_COPIES = 4, 3
+"""Of the rows of H that are taken at once, and of the square root of the information, while its
+singular values are found; measured with 48 to 30 720 parameters and 1 008 to 28 080 readings."""
+
+READING_BYTES, READING_SECONDS = 1200, 6e-5
+"""For labels, tables and pictures of every reading; a million were measured."""
 
 CHUNK_BYTES, CHUNK_PLACES, PLACE_BYTES, PLACES_AT_ONCE = 230e6, 40_000, 180, 4_000_000
 """The exact field from 96 000 and 576 000 places (see `_places`): temporary arrays, which many
 places fill, and what is kept of each."""
 
 OWN_SECONDS, ELEMENT_SECONDS, PLACE_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 2.5e-5, 1e-9
-"""To start and to report; by element of every process; by place; by entry of H and parameter."""
+"""To start and to report; by element of every process; by place; by entry of H and parameter, or
+reading if there are fewer."""
 
 COUNTED_PLACES = 500_000
 """At most, half a second."""
@@ -334,7 +341,9 @@ def posed(
     if route == "azimuthal_modes":
         weights = nominal_waves(study, modes_needed(study, points))
         rings = len({number // study.array.blocks_per_ring for number in blocks})
-        spans = [(first, last - first + 1) for first, last in spans_of(weights, bool(blocks))]
+        each = (NOMINAL_SOURCES - 1 + 3 * rings) * unknowns_of(mesh.inner, mesh.axis, 1)
+        spans = [(first, last - first + 1) for first, last in spans_of(
+            weights, bool(blocks), each)]
         return [problem(unknowns_of(mesh.inner, mesh.axis, first), PLANE, variants, modes,
                         modes * (NOMINAL_SOURCES + 3 * rings)) for first, modes in spans]
     formulation = formulation_of(study, route)
@@ -397,12 +406,19 @@ def _estimate(
     matrix = readings * parameters
     places = 0.0 if study.solver.method == "direct" else _places(study, points)
     fields = parameters * len(points) * 3 if problems else 0
-    own = (PYTHON_BYTES + ELEMENT_BYTES * elements + 8 * (MATRIX_COPIES * matrix + fields)
-           + CHUNK_BYTES * min(1.0, places / CHUNK_PLACES)
-           + PLACE_BYTES * min(places, PLACES_AT_ONCE)) / GIB
+    known = parameters * min(readings, parameters)
+    # the fields of blocks are gone when the posterior is found
+    making = (8 * fields + CHUNK_BYTES * min(1.0, places / CHUNK_PLACES)
+              + PLACE_BYTES * min(places, PLACES_AT_ONCE))
+    learning = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
+                    + INFORMATION_COPIES * known)
+    own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(making, learning)
+           + (READING_BYTES * readings if parameters else 0)
+           + (8 * matrix if 8 * matrix <= LOADED_BYTES else 8 * NUMBERS_AT_ONCE)) / GIB
     side_by_side = 0.0
     seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(one.elements * one.processes for one in problems)
-    seconds += PLACE_SECONDS * places + MATRIX_SECONDS * matrix * parameters
+    seconds += PLACE_SECONDS * places + MATRIX_SECONDS * matrix * min(readings, parameters)
+    seconds += READING_SECONDS * readings if parameters else 0
     for what in dict.fromkeys(one.what for one in problems):
         runs = [one for problem in problems if problem.what == what
                 for one in [problem] * problem.processes]
@@ -417,7 +433,7 @@ def _estimate(
         problems=tuple(replace(one, seconds=one.seconds / speed) for one in problems),
         own_memory_GiB=own, memory_GiB=own + side_by_side,
         disk_GiB=sum(one.processes * one.disk_GiB for one in problems)
-        + 8 * (matrix + parameters**2) / GIB,
+        + 8 * (matrix + known) / GIB,
         seconds=seconds / speed, available_GiB=available_memory())
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -107,13 +108,13 @@ def _fields_of_some(
         fields[shape] = unit_field(_in_frame(pieces[members[0]][2], frames[members[0]]), union,
                                    order, panel)
         places.update(zip(members, inverse.reshape(len(members), len(points)), strict=True))
+    remaining = iter(range(len(pieces)))
     for number, block in enumerate(blocks):
         total = np.zeros((len(points), 3, 3))
-        for piece, (owner, factor, _) in enumerate(pieces):
-            if owner == number:
-                frame = frames[piece]
-                signs = frame.local(seen_by[number])[1]
-                total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
+        for piece in islice(remaining, len(block.parts)):
+            frame, factor = frames[piece], pieces[piece][1]
+            signs = frame.local(seen_by[number])[1]
+            total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
         if not block.in_place:
             turn = turn_of(block.turn)
             total = turn @ total @ turn.T

@@ -56,6 +56,13 @@ def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
     return values
 
 
+def mapped(path: Path) -> NDArray[Any]:
+    """The array of a .npy file, on the disk; ValueError if it is none."""
+    with _refusing():
+        found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return found
+
+
 @contextlib.contextmanager
 def hdf5(file: BinaryIO) -> Iterator[Any]:
     """Open an HDF5 file.

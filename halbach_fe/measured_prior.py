@@ -33,7 +33,7 @@ from halbach_fe.blocks import (
 )
 from halbach_fe.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import demagnetizing_tensors
-from halbach_fe.inference.prior import Gaussian
+from halbach_fe.inference.prior import Gaussian, mounted
 from halbach_fe.inference.samples import (
     anderson_darling,
     holm,
@@ -124,14 +124,13 @@ def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
     """
     meant = _prior_as_meant(as_meant(study), table)
     size = study.dimension
-    mounted = mountings(study)
-    sources = np.array([source for source, _ in mounted])
-    turns = np.array([matrix for _, matrix in mounted])[:, :size, :size]
-    before = meant.gaussian.root.reshape(len(mounted), size, -1)[sources]
-    mean = meant.gaussian.mean.reshape(len(mounted), size, 1)[sources]
+    moves = mountings(study)
+    sources = np.array([source for source, _ in moves])
+    turns = np.array([matrix for _, matrix in moves])[:, :size, :size]
+    mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
     nominal = np.concatenate([block.magnetization[:size] for block in blocks_of(study)])
     return replace(meant, nominal=nominal, gaussian=Gaussian(
-        (turns @ mean).ravel(), (turns @ before).reshape(nominal.size, -1)))
+        (turns @ mean).ravel(), mounted(meant.gaussian.root, turns, sources)))
 
 
 def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:

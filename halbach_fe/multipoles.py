@@ -33,7 +33,7 @@ from halbach_fe.observation import (
     points_from,
     together,
 )
-from halbach_fe.response import Response, response
+from halbach_fe.response import Response, StoredMatrix, response
 from halbach_fe.solve import Workshop
 from halbach_fe.study import (
     COMPONENTS,
@@ -291,7 +291,7 @@ def circle_models(
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        reference, fixed = (_complexes(middle @ one)[main - 1:main]
+        reference, fixed = (_complexes(_seen(middle, one))[main - 1:main]
                             for one in (model.matrix, model.offset))
         try:
             turn = _turn(study, reference[0], model)
@@ -300,7 +300,7 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix, offset = (_complexes(analysis @ one)[:len(orders)]
+            matrix, offset = (_complexes(_seen(analysis, one))[:len(orders)]
                               for one in (model.matrix, model.offset))
             found.append(MultipoleModel(
                 orders, main, radius, z if study.dimension == 3 else None, False,
@@ -327,6 +327,12 @@ def solved_circles(
     whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
     exact = Gaussian(np.ones(1), np.zeros((1, 1)))
     return [(one, one.of(exact)) for one in circle_models(bare, observation, whole)]
+
+
+def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:
+    """An analysis (k, readings) of values (readings, ...), of which it needs few."""
+    used = np.unique(analysis.indices)
+    return np.asarray(analysis[:, used] @ values[used])
 
 
 def _complexes(values: Floats) -> Complexes:

@@ -132,7 +132,7 @@ def build(
         assembly.solutions[1 + size * number:1 + size * (number + 1), iron].T
         @ (MU_0 * block.recoil_tensor[:size, :size])
         for number, block in enumerate(blocks_of(study))])
-    return Condensed(law, gradient, weights, stiffness, potential, linear.matrix, surface,
+    return Condensed(law, gradient, weights, stiffness, potential, linear.whole, surface,
                      readings, linear.nominal)
 
 

@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.blocks import Floats, Ints, blocks_of
 from halbach_fe.errors import MeasurementError, StudyError, must_be
 from halbach_fe.exact_field import gradient_of
 from halbach_fe.field_map import points_of
@@ -82,6 +82,13 @@ class Observation:
         """Readings of fields (..., n, 3) in T; shape (..., readings)."""
         flat = fields.reshape(-1, 3 * len(self.points))
         return np.asarray(self.operator @ flat.T).T.reshape(*fields.shape[:-2], len(self))
+
+    def part(self, rows: slice) -> tuple[Ints, sparse.csr_array]:
+        """Indices (k,) of the points that some readings see, and the operator (rows, 3 k) there."""
+        own = self.operator[rows]
+        seen, place = np.unique(own.indices // 3, return_inverse=True)
+        return seen, sparse.csr_array((own.data, 3 * place + own.indices % 3, own.indptr),
+                                      shape=(own.shape[0], 3 * len(seen)))
 
     def read(self, map_fields: Floats) -> Floats:
         """Readings (..., readings) of what a map shows, (..., m, 3) in T."""

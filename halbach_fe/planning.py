@@ -111,7 +111,7 @@ def plan(study: Study, workshop: Workshop, count: int | None = None) -> Measurem
     prior = block_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
                         study.prior.direction_sd_deg, study.prior.common_mode_sd)
     size = len(observation) // len(points)  # readings at a point, which alone may be correlated
-    whitened = errors.whiten(model.matrix @ prior.root).reshape(len(points), size, -1)
+    whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)
     same = min(wanted, len(baseline))
     counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata, resources
 from pathlib import Path
@@ -25,16 +26,64 @@ from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError
 from halbach_fe.exact_field import unit_fields
 from halbach_fe.external import external_field
-from halbach_fe.field_map import write_hdf5
+from halbach_fe.field_map import atomic, write_hdf5
+from halbach_fe.inference.linear import parts_of
+from halbach_fe.inference.noise import Rows
 from halbach_fe.observation import Observation
 from halbach_fe.routes import (
     SUPERPOSITION_TOLERANCE,
+    ElementFields,
     check_points,
     exact_part,
     finite_element_part,
 )
 from halbach_fe.solve import Workshop
 from halbach_fe.study import COMPONENTS, FIELD_KEYS, MU_0, Study, curve_of
+
+LOADED_BYTES = 2**30
+"""A larger matrix stays on the disk, and is read in parts."""
+
+
+@dataclass(frozen=True)
+class StoredMatrix:
+    """A matrix in a .npy file.
+
+    Attributes
+    ----------
+    path : Path
+    shape : tuple of int
+    """
+
+    path: Path
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, parts: Iterable[Floats], shape: tuple[int, int], path: Path) -> StoredMatrix:
+        """Write a matrix of its rows, parts (k, m)."""
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, {
+                "descr": "<f8", "fortran_order": False, "shape": shape})
+            for part in parts:
+                file.write(np.ascontiguousarray(part, "<f8").data)
+        return cls(path, shape)
+
+    @classmethod
+    def at(cls, path: Path, shape: tuple[int, int]) -> StoredMatrix:
+        """One that was written before; ValueError if it is damaged, or another."""
+        there = foreign.mapped(path)
+        if there.shape != shape or there.dtype != "<f8":
+            raise ValueError(f"{path} is not a matrix {shape}")
+        return cls(path, shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: Rows) -> Floats:
+        # mapped anew: pages that were read are not kept
+        return np.array(np.load(self.path, mmap_mode="r")[rows])
+
+    def __matmul__(self, vector: Floats) -> Floats:
+        return np.concatenate([self[part] @ vector for part in parts_of(*self.shape)])
 
 
 @dataclass(frozen=True)
@@ -43,7 +92,7 @@ class Response:
 
     Attributes
     ----------
-    matrix : ndarray, shape (readings, parameters), in T m/A
+    matrix : ndarray or StoredMatrix, shape (readings, parameters), in T m/A
     parameters : tuple of str
         ``r01s05.Mx``: ring 1, slot 5, component x.
     nominal : ndarray, shape (parameters,), in A/m
@@ -60,13 +109,18 @@ class Response:
         Whether it was taken from an earlier run with the same inputs.
     """
 
-    matrix: Floats
+    matrix: Floats | StoredMatrix
     parameters: tuple[str, ...]
     nominal: Floats
     offset: Floats
     error: Floats
     superposition_error: float
     reused: bool = False
+
+    @property
+    def whole(self) -> Floats:
+        """The matrix in memory, however large."""
+        return self.matrix[np.arange(len(self.matrix))]
 
 
 def parameter_names(study: Study) -> tuple[str, ...]:
@@ -83,25 +137,19 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
     stored = _read(path, key)
     if stored is not None:
         return stored
-    blocks = blocks_of(study)
-    dimension = study.dimension
+    blocks, dimension = blocks_of(study), study.dimension
     parts = finite_element_part(study, observation.points, workshop)
-    exact = study.solver.method == "reaction"
-    vacuum = unit_fields(blocks, observation.points)
-    columns = []
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
-    for number, block in enumerate(blocks):
-        readings = observation.apply(np.moveaxis(parts.block(number), 2, 0))
-        source = parts.sources[number]
-        share = readings * (source.remanence * np.array(source.easy_axis[:dimension]))[:, None]
-        total += share.sum(axis=0)
-        magnitude += np.abs(share).sum(axis=0)
-        if exact:
-            readings = readings + observation.apply(
-                np.moveaxis(next(vacuum)[:, :, :dimension], 2, 0))
-        # B_r = mu_0 mu_r M turns per tesla into per A/m
-        columns.append(readings.T @ (MU_0 * block.recoil_tensor[:dimension, :dimension]))
-    matrix = np.hstack(columns)
+
+    def rows() -> Iterator[Floats]:
+        # as many at once as memory takes: they share integrals
+        for some in parts_of(len(observation), dimension * len(blocks), len(observation)):
+            matrix, total[some], magnitude[some] = _rows(study, observation, parts, some)
+            yield matrix
+
+    shape = len(observation), dimension * len(blocks)
+    matrix = _whole(rows(), shape) if 8 * np.prod(shape) <= LOADED_BYTES else StoredMatrix.of(
+        rows(), shape, _beside(path, key))
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     direct = observation.apply(parts.along_nominal)
     error = reading_errors(study, observation, parts, error_workshop(workshop))
@@ -115,6 +163,41 @@ def response(study: Study, observation: Observation, workshop: Workshop) -> Resp
                      np.hypot(error, total - direct), superposition)
     _write(path, key, built)
     return built
+
+
+def _rows(
+    study: Study, observation: Observation, parts: ElementFields, some: slice
+) -> tuple[Floats, Floats, Floats]:
+    """Some rows (k, parameters) of H; and of what finite elements contribute to these readings of
+    the nominal array, block by block, the sum and that of magnitudes (k,), in T.
+    """
+    blocks, dimension = blocks_of(study), study.dimension
+    seen, operator = observation.part(some)
+    points = observation.points[seen]
+    vacuum = unit_fields(blocks, points) if study.solver.method == "reaction" else None
+    total, magnitude = np.zeros(operator.shape[0]), np.zeros(operator.shape[0])
+    matrix = np.empty((operator.shape[0], dimension * len(blocks)))
+    for number, block in enumerate(blocks):
+        readings = operator @ parts.block(number, seen).reshape(-1, dimension)
+        source = parts.sources[number]
+        share = readings * (source.remanence * np.array(source.easy_axis[:dimension]))
+        total += share.sum(axis=1)
+        magnitude += np.abs(share).sum(axis=1)
+        if vacuum is not None:
+            readings = readings + operator @ next(vacuum)[:, :, :dimension].reshape(-1, dimension)
+        # B_r = mu_0 mu_r M turns per tesla into per A/m
+        matrix[:, dimension * number:dimension * (number + 1)] = readings @ (
+            MU_0 * block.recoil_tensor[:dimension, :dimension])
+    return matrix, total, magnitude
+
+
+def _whole(parts: Iterable[Floats], shape: tuple[int, int]) -> Floats:
+    """A matrix of its rows, parts (k, m)."""
+    matrix, first = np.empty(shape), 0
+    for part in parts:
+        matrix[first:first + len(part)] = part
+        first += len(part)
+    return matrix
 
 
 def verify_superposition(
@@ -166,13 +249,22 @@ def code_digest() -> bytes:
 
 def _write(path: Path, key: str, built: Response) -> None:
     data = xr.Dataset(
-        {"H": (("reading", "parameter"), built.matrix, {"units": "T m/A"}),
-         "nominal": ("parameter", built.nominal, {"units": "A/m"}),
+        {"nominal": ("parameter", built.nominal, {"units": "A/m"}),
          "offset": ("reading", built.offset, {"units": "T"}),
          "error": ("reading", built.error, {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error})
+    if not isinstance(built.matrix, StoredMatrix):
+        data["H"] = (("reading", "parameter"), built.matrix, {"units": "T m/A"})
     write_hdf5(data, path)
+    for other in path.parent.glob("response-*.npy"):
+        if "H" in data or other != _beside(path, key):
+            other.unlink()  # of other inputs
+
+
+def _beside(path: Path, key: str) -> Path:
+    """Where a matrix is that is too large for the file of the rest."""
+    return path.with_name(f"response-{key[:16]}.npy")
 
 
 def _read(path: Path, key: str) -> Response | None:
@@ -183,10 +275,12 @@ def _read(path: Path, key: str) -> Response | None:
             return None
         names = tuple(map(str, data["parameter"].values))
         readings, parameters = (len(data["offset"]),), (len(names),)
-        return Response(foreign.numbers(data["H"], readings + parameters), names,
+        matrix = (foreign.numbers(data["H"], readings + parameters) if "H" in data
+                  else StoredMatrix.at(_beside(path, key), readings + parameters))
+        return Response(matrix, names,
                         foreign.numbers(data["nominal"], parameters),
                         foreign.numbers(data["offset"], readings),
                         foreign.numbers(data["error"], readings),
                         float(data.attrs["superposition_error"]), reused=True)
-    except (OSError, KeyError, ValueError, TypeError):
+    except (OSError, EOFError, KeyError, ValueError, TypeError):
         return None

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from halbach_fe.azimuthal import solve_modes, suits
-from halbach_fe.blocks import Floats, MagnetBlock, blocks_of, points_in_material
+from halbach_fe.blocks import Floats, Ints, MagnetBlock, blocks_of, points_in_material
 from halbach_fe.errors import HalbachWarning, StudyError
 from halbach_fe.exact_field import field_of
 from halbach_fe.extent import (
@@ -76,8 +76,9 @@ class ElementFields:
     sources : tuple of MagnetBlock
         The blocks of the array that was solved for.
     block : callable
-        Number of a block, from 0, to its contribution (n, 3, D), in T per T of remanence along
-        each axis. By symmetry several blocks share one solve.
+        Number of a block, from 0, and indices (k,) of some points, or a slice, to its contribution
+        there (k, 3, D), in T per T of remanence along each axis. By symmetry several blocks share
+        one solve.
     error : ndarray, shape (n, 3), in T, or None
         Of ``nominal``, where it is known already.
     """
@@ -86,7 +87,7 @@ class ElementFields:
     nominal: Floats
     along_nominal: Floats
     sources: tuple[MagnetBlock, ...]
-    block: Callable[[int], Floats]
+    block: Callable[[int, Ints | slice], Floats]
     error: Floats | None = None
 
     @property
@@ -134,7 +135,7 @@ def finite_element_part(
     if study.solver.method == "reaction" and is_vacuum(study):
         zero = np.zeros((len(points), 3))
         return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, blocks_of(study),
-                             lambda number: np.zeros((len(points), 3, size)))
+                             lambda number, some: np.zeros((len(points[some]), 3, size)))
     route = choose_route(study, points)
     if not columns:
         nominal = _solve_nominal(study, points, workshop, route)
@@ -154,10 +155,10 @@ def finite_element_part(
     # the identity is among the placements: the first block is its own source, where it stands
     here = index[symmetry.sources[0]]
 
-    def block(number: int) -> Floats:
+    def block(number: int, some: Ints | slice) -> Floats:
         placement = symmetry.placements[number]
         first = 1 + size * symmetry.sources.index(placement.source)
-        seen = np.moveaxis(fields[first:first + size, index[number]], 0, 2)
+        seen = np.moveaxis(fields[first:first + size, index[number][some]], 0, 2)
         return placement.from_source(seen)
 
     tangent = fields[0, here]
@@ -219,7 +220,7 @@ def _superposition_tolerance(study: Study, route: str, placed: bool) -> float:
     return ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
 
 
-def _not_solved(number: int) -> Floats:
+def _not_solved(number: int, some: Ints | slice) -> Floats:
     raise AssertionError(f"block {number} was not solved for")
 
 

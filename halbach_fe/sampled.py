@@ -166,7 +166,8 @@ def sample_posterior(
     return Sampled(
         kept, model.parameters, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
-        Prediction(predicted.mean(axis=0), predicted.std(axis=0), lambda rows: spread[:, rows].T))
+        Prediction(predicted.mean(axis=0), predicted.std(axis=0), lambda rows: spread[:, rows].T,
+                   len(spread)))
 
 
 @dataclass(frozen=True)

@@ -339,9 +339,9 @@ def taken_out(update: Update) -> tuple[Floats, Floats, Floats]:
         Roots of w and of p with common columns.
     """
     study, after = update.study, update.posterior
-    sd = np.radians(study.prior.mounting_sd_deg)
+    sd, root = np.radians(study.prior.mounting_sd_deg), np.asarray(after.root)
     if not sd or update.measured_blocks is None:  # then no mounting is part of the prior
-        return after.mean, after.root, after.root
+        return after.mean, root, root
     before = update.prior
     turns = linalg.block_diag(*_turn_covariance(
         before.mean.reshape(-1, study.dimension), sd))
@@ -349,8 +349,8 @@ def taken_out(update: Update) -> tuple[Floats, Floats, Floats]:
     rest = _root(turns - share @ turns)
     whole = np.eye(len(share)) - share
     return (after.mean - share @ (after.mean - before.mean),
-            np.hstack([whole @ after.root, -rest]),
-            np.hstack([after.root, np.zeros_like(rest)]))
+            np.hstack([whole @ root, -rest]),
+            np.hstack([root, np.zeros_like(rest)]))
 
 
 def _times_inverse(matrix: Floats, covariance: Floats) -> Floats:
@@ -404,9 +404,9 @@ def _nominal(study: Study, mounts: Mounts) -> Spares:
     vectors = np.array([block.magnetization for block in blocks_of(as_meant(study))])
     prior = block_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
                         settings.direction_sd_deg, settings.common_mode_sd)
+    roots = np.asarray(prior.root).reshape(len(vectors), size, -1)
     own = np.zeros((len(vectors), 3, 3))
-    for number in range(len(vectors)):
-        rows = prior.root[number * size:(number + 1) * size]
+    for number, rows in enumerate(roots):
         back = mounts.frames[number, :size, :size].T
         own[number, :size, :size] = back @ rows @ rows.T @ back.T
     return Spares(("nominal",) * len(vectors), np.einsum("nji,nj->ni", mounts.frames, vectors), own,

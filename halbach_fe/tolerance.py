@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg as linalg
 
 from halbach_fe.blocks import Floats
-from halbach_fe.inference.prior import Gaussian, block_prior, turned
+from halbach_fe.inference.prior import Gaussian, beside, block_prior, by_block, turned
 from halbach_fe.multipoles import MultipoleModel, Multipoles, met
 from halbach_fe.study import Study
 
@@ -79,7 +79,7 @@ def assembled_prior(study: Study, nominal: Floats) -> Gaussian:
     blocks = block_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
                          settings.common_mode_sd)
     turns = turned(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return Gaussian(blocks.mean, np.hstack([blocks.root, linalg.block_diag(*turns)]))
+    return Gaussian(blocks.mean, beside(blocks.root, by_block(turns)))
 
 
 def tolerance(

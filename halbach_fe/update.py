@@ -17,18 +17,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe import foreign
 from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats, blocks_of, points_in_material
+from halbach_fe.blocks import Floats, Ints, blocks_of, points_in_material
 from halbach_fe.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
 from halbach_fe.field_map import atomic, points_of, write_hdf5
 from halbach_fe.inference import linear
-from halbach_fe.inference.linear import predict, whitened
+from halbach_fe.inference.linear import parts_of, predict, whitened
 from halbach_fe.inference.noise import Noise
-from halbach_fe.inference.prior import Gaussian, block_prior
+from halbach_fe.inference.prior import Gaussian, Root, beside, block_prior, entries
 from halbach_fe.instrument import as_read, without_remainder
 from halbach_fe.measured_prior import prior_from_blocks
 from halbach_fe.nonlinear import newton_readings
@@ -53,6 +54,12 @@ TRAINING, HELD_OUT, HELD_OUT_MAP = "training", "held out", "held-out map"
 LINEAR_ENOUGH = 0.3
 """Of the error bar: what linearizing the iron may move a reading without a word."""
 
+LEFT_OUT = 0.02
+"""Of a variance, 1 % of a standard deviation: what may be left out without a word."""
+
+WRITTEN_COVARIANCE = 2000
+"""Parameters, at most, whose covariance is written too: 32 MB."""
+
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
 
@@ -65,12 +72,14 @@ class Prediction:
     ----------
     mean, sd : ndarray, shape (readings,), in T
     root : callable
-        Mask of readings (readings,) to a root (chosen, k) of their covariance, in T.
+        Indices (c,) of readings to these rows (c, columns) of a root of their covariance, in T.
+    columns : int
     """
 
     mean: Floats
     sd: Floats
-    root: Callable[[NDArray[np.bool_]], Floats]
+    root: Callable[[Ints], Floats]
+    columns: int
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,8 @@ class Update:
 
     ``parts`` and ``regions`` are those of each reading: training, held out, or of a map that is
     only predicted; and the noise region. ``measured_blocks`` is how many blocks the prior was
-    measured of; None if it is the study's.
+    measured of; None if it is the study's. ``left_out`` is that of
+    `halbach_fe.inference.linear.LinearPosterior`.
     """
 
     study: Study
@@ -122,6 +132,7 @@ class Update:
     log_evidence: float
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
+    left_out: float = 0.0
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:
@@ -176,7 +187,10 @@ class Update:
         result = (self.readings - prediction.mean) / np.hypot(prediction.sd, self.sigma)
         if self.errors.covariance[self.held_out][:, ~self.held_out].nnz:
             residual, noise, root = self._unseen(prediction, self.held_out)
-            result[self.held_out] = residual / np.hypot(noise.sd, np.linalg.norm(root, axis=1))
+            sd = np.concatenate([
+                np.linalg.norm(root(np.arange(part.start, part.stop)), axis=1)
+                for part in parts_of(len(residual), prediction.columns)])
+            result[self.held_out] = residual / np.hypot(noise.sd, sd)
         return result
 
     def whitened(self, prediction: Prediction, chosen: NDArray[np.bool_]) -> Floats:
@@ -184,20 +198,26 @@ class Update:
         and solver together: independent and standard normal if all is well and the posterior has
         not seen them.
         """
-        return whitened(*self._unseen(prediction, chosen))
+        return whitened(*self._unseen(prediction, chosen), prediction.columns)
 
     def _unseen(
         self, prediction: Prediction, chosen: NDArray[np.bool_]
-    ) -> tuple[Floats, Noise, Floats]:
-        """Residuals of some readings, their noise, and the root of the prediction's covariance; of
-        what is left of each when all that the noise of other, training readings foretells is taken
-        off. Only then are noise and prediction independent.
+    ) -> tuple[Floats, Noise, Callable[[Ints], Floats]]:
+        """Residuals of some readings, their noise, and rows of a root of the prediction's
+        covariance; of what is left of each when all that the noise of other, training readings
+        foretells is taken off. Only then are noise and prediction independent.
         """
-        seen = ~self.held_out & ~chosen
+        seen = np.flatnonzero(~self.held_out & ~chosen)
         told, noise = self.errors.given(chosen, seen)
-        residual, root = self.readings - prediction.mean, prediction.root(chosen)
-        if told.nnz:
-            root = root - told @ prediction.root(seen)
+        residual, index = self.readings - prediction.mean, np.flatnonzero(chosen)
+
+        def root(rows: Ints) -> Floats:
+            own, from_ = prediction.root(index[rows]), told[rows]
+            if from_.nnz:
+                needed = np.unique(from_.indices)
+                own = own - from_[:, needed] @ prediction.root(seen[needed])
+            return own
+
         return residual[chosen] - told @ residual[seen], noise, root
 
     def _score(
@@ -263,8 +283,14 @@ def infer(
         study.prior.common_mode_sd))
     errors = noise.plus(model.error)
     learnt = linear.update(
-        model.matrix[~keep], (readings - model.offset)[~keep], errors.part(~keep), before)
+        model.matrix, (readings - model.offset)[~keep], errors.part(~keep), before,
+        np.flatnonzero(~keep))
     after = learnt.distribution
+    if learnt.left_out > LEFT_OUT:
+        warnings.warn(
+            f"Of so many parameters and readings of study {study.name} some combinations were left "
+            f"out, which together may change a variance by {learnt.left_out:.1g} of itself.",
+            HalbachWarning, stacklevel=2)
     if is_nonlinear(study) and not linearized_only:
         _check_linearization(study, observation, workshop, model, after.mean, errors.sd)
     return Update(
@@ -274,7 +300,8 @@ def infer(
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
         log_evidence=learnt.log_evidence,
         kind="linearized" if is_nonlinear(study) else "closed form",
-        measured_blocks=of_blocks.count if of_blocks and not prior else None)
+        measured_blocks=of_blocks.count if of_blocks and not prior else None,
+        left_out=learnt.left_out)
 
 
 def observed(
@@ -344,7 +371,8 @@ def _measured(
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
     mean, sd = predict(model.matrix, parameters)
-    return Prediction(model.offset + mean, sd, lambda rows: model.matrix[rows] @ parameters.root)
+    return Prediction(model.offset + mean, sd, lambda rows: model.matrix[rows] @ parameters.root,
+                      parameters.root.shape[1])
 
 
 def _check_linearization(
@@ -373,9 +401,12 @@ def write_update(update: Update, folder: Path) -> None:
              ("prior_mean", update.prior.mean), ("prior_sd", update.prior.sd),
              ("posterior_mean", update.posterior.mean), ("posterior_sd", update.posterior.sd))},
         coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
-    for name, one in (("prior", update.prior), ("posterior", update.posterior)):
-        magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
-                                               {"units": "A2/m2"})
+    known = {"prior": update.prior, "posterior": update.posterior}
+    for name, one in known.items():
+        magnetization.update(_stored_root(name, one, update.prior))
+        if len(parameters) <= WRITTEN_COVARIANCE:
+            magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
+                                                   {"units": "A2/m2"})
     write_hdf5(magnetization, folder / "posterior.h5")
     x, y, z = update.observation.positions.T
     columns = {
@@ -406,12 +437,13 @@ def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
         If it is none, or not of this study's magnet.
     """
     nominal = np.concatenate([block.magnetization[:study.dimension] for block in blocks_of(study)])
+    found: dict[str, Gaussian] = {}
     try:
         data = foreign.dataset(path)
         own = foreign.numbers(data["nominal"], data["nominal"].shape)
-        found = {name: Gaussian(foreign.numbers(data[f"{name}_mean"], own.shape), _root(
-            foreign.numbers(data[f"{name}_covariance"], own.shape * 2)))
-            for name in ("prior", "posterior")}
+        for name in ("prior", "posterior"):
+            found[name] = Gaussian(foreign.numbers(data[f"{name}_mean"], own.shape),
+                                   _read_root(data, name, found.get("prior"), len(own)))
     except (OSError, KeyError, ValueError, TypeError):
         raise MeasurementError(must_be(
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
@@ -423,9 +455,41 @@ def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
     return found
 
 
-def _root(covariance: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
+    """Variables of the root of a distribution's covariance: its rows as a sparse matrix, or what
+    the readings left of the prior's, see `Root`.
+    """
+    if isinstance(one.root, Root) and one is not prior and one.root.outer is entries(prior.root):
+        return {f"{name}_directions": (("coordinate", "direction"), one.root.directions),
+                f"{name}_left": ("direction", one.root.left)}
+    rows = sparse.csr_array(entries(one.root))
+    return {f"{name}_root": (f"{name}_entry", rows.data, {"units": "A/m"}),
+            f"{name}_root_column": (f"{name}_entry", rows.indices),
+            f"{name}_root_row_start": (f"{name}_row", rows.indptr, {"columns": rows.shape[1]})}
+
+
+def _read_root(
+    data: xr.Dataset, name: str, prior: Gaussian | None, size: int
+) -> Floats | Root:
+    """The root with ``size`` rows; KeyError, ValueError or TypeError if what is stored is none."""
+    if f"{name}_left" in data and prior is not None:
+        left = data[f"{name}_left"]
+        return Root(entries(prior.root), foreign.numbers(
+            data[f"{name}_directions"], (prior.root.shape[1], len(left))),
+            foreign.numbers(left, left.shape))
+    start, values = data[f"{name}_root_row_start"], data[f"{name}_root"]
+    rows = sparse.csr_array(
+        (foreign.numbers(values, values.shape), _whole(data[f"{name}_root_column"]), _whole(start)),
+        shape=(size, int(start.attrs["columns"])))
+    rows.check_format()  # scipy would follow indices anywhere
+    return beside(rows)
+
+
+def _whole(data: xr.DataArray) -> Ints:
+    values = foreign.numbers(data, data.shape)
+    if (np.abs(values) > np.iinfo(np.int32).max).any() or (values % 1 != 0).any():
+        raise ValueError("it must be whole numbers")
+    return values.astype(np.int64)
 
 
 def summary(update: Update) -> dict[str, object]:
@@ -445,6 +509,7 @@ def summary(update: Update) -> dict[str, object]:
         "prior_conflict_limit": update.conflict_limit,
         "parameters_learnt": update.parameters_learnt,
         "log_evidence": update.log_evidence,
+        "information_left_out": update.left_out,
         "contraction_by_block": linear.contraction(
             update.prior, update.posterior, update.study.dimension).round(6).tolist(),
         "largest_shift_A_per_m": float(np.abs(shift).max()),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg as linalg
 import scipy.special as special
 
 from halbach_fe.blocks import Floats
-from halbach_fe.inference.prior import Gaussian
+from halbach_fe.inference.prior import Gaussian, beside, by_block
 
 MIN_TESTED = 8
 """Samples below which the approximation of Anderson and Darling's p-value does not hold."""
@@ -91,9 +90,9 @@ def measured_prior(
     """
     outer = np.einsum("bi,bj->bij", mean, mean)
     across = np.sum(mean**2, axis=1)[:, None, None] * np.eye(mean.shape[1]) - outer
-    blocks = linalg.block_diag(*np.linalg.cholesky(own + mounting_sd**2 * across))
-    return Gaussian(mean.ravel(), np.hstack([
-        blocks, shared.reshape(mean.size, -1), common_mode_sd * mean.reshape(-1, 1)]))
+    roots = np.linalg.cholesky(own + mounting_sd**2 * across)
+    return Gaussian(mean.ravel(), beside(
+        by_block(roots), shared.reshape(mean.size, -1), common_mode_sd * mean.reshape(-1, 1)))
 
 
 def anderson_darling(samples: Floats) -> tuple[float, float]:

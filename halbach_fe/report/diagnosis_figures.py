@@ -310,7 +310,7 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
 def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Rms changes of the magnetizations, and what the prior allows."""
     found = [(state.when, _deviations(state.update)) for state in states(diagnosis)]
-    prior = _parts(diagnosis.before, diagnosis.before.prior.root)
+    prior = _parts(diagnosis.before, np.asarray(diagnosis.before.prior.root))
     return [{"rms change of the magnetizations": name,
              "prior sd": f"{np.sqrt(np.mean(np.sum(values**2, axis=1))):.3g}"} | {
         when: f"{np.sqrt(np.mean(one[name]**2)):.3g}" for when, one in found}

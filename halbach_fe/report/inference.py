@@ -25,9 +25,8 @@ from halbach_fe.report.view import of_update
 from halbach_fe.update import Update
 
 NOTHING = "–"
-NUMBERED_SLOTS = 32
+NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """More do not find room for their numbers."""
-
 
 
 def score_table(update: Update, published: Published | None = None) -> list[dict[str, str]]:
@@ -118,6 +117,11 @@ def _z_of(update: Update, region: str, part: str) -> Floats:
     return update.observation.positions[update.chosen(region, part), 2]
 
 
+def _height(rings: int) -> float:
+    """In inches, of a picture with a row a ring."""
+    return 1.8 + 0.25 * min(rings, NUMBERED_RINGS)
+
+
 def _blocks(update: Update) -> Figure:
     array = update.study.array
     dimension = update.study.dimension
@@ -126,7 +130,7 @@ def _blocks(update: Update) -> Figure:
     length = np.linalg.norm(nominal, axis=1)
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
     picture = 100 * along.reshape(array.rings, array.blocks_per_ring)
-    figure = Figure(figsize=(8, 1.8 + 0.25 * array.rings), layout="constrained")
+    figure = Figure(figsize=(8, _height(array.rings)), layout="constrained")
     axis = figure.subplots()
     limit = float(np.abs(picture).max()) or 1.0
     image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
@@ -135,7 +139,7 @@ def _blocks(update: Update) -> Figure:
     axis.add_patch(Rectangle((0.5, 0.5), array.blocks_per_ring, array.rings, fill=False))
     axis.set_xlabel("slot")
     axis.set_ylabel("ring")
-    axis.set_xticks(range(1, array.blocks_per_ring + 1))
+    axis.set_xticks(range(1, array.blocks_per_ring + 1, max(1, array.blocks_per_ring // 24)))
     axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 12)))
     figure.colorbar(image, label="posterior change along\nthe easy axis in %")
     return figure
@@ -146,7 +150,7 @@ def _contraction(update: Update) -> Figure:
     percent = 100 * contraction(update.prior, update.posterior, update.study.dimension).reshape(
         array.rings, array.blocks_per_ring)
     slots = np.arange(1, array.blocks_per_ring + 1)
-    figure = Figure(figsize=(8, 3 if array.rings == 1 else 1.8 + 0.25 * array.rings),
+    figure = Figure(figsize=(8, 3 if array.rings == 1 else _height(array.rings)),
                     layout="constrained")
     axis = figure.subplots()
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
@@ -158,7 +162,7 @@ def _contraction(update: Update) -> Figure:
         return figure
     image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
                         extent=(0.5, len(slots) + 0.5, 0.5, array.rings + 0.5))
-    if len(slots) <= NUMBERED_SLOTS:
+    if len(slots) <= NUMBERED_SLOTS and array.rings <= NUMBERED_RINGS:
         for (ring, slot), value in np.ndenumerate(percent):
             axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
                       color="white" if value < 50 else "black")

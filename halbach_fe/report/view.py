@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import plotly.graph_objects as go
 import plotly.io
+import scipy.sparse as sparse
 from markupsafe import Markup
 from scipy.spatial import Delaunay
 
@@ -28,6 +30,9 @@ FLAT = 0.2
 
 MOST_POINTS = 10_000
 """Of a map; more would make the page slow."""
+
+MOST_BLOCKS = 2000
+"""Of an array; of more, those of neighbouring rings are drawn as one."""
 
 LARGE = 4.0
 """Residuals over their standard deviations from which the colour is the same."""
@@ -127,9 +132,10 @@ def of_update(update: Update) -> Markup:
     easy = nominal / np.linalg.norm(nominal, axis=1)[:, None]
     length = np.einsum("ij,ij->i", nominal, easy)
     mean = update.posterior.mean.reshape(-1, size)
-    along = np.einsum("ij,ijk->ik", easy, update.posterior.root.reshape(*easy.shape, -1))
+    number = np.arange(len(easy) + 1)
+    along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
     change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
-    sd = 100 * np.linalg.norm(along, axis=1) / length
+    sd = 100 * update.posterior.sd_of(along) / length
     known = Known(mean, Colours(change, "posterior change<br>along the easy axis in %", [
         f"{one:+.2f} ± {error:.2f} % along the easy axis"
         for one, error in zip(change, sd, strict=True)]))
@@ -153,7 +159,8 @@ def _by_point(positions: Floats, scores: Floats) -> Points:
 
 def magnet_view(study: Study, known: Known, points: Points | None = None) -> Markup:
     """A part of a page, with all that it needs."""
-    figure = go.Figure([_blocks(study, known), *_arrows(study, known)])
+    blocks, known = _few(study, known)
+    figure = go.Figure([_blocks(study, blocks, known), *_arrows(study, blocks, known)])
     if study.iron_ring is not None:
         figure.add_trace(_iron(study))
     if points is not None:
@@ -169,11 +176,35 @@ def magnet_view(study: Study, known: Known, points: Points | None = None) -> Mar
         config={"displaylogo": False, "responsive": True}))
 
 
-def _blocks(study: Study, known: Known) -> go.Mesh3d:
+def _rings_in_one(study: Study) -> int:
+    """How many rings are drawn as one."""
+    return math.ceil(study.array.rings * study.array.blocks_per_ring / MOST_BLOCKS)
+
+
+def _few(study: Study, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
+    """The blocks to draw, and what is known of them: of too many, one for each slot of several
+    rings, with their mean magnetization and the number of that which has the largest.
+    """
+    blocks, slots = blocks_of(study), study.array.blocks_per_ring
+    step = _rings_in_one(study)
+    if step == 1:
+        return blocks, known
+    groups = [range(first + slot, min(first + step * slots, len(blocks)), slots)
+              for first in range(0, len(blocks), step * slots) for slot in range(slots)]
+    colours = known.colours
+    if colours is not None:
+        size = np.abs(colours.values)
+        worst = [group[int(np.argmax(size[group]))] for group in groups]
+        colours = replace(colours, values=colours.values[worst], words=[
+            f"most in ring {blocks[one].ring}: {colours.words[one]}" for one in worst])
+    return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
+            Known(np.array([known.magnetization[group].mean(axis=0) for group in groups]), colours))
+
+
+def _blocks(study: Study, blocks: Sequence[MagnetBlock], known: Known) -> go.Mesh3d:
     """All blocks as one surface, each with vertices of its own, which carry its words."""
     vertices, triangles, owner = [], [], []
     first = 0
-    blocks = blocks_of(study)
     for number, block in enumerate(blocks):
         corners, faces = prism(block, _height(study))
         vertices.append(corners)
@@ -181,7 +212,9 @@ def _blocks(study: Study, known: Known) -> go.Mesh3d:
         owner += [number] * len(corners)
         first += len(corners)
     points, faces = np.vstack(vertices), np.vstack(triangles)
-    words = [_words(block, known, number) for number, block in enumerate(blocks)]
+    more = _rings_in_one(study) - 1
+    words = [_words(block, min(more, study.array.rings - block.ring), known, number)
+             for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
     if known.colours is not None:
         values = known.colours.values
@@ -197,9 +230,11 @@ def _blocks(study: Study, known: Known) -> go.Mesh3d:
         name="blocks", showlegend=True, lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
 
 
-def _words(block: MagnetBlock, known: Known, number: int) -> str:
+def _words(block: MagnetBlock, more: int, known: Known, number: int) -> str:
+    """Of a block that stands for those of so many more rings."""
     moment = known.magnetization[number]
-    lines = [f"ring {block.ring}, slot {block.slot}",
+    rings = f"rings {block.ring} to {block.ring + more}" if more else f"ring {block.ring}"
+    lines = [f"{rings}, slot {block.slot}",
              "M = (" + ", ".join(f"{1e-3 * one:.1f}" for one in moment) + ") kA/m"]
     if known.colours is not None:
         lines.append(known.colours.words[number])
@@ -231,9 +266,10 @@ def _height(study: Study) -> float:
     return FLAT * study.array.outer_radius_m
 
 
-def _arrows(study: Study, known: Known) -> list[go.Scatter3d | go.Cone]:
+def _arrows(
+    study: Study, blocks: Sequence[MagnetBlock], known: Known
+) -> list[go.Scatter3d | go.Cone]:
     """Directions of magnetization, on the upper faces of the blocks."""
-    blocks = blocks_of(study)
     middles = np.array([[*(block.middle + block.shift)[:2],
                          prism(block, _height(study))[0][:, 2].max()] for block in blocks])
     vectors = np.zeros((len(blocks), 3))

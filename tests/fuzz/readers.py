@@ -34,9 +34,10 @@ from halbach_fe.formats.declared import Declared
 from halbach_fe.formats.grid import grid_of
 from halbach_fe.formats.openpmd import content as openpmd_content
 from halbach_fe.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
+from halbach_fe.inference.prior import Gaussian, Root, block_prior
 from halbach_fe.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.regions import Regions
-from halbach_fe.response import Response
+from halbach_fe.response import Response, StoredMatrix, _beside
 from halbach_fe.response import _read as read_response
 from halbach_fe.response import _write as write_response
 from halbach_fe.routes import finite_element_part
@@ -45,7 +46,7 @@ from halbach_fe.solutions import read_matrix, read_saved, read_solutions, read_u
 from halbach_fe.solve import Workshop
 from halbach_fe.study import Study, _with_table, curve_of, parse_study, read_study
 from halbach_fe.study_file import amended
-from halbach_fe.update import read_posterior
+from halbach_fe.update import _stored_root, read_posterior
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import RICH, document
@@ -130,8 +131,12 @@ def posterior() -> bytes:
             ("nominal", 1), ("prior_mean", 1), ("prior_sd", 0.01), ("posterior_mean", 1.01),
             ("posterior_sd", 0.001))},
         coords={"parameter": [f"p{n}" for n in range(count)]}, attrs={"study": "{}"})
-    for name in ("prior", "posterior"):
-        data[f"{name}_covariance"] = (("parameter", "parameter_2"), np.eye(count))
+    prior = block_prior(nominal, 2, 0.01, 1.0, 0.005)
+    size = prior.root.shape[1]
+    after = Gaussian(nominal, Root(
+        prior.root.outer, np.eye(size)[:, :3], np.array([0.1, 0.2, 1.0])))
+    for name, one in (("prior", prior), ("posterior", after)):
+        data.update(_stored_root(name, one, prior))
     return written(".h5", lambda path: data.to_netcdf(path, engine="h5netcdf"))
 
 
@@ -139,6 +144,27 @@ def a_response() -> bytes:
     built = Response(np.ones((3, 2)), ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3),
                      np.zeros(3), 1e-9)
     return written(".h5", lambda path: write_response(path, "the key", built))
+
+
+def a_matrix() -> bytes:
+    return written(".npy", lambda path: StoredMatrix.of([np.ones((3, 2))], (3, 2), path))
+
+
+def with_matrix(path: Path) -> np.ndarray | None:
+    """A response whose matrix is in a file of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        main = Path(folder, "response.h5")
+        beside = _beside(main, "the key")
+        beside.write_bytes(path.read_bytes())
+        write_response(main, "the key", Response(
+            StoredMatrix(beside, (3, 2)), ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3),
+            np.zeros(3), 1e-9))
+        found = read_response(main, "the key")
+        return None if found is None else found.whole
+
+
+def check_matrix(found: np.ndarray | None) -> None:
+    assert found is None or (found.shape == (3, 2) and found.dtype == float)
 
 
 def chains() -> bytes:
@@ -184,7 +210,8 @@ def check_posterior(found) -> None:
     for one in found.values():
         assert one.mean.shape == (8,)
         assert np.isfinite(one.mean).all()
-        assert np.isfinite(one.root).all()
+        assert np.asarray(one.root).shape[0] == 8
+        assert np.isfinite(np.asarray(one.root)).all()
 
 
 def check_map(data: xr.Dataset) -> None:
@@ -375,9 +402,9 @@ NAMES = (
     "study", "changed study", "steel", "map (CSV)", "map (HDF5)", "map (VTU)", "block table",
     "import: columns", "import: opera", "import: comsol", "import: openpmd", "import as columns",
     "import as opera", "import as comsol", "import as openpmd", "posterior", "stored response",
-    "stored chains", "mesh", "regions", "GetDP: unknowns", "GetDP: unknowns of edges",
-    "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log",
-    "cached answer")
+    "stored matrix", "stored chains", "mesh", "regions", "GetDP: unknowns",
+    "GetDP: unknowns of edges", "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix",
+    "GetDP: vectors", "GetDP: log", "cached answer")
 """To collect tests by, without making the seeds."""
 
 
@@ -426,6 +453,9 @@ def readers() -> tuple[Reader, ...]:
                lambda path: read_posterior(TINY, path), MeasurementError, check_posterior, HDF5),
         Reader("stored response", "response.h5", (a_response(),),
                lambda path: read_response(path, "the key"), None, check_response, HDF5),
+        Reader("stored matrix", "response.npy", (a_matrix(),), with_matrix, None, check_matrix,
+               (b"'descr'", b"'<f8'", b"'|O'", b"'fortran_order': True", b"(3, 2)", b"(10**9, 2)",
+                b"(-1, 2)", b"(", b"{", b"\x93NUMPY\x02\x00")),
         Reader("stored chains", "chains.nc", (chains(),), resumed, None, check_resumed,
                (*HDF5, b"PCG64", b"bit_generator", b"state", b"has_uint32")),
         Reader("mesh", "mesh.msh", (left["mesh"], ascii_mesh), mesh_beside(

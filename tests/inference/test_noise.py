@@ -132,9 +132,9 @@ def test_prediction_of_readings_whose_noise_was_seen_in_others(generator):
         readings = matrix @ truth + noise.sample(generator)
         after = update(matrix[seen], readings[seen], noise.part(seen), prior).distribution
         residual, root = readings - matrix @ after.mean, matrix @ after.root
-        right.append(whitened(residual[~seen] - told @ residual[seen], left,
-                              root[~seen] - told @ root[seen]))
-        wrong.append(whitened(residual[~seen], noise.part(~seen), root[~seen]))
+        given = root[~seen] - told @ root[seen]
+        right.append(whitened(residual[~seen] - told @ residual[seen], left, given.__getitem__, 6))
+        wrong.append(whitened(residual[~seen], noise.part(~seen), root[~seen].__getitem__, 6))
     # 8000 independent values: the rms of a standard normal is 1 +- 0.008; 5 sigma
     assert np.sqrt(np.mean(np.square(right))) == pytest.approx(1.0, abs=0.04)
     assert np.sqrt(np.mean(np.square(wrong))) != pytest.approx(1.0, abs=0.08)

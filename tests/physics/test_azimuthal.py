@@ -51,6 +51,23 @@ def test_every_column_against_its_exact_field(modes, workshop):
     assert (np.abs(found - wrong).max(axis=(1, 2)) / scale).min() > 0.1
 
 
+def test_runs_of_few_modes_do_the_same(modes, workshop, monkeypatch):
+    """Solutions of many blocks, which would fill the disk, are read a few modes at a time."""
+    study = modes(array__recoil_permeability=1.1)
+
+    def columns():
+        return azimuthal.solve_modes(study, POINTS, [0], workshop)
+
+    weights = azimuthal.nominal_waves(study, 4)
+    assert azimuthal.spans_of(weights, True, 1) == [(0, 0), (1, 4)]
+    together = columns()
+    monkeypatch.setattr(azimuthal, "SOLVED_NUMBERS", 2)
+    assert azimuthal.spans_of(weights, True, 1) == [(0, 0), (1, 2), (3, 4)]
+    assert azimuthal.spans_of(weights, True, 5) == [(m, m) for m in range(5)]
+    # the same matrices, factorized again
+    np.testing.assert_allclose(columns(), together, atol=1e-12 * np.abs(together).max())
+
+
 @pytest.mark.parametrize("missing", [0, 1, 2])
 def test_a_missing_mode_is_seen(modes, workshop, monkeypatch, missing):
     """Negative control: drop one mode of the sum and the columns are wrong."""

@@ -17,8 +17,9 @@ from halbach_fe.geo import cross_section
 from halbach_fe.observation import observe, points_from
 from halbach_fe.routes import MESHES, choose_route, finite_element_part
 from halbach_fe.solve import Workshop
-from halbach_fe.study import read_study
+from halbach_fe.study import parse_study, read_study
 from tests.conftest import ROOT
+from tests.oracles.cuboids import long_dipole
 
 TRAPEZOID = {"shape": "trapezoid", "side_gap_m": 0.002}
 STEEL = {"inner_radius_m": 0.19, "outer_radius_m": 0.215,
@@ -158,3 +159,20 @@ def test_finer_and_more_takes_more(studies):
         assert getattr(columns, name) >= getattr(base, name)
     assert more_jobs.memory_GiB > base.memory_GiB
     assert columns.solves > base.solves
+
+
+def test_a_large_matrix_stays_on_the_disk():
+    """6 000 parameters: a thousand readings are held, 50 000 are not."""
+    def foretold(circles):
+        study = parse_study(long_dipole(125, circles))
+        points = points_from(study.observation.positions)
+        observation = observe(study, points, np.ones_like(points, bool))
+        return cost.of_infer(study, observation, jobs=1), 8 * 6000 * len(observation) / cost.GIB
+
+    few, few_matrix = foretold(42)
+    assert few_matrix < few.disk_GiB < few.own_memory_GiB < 1
+    many, many_matrix = foretold(2100)
+    assert many_matrix > 2
+    assert many.disk_GiB > many_matrix > many.own_memory_GiB
+    # the square root of the information, which is what grows
+    assert many.own_memory_GiB > 8 * 6000**2 / cost.GIB

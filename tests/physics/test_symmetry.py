@@ -19,7 +19,7 @@ POINTS = np.vstack([circle(0.05, 5, z, 0.2 + z) for z in (-0.12, 0.03, 0.1)])
 
 def fields(study, workshop):
     parts = finite_element_part(study, POINTS, workshop)
-    return np.array([parts.block(number) for number in range(len(blocks_of(study)))])
+    return np.array([parts.block(number, slice(None)) for number in range(len(blocks_of(study)))])
 
 
 @pytest.mark.parametrize("rings", [2, 3])
@@ -167,7 +167,7 @@ def test_blocks_react_as_in_a_regular_array(short_dipole, workshop):
         return np.sqrt(np.mean(field**2))
 
     assert 0.3 < rms(parts.error) / rms(parts.nominal - finer) < 3
-    ours, theirs = (np.array([one.block(number) for number in range(32)])
+    ours, theirs = (np.array([one.block(number, slice(None)) for number in range(32)])
                     for one in (parts, whole))
     # an eleventh of the material is missing, and the mesh is coarse
     assert rms(ours - theirs) < 0.25 * rms(theirs)

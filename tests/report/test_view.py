@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from halbach_fe.blocks import blocks_of
+from halbach_fe.report import view
 from halbach_fe.report.view import Colours, Known, magnet_view, prism, residuals
 from halbach_fe.study import read_study
 from tests.conftest import ROOT
@@ -108,6 +109,28 @@ def test_studies_are_shown(page, name):
     whole = coloured(shown)
     shown.evaluate("Plotly.restyle('magnet-view', {visible: false}, [0])")
     assert coloured(shown) < 0.2 * whole  # the iron stays
+
+
+def test_of_too_many_blocks_neighbouring_rings_are_one(short_dipole, monkeypatch):
+    """What changed most in them is shown, and the whole length."""
+    study = short_dipole(array__rings=7, array__recoil_permeability=1.0)
+    blocks = blocks_of(study)
+    values = np.zeros(len(blocks))
+    values[16 * 3 + 4], values[16 * 6 + 1] = -5.0, 2.0  # ring 4, slot 5; ring 7, slot 2
+    known = Known(np.array([block.magnetization for block in blocks]), Colours(
+        values, "change", [f"{one:g} %" for one in values]))
+    every, _ = view._few(study, known)
+    assert len(every) == len(blocks)
+    monkeypatch.setattr(view, "MOST_BLOCKS", 40)
+    few, shown = view._few(study, known)
+    assert len(few) == len(shown.magnetization) == len(shown.colours.words) == 48  # rings by three
+    assert shown.colours.values[16 + 4] == -5.0
+    assert shown.colours.words[16 + 4] == "most in ring 4: -5 %"
+    assert view._words(few[16 + 4], 2, shown, 16 + 4).startswith("rings 4 to 6, slot 5")
+    assert shown.colours.values[32 + 1] == 2.0
+    assert (few[0].z_min, few[-1].z_max) == (blocks[0].z_min, blocks[-1].z_max)
+    assert sum(block.volume for block in few) == pytest.approx(
+        sum(block.volume for block in blocks))
 
 
 @pytest.mark.parametrize("name", STUDIES)

@@ -73,6 +73,17 @@ def test_overlapping_cuboids_are_refused(dipole):
             "shape": "cuboid", "width_m": 0.0825, "orientation": "magnetization"}))
 
 
+def test_many_narrow_neighbours(dipole):
+    """Sectors and trapezoids that share faces are apart; cuboids a little too wide are not."""
+    many = {"array__blocks_per_ring": 256}
+    blocks_of(dipole(**many))
+    blocks_of(dipole(**many, array__block={"shape": "trapezoid", "side_gap_m": 0.0}))
+    pitch = 2 * 0.104 * np.tan(np.pi / 256)
+    blocks_of(dipole(**many, array__block={"shape": "cuboid", "width_m": 0.999 * pitch}))
+    with pytest.raises(StudyError, match="overlap"):
+        blocks_of(dipole(**many, array__block={"shape": "cuboid", "width_m": 1.001 * pitch}))
+
+
 def test_crossing_cuboids_are_refused(dipole):
     """Thin cuboids that cross like swords hold no corner or centre of each other."""
     with pytest.raises(StudyError, match="overlap"):
