@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import tempfile
 import time
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 import ngsolve
 import numpy as np
 
+from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe import getdp as runner
 from halbach_fe.campaign.bodies import law_of
@@ -61,7 +61,8 @@ def faser(note: Note) -> None:
     observation = observe(study, points, np.ones_like(points, bool))
     common.say("FASER dipole in a tube that saturates, in 3D")
     with tempfile.TemporaryDirectory() as name:
-        workshop = Workshop(find_getdp(), Path(name), jobs=2)
+        scales = Weighed.of(find_getdp(), Path(name))
+        workshop = Workshop(scales.getdp, Path(name), jobs=2)
         started = time.monotonic()
         parts = finite_element_part(study, points, workshop, columns=False)
         part = parts.nominal
@@ -71,9 +72,8 @@ def faser(note: Note) -> None:
         stated = reading_errors(study, observation, parts, error_workshop(workshop))
         note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
              "the dual formulation, Newton's method again")
-    note("nonlinear.faser_3d_memory_GiB", sum(resource.getrusage(who).ru_maxrss for who in (
-        resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN, resource.RUSAGE_CHILDREN)) / 2**20,
-        "GiB", "peak of this process and of two of GetDP's")
+        note("nonlinear.faser_3d_memory_GiB", own_peak() + 2 * scales.peak, "GiB",
+             "peak of this process and of two of GetDP's")
     main_field = float(np.abs(exact_part(study, points) + part).max())
     common.say("the same by NGSolve")
     dipole, iron = dipole_of(study), law_of(study.iron_ring)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import tempfile
 import time
 from pathlib import Path
@@ -11,6 +10,7 @@ import magpylib
 import ngsolve
 import numpy as np
 
+from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe import getdp as runner
 from halbach_fe.azimuthal import solve_modes
@@ -35,11 +35,11 @@ COLUMNS_BY_PROCESS = 2
 ORACLE_POINTS = 13  # every 13th point of the map is compared with NGSolve
 
 
-def built(study: Study, points: np.ndarray, folder: Path) -> tuple[Response, float]:
+def built(study: Study, points: np.ndarray, workshop: Workshop) -> tuple[Response, float]:
     """H from nothing, with permeability and iron, and the seconds it took."""
     observation = observe(study, points, np.ones_like(points, bool))
     started = time.monotonic()
-    found = response(study, observation, Workshop(find_getdp(), folder, jobs=2))
+    found = response(study, observation, workshop)
     return found, time.monotonic() - started
 
 
@@ -181,12 +181,12 @@ def run(note: Note) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         common.say("response matrix from nothing")
-        base, seconds = built(study, points, folder / "response")
+        scales = Weighed.of(find_getdp(), folder)
+        base, seconds = built(study, points, Workshop(scales.getdp, folder / "response", jobs=2))
         note("response.seconds", seconds, "s",
              f"{base.matrix.shape[1]} columns x {base.matrix.shape[0]} readings")
-        note("response.memory_GiB", sum(resource.getrusage(who).ru_maxrss for who in (
-            resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN, resource.RUSAGE_CHILDREN)) / 2**20,
-            "GiB", "peak of this process and of two of GetDP's")
+        note("response.memory_GiB", own_peak() + 2 * scales.peak, "GiB",
+             "peak of this process and of two of GetDP's")
         common.say("one GetDP process per column")
         alone = process_per_column_seconds(folder / "response")
         note("response.speedup_vs_process_per_column", alone * base.matrix.shape[1] / seconds,

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.azimuthal import solve_modes
 from halbach_fe.blocks import blocks_of
@@ -58,9 +59,8 @@ MESHES = (0.016, 0.008, 0.004)
 SOLIDS = (0.035, 0.025, 0.018)
 """Elements in m of the 3D mesh of two rings: the nominal array, factorized."""
 
-SLOPE_FROM = {"blocks": 2560, "readings": 100_000, "azimuthal modes": 40_000, "scalar potential": 0}
-"""Sizes from which on growth is that of the work itself, not of what every run takes; and a GetDP
-process is larger than the one that started it, whose memory the system counts as its own."""
+SLOPE_FROM = {"blocks": 2560, "readings": 100_000, "azimuthal modes": 0, "scalar potential": 0}
+"""Sizes from which on growth is that of the work itself, not of what every run takes."""
 
 
 def measured(work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
@@ -72,15 +72,9 @@ def measured(work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, 
 def _timed(work: Callable[..., dict[str, Any]], arguments: Sequence[Any]) -> dict[str, Any]:
     started = time.monotonic()
     found = work(*arguments)
-    return {"seconds": time.monotonic() - started, "memory_GiB": peak_memory(),
+    return {"seconds": time.monotonic() - started, "memory_GiB": own_peak(),
             "processor_s": sum(one.ru_utime + one.ru_stime for one in map(
                 resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))} | found
-
-
-def peak_memory(children: bool = False) -> float:
-    """In GiB, of this process, or the largest of its children's."""
-    who = resource.RUSAGE_CHILDREN if children else resource.RUSAGE_SELF
-    return resource.getrusage(who).ru_maxrss / 2**20
 
 
 def write_campaign(document: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -145,13 +139,14 @@ def modes(size: float, jobs: int) -> dict[str, Any]:
     study = twelve_rings(size)
     points = points_from(study.observation.positions)
     with tempfile.TemporaryDirectory() as name:
+        scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_modes(study, points, range(0, 96, 16), Workshop(find_getdp(), Path(name), jobs=jobs))
-        seconds = time.monotonic() - started
+        solve_modes(study, points, range(0, 96, 16), Workshop(scales.getdp, Path(name), jobs=jobs))
+        seconds, peak = time.monotonic() - started, scales.peak
     problem = max(of_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": jobs, "seconds": seconds,
-            "getdp_GiB": peak_memory(children=True)}
+            "getdp_GiB": peak}
 
 
 def solid(size: float) -> dict[str, Any]:
@@ -164,13 +159,14 @@ def solid(size: float) -> dict[str, Any]:
             "z_max_m": 0.1}))
     points = points_from(study.observation.positions)
     with tempfile.TemporaryDirectory() as name:
+        scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_nominal(study, points, Workshop(find_getdp(), Path(name), jobs=1))
-        seconds = time.monotonic() - started
+        solve_nominal(study, points, Workshop(scales.getdp, Path(name), jobs=1))
+        seconds, peak = time.monotonic() - started, scales.peak
     problem = max(of_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": 1, "seconds": seconds,
-            "getdp_GiB": peak_memory(children=True)}
+            "getdp_GiB": peak}
 
 
 def slope(points: Sequence[dict[str, Any]], size: str, what: str, start: float) -> float:

@@ -5,12 +5,10 @@ Time is not compared: it says more of what else the machine does.
 
 from __future__ import annotations
 
-import sys
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
+from benchmarks.memory import Weighed
 from halbach_fe import cost, geo, mesh, solve
 from halbach_fe.discretization import error_workshop, reading_errors, refined
 from halbach_fe.geo import cross_section
@@ -115,15 +113,9 @@ def test_the_runs_are_those_foretold(studies, name, workshop, monkeypatch):
 
 @pytest.fixture
 def weighed(getdp, tmp_path):
-    """GetDP, and the file where each run's peak memory goes."""
-    wrapper, record = tmp_path / "getdp", tmp_path / "memory"
-    wrapper.write_text(
-        f"#!{sys.executable} -S\nimport resource, subprocess, sys\n"
-        f"code = subprocess.call([{str(getdp.executable)!r}, *sys.argv[1:]])\n"
-        "peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss\n"
-        f"open({str(record)!r}, 'a').write(f'{{peak}}\\n')\nsys.exit(code)\n")
-    wrapper.chmod(0o755)
-    return Workshop(replace(getdp, executable=wrapper), tmp_path / "work"), record
+    """A workshop whose runs tell their peak memory, and what they told."""
+    scales = Weighed.of(getdp, tmp_path)
+    return Workshop(scales.getdp, tmp_path / "work"), scales
 
 
 @pytest.mark.parametrize(("route", "changes"), [
@@ -137,9 +129,9 @@ def weighed(getdp, tmp_path):
 def test_the_memory_of_getdp(dipole, short_dipole, weighed, route, changes):
     study = (dipole if route == "cross_section" else short_dipole)(**changes)
     points = observation_of(study).points
-    workshop, record = weighed
+    workshop, scales = weighed
     finite_element_part(study, points, workshop, columns=False)
-    peak = max(map(int, record.read_text().split())) / 2**20
+    peak = scales.peak
     foretold = [max(one.memory_GiB for one in cost.nominal(variant, points, jobs=1))
                 for variant in (study, refined(study, 1.5), refined(study, 1 / 1.5))]
     assert {problem.route for problem in cost.nominal(study, points, jobs=1)} == {route}
