@@ -28,7 +28,9 @@ def run(arguments: argparse.Namespace) -> int:
     """List or clear."""
     cache = default_cache(arguments.cache)
     if cache is None:
-        common.say("No cache is kept: its limit is 0.")
+        common.say("No cache is kept: its limit is 0, or there is no home.")
+        if arguments.json:
+            common.print_json({"folder": None, "limit_bytes": 0, "bytes": 0, "entries": []})
         return 0
     entries = cache.entries()
     if arguments.what == "clear":

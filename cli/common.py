@@ -299,16 +299,22 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
         with connected(arguments.scheduler) as cluster:
             yield cluster.executor
         return
-    with ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn"),
-                             _end_with, (os.getpid(),)) as pool:
-        try:
-            yield pool
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    pool = ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn"),
+                               _begin_worker, (os.getpid(),))
+    try:
+        yield pool
+    except BaseException:  # what waits is not begun, and what runs is ended
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    pool.shutdown()
 
 
-def _end_with(parent: int) -> None:
+def _begin_worker(parent: int) -> None:
     """End this process when its parent has, however that ended."""
+    _claim_buffers()
+
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(1)

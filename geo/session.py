@@ -12,6 +12,9 @@ import gmsh
 
 from halbach_fe.errors import HalbachError, MeshError
 
+_ALONE = threading.Lock()
+"""There is one Gmsh in a process, whatever its threads would like."""
+
 
 @contextmanager
 def gmsh_session(name: str) -> Iterator[None]:
@@ -22,6 +25,11 @@ def gmsh_session(name: str) -> Iterator[None]:
     MeshError
         In place of Gmsh's bare exceptions.
     """
+    with _ALONE:
+        yield from _session(name)
+
+
+def _session(name: str) -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:

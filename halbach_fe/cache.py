@@ -10,12 +10,14 @@ longest go.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
-import tempfile
 import time
+import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -79,7 +81,10 @@ class Cache:
         digest = hashlib.sha256()
         asked = asdict(job) | {"numbers": sorted(job.numbers.items())}
         del asked["time_limit_s"]  # an answer is the same whenever it comes
-        said = [getdp.version, *getdp.build_options, getdp.petsc]
+        said: list[object] = [getdp.version, *getdp.build_options, getdp.petsc]
+        with contextlib.suppress(OSError):  # one of the same version may be built anew
+            there = getdp.executable.stat()
+            said += [there.st_size, there.st_mtime_ns]
         digest.update(json.dumps([asked, said], sort_keys=True).encode())
         given = sorted(path.name for path in run_folder.iterdir())
         for name in given:
@@ -116,7 +121,9 @@ class Cache:
     def _folders(self) -> Iterator[Path]:
         for folder in sorted(self.folder.glob("[0-9a-f][0-9a-f]")):
             remove_left_behind(folder)
-            yield from sorted(path for path in folder.iterdir() if path.name[0] != ".")
+            with contextlib.suppress(OSError):
+                yield from [path for path in sorted(folder.iterdir())
+                            if re.fullmatch("[0-9a-f]{64}", path.name)]
 
 
 @dataclass(frozen=True)
@@ -135,7 +142,7 @@ class Entry:
 
         One that is damaged is removed, with a warning.
         """
-        if not self.folder.is_dir():
+        if not os.path.isdir(self.folder):  # False too where it may not be looked at
             return False
         manifest = _manifest(self.folder)
         try:
@@ -147,43 +154,51 @@ class Entry:
                 shutil.copyfile(self.folder / name, self.run_folder / name)
                 if _digest(self.run_folder / name) != kept.sha256:
                     raise ValueError(f"{name} is not what was stored")
-            os.utime(self.folder / MANIFEST)
         except (OSError, ValueError) as error:
             for path in self.run_folder.iterdir():
                 if path.name not in self.given:
                     path.unlink()
-            if self.folder.is_dir():  # otherwise another process has removed it meanwhile
+            damaged = isinstance(error, ValueError | FileNotFoundError | IsADirectoryError)
+            # otherwise another process has removed it meanwhile, or it cannot be had
+            if damaged and os.path.isdir(self.folder):
                 warnings.warn(f"An entry of the cache is damaged ({error}) and is computed again: "
                               f"{self.folder}", HalbachWarning, stacklevel=2)
                 _remove(self.folder)
             return False
+        with contextlib.suppress(OSError):  # it may be another's
+            os.utime(self.folder / MANIFEST)
         log = (self.run_folder / LOG_NAME).read_text(encoding="utf-8")
         for line in log.splitlines()[1:]:  # the first has the options
             on_line(line)
         return True
 
-    def store(self) -> None:
-        """Keep what GetDP wrote into the run folder, unless it is there already."""
-        if self.folder.is_dir():
-            return
+    def store(self) -> bool:
+        """Keep what GetDP wrote into the run folder, unless it is there already; tell whether the
+        cache has grown.
+        """
+        if os.path.isdir(self.folder):
+            return False
         written = [path for path in self.run_folder.iterdir() if path.name not in self.given]
         if sum(path.stat().st_size for path in written) > self.cache.limit_bytes:
-            return
+            return False
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
-            making = Path(tempfile.mkdtemp(prefix=name_in_the_making(self.folder.name[:8]),
-                                           dir=self.folder.parent))
+            making = self.folder.with_name(  # of the mode that others may use it by
+                name_in_the_making(self.folder.name[:8]) + uuid.uuid4().hex)
+            making.mkdir()
             try:
                 self._fill(making, written)
                 making.rename(self.folder)
             finally:
                 shutil.rmtree(making, ignore_errors=True)
         except OSError as error:
-            if not self.folder.is_dir():  # otherwise another process was faster
+            if not os.path.isdir(self.folder):  # otherwise another process was faster
                 warnings.warn(
                     f"Results are not kept in the cache {self.cache.folder} ({error.strerror}). "
                     f"Free some space, or name another folder in {FOLDER_VARIABLE}.",
                     HalbachWarning, stacklevel=2)
+            return False
+        return True
 
     def _fill(self, making: Path, written: list[Path]) -> None:
         files = {}
@@ -214,9 +229,13 @@ def default_cache(folder: Path | None = None) -> Cache | None:
                           f"instead it is '{said}'.")
     if limit == 0:
         return None
-    named = os.environ.get(FOLDER_VARIABLE)
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Cache(folder or (Path(named) if named else home / "halbach-fe"), limit * 2**30)
+    named = folder or os.environ.get(FOLDER_VARIABLE)
+    if not named:
+        home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        if home.startswith("~"):  # some have no home
+            return None
+        named = Path(home, "halbach-fe")
+    return Cache(Path(named), limit * 2**30)
 
 
 def _manifest(folder: Path) -> Manifest | None:

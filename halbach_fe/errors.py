@@ -76,6 +76,10 @@ class NotConvergedError(GetDPError):
         super().__init__(message)
         self.residuals = residuals
 
+    def __reduce__(self) -> tuple[type[NotConvergedError], tuple[str, tuple[float, ...]]]:
+        """Errors travel from one process to another."""
+        return NotConvergedError, (str(self), self.residuals)
+
 
 class OutputError(HalbachError):
     """Results cannot be written, or a stored result cannot be read back."""

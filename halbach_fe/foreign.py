@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,9 @@ SMALL = 1 << 26
 
 MOST_COMPRESSED = 100
 """Times a file's size, of data in it, beyond `SMALL`. Ours are not compressed at all."""
+
+_ALONE = threading.RLock()
+"""Where output goes, and whether there are warnings, is one thing for all threads."""
 
 MAX_OBJECTS = 10_000
 """Of an HDF5 file; groups may contain one another without end."""
@@ -54,13 +58,6 @@ def numbers(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"it must be {shape} finite numbers")
     return values
-
-
-def mapped(path: Path) -> NDArray[Any]:
-    """The array of a .npy file, on the disk; ValueError if it is none."""
-    with _refusing():
-        found: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-        return found
 
 
 @contextlib.contextmanager
@@ -153,10 +150,12 @@ def _refusing() -> Iterator[None]:
     """Turn what a library does with a bad file into one ValueError."""
     silent = io.StringIO()
     try:
-        with (warnings.catch_warnings(), contextlib.redirect_stdout(silent),
+        with (_ALONE, warnings.catch_warnings(), contextlib.redirect_stdout(silent),
               contextlib.redirect_stderr(silent)):
             warnings.simplefilter("ignore")
             yield
+    except MemoryError:
+        raise
     except SystemExit:  # meshio's way to say so
         raise ValueError("damaged") from None
     except Exception as error:

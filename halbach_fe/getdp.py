@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -201,7 +202,7 @@ def run(
     _check_before(job, folder)
     arguments = [
         str(getdp.executable), job.problem, "-msh", job.mesh, "-solve", job.resolution,
-        "-v", "4", "-ksp_error_if_not_converged", *job.options,
+        "-v", "4", "-skip_petscrc", "-ksp_error_if_not_converged", *job.options,
     ]
     for name, value in job.numbers.items():
         arguments += ["-setnumber", name, f"{value:.17g}"]
@@ -297,11 +298,19 @@ def _launcher(job: Job) -> list[str]:
     """What GetDP is started by: so that it ends when its starter does, however that ends, and
     under MPI if several processes share the run.
     """
-    setpriv = shutil.which("setpriv")
-    tether = [setpriv, "--pdeathsig", "KILL"] if setpriv else []
-    if job.processes == 1:
-        return tether
-    return [*tether, "mpirun", "-n", str(job.processes), *tether]
+    tether = _tether()
+    return tether if job.processes == 1 else [*tether, "mpirun", "-n", str(job.processes), *tether]
+
+
+@cache
+def _tether() -> list[str]:
+    """util-linux has it since 2.33; others may have a `setpriv` without."""
+    tether = ["setpriv", "--pdeathsig", "KILL"]
+    try:
+        tried = subprocess.run([*tether, "true"], capture_output=True, check=False, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return tether if tried.returncode == 0 else []
 
 
 def _execute(
@@ -311,15 +320,17 @@ def _execute(
     threads = str(job.threads)
     environment = os.environ | (_ALONE if job.processes == 1 else _TOGETHER) | {
         "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+    environment.pop("PETSC_OPTIONS", None)  # nobody would know of them afterwards
     lines: list[str] = []
+    if job.processes > 1 and shutil.which("mpirun") is None:
+        raise _failure("`mpirun` was not found (Debian: openmpi-bin)", folder)
     try:
         process = subprocess.Popen(
             [*_launcher(job), *arguments], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
             start_new_session=True)
     except OSError as error:
-        what = "`mpirun` (Debian: openmpi-bin)" if job.processes > 1 else "it"
-        raise _failure(f"{what} could not be started ({error.strerror})", folder) from None
+        raise _failure(f"it could not be started ({error.strerror})", folder) from None
 
     def read() -> None:
         assert process.stdout is not None

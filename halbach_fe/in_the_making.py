@@ -19,7 +19,7 @@ _NAME = re.compile(r"\..+~(?P<host>[^~]+)~(?P<process>\d+)~")
 
 def name_in_the_making(name: str) -> str:
     """How the name of something begins while this process is making it."""
-    return f".{name}~{socket.gethostname()}~{os.getpid()}~"
+    return f".{name}~{_here()}~{os.getpid()}~"
 
 
 def remove_left_behind(folder: Path) -> None:
@@ -27,11 +27,18 @@ def remove_left_behind(folder: Path) -> None:
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             match = _NAME.match(path.name)
-            if match and match["host"] == socket.gethostname() and not _runs(int(match["process"])):
+            if match and match["host"] == _here() and not _runs(int(match["process"])):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:
                     path.unlink(missing_ok=True)
+
+
+def _here() -> str:
+    """The machine, and the name space of its process numbers: a container has its own."""
+    with contextlib.suppress(OSError):
+        return f"{socket.gethostname()}-{os.stat('/proc/self/ns/pid').st_ino}"
+    return socket.gethostname()
 
 
 def _runs(process: int) -> bool:

@@ -11,6 +11,7 @@ One more solve, of the nominal array at once, is compared with the sum of the co
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ import xarray as xr
 from halbach_fe import foreign
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.discretization import error_workshop, reading_errors
-from halbach_fe.errors import GetDPError
+from halbach_fe.errors import GetDPError, OutputError
 from halbach_fe.exact_field import unit_fields
 from halbach_fe.external import external_field
 from halbach_fe.field_map import atomic, write_hdf5
@@ -61,8 +62,7 @@ class StoredMatrix:
     def of(cls, parts: Iterable[Floats], shape: tuple[int, int], path: Path) -> StoredMatrix:
         """Write a matrix of its rows, parts (k, m)."""
         with atomic(path) as temporary, temporary.open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, {
-                "descr": "<f8", "fortran_order": False, "shape": shape})
+            file.write(_npy_header(shape))
             for part in parts:
                 file.write(np.ascontiguousarray(part, "<f8").data)
         return cls(path, shape)
@@ -70,20 +70,33 @@ class StoredMatrix:
     @classmethod
     def at(cls, path: Path, shape: tuple[int, int]) -> StoredMatrix:
         """One that was written before; ValueError if it is damaged, or another."""
-        there = foreign.mapped(path)
-        if there.shape != shape or there.dtype != "<f8":
-            raise ValueError(f"{path} is not a matrix {shape}")
+        header = _npy_header(shape)
+        with path.open("rb") as file:
+            if file.read(len(header)) != header or (
+                    path.stat().st_size != len(header) + 8 * shape[0] * shape[1]):
+                raise ValueError(f"{path} is not a matrix {shape}")
         return cls(path, shape)
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def __getitem__(self, rows: Rows) -> Floats:
-        # mapped anew: pages that were read are not kept
-        return np.array(np.load(self.path, mmap_mode="r")[rows])
+        try:  # mapped anew: pages that were read are not kept
+            return np.array(np.memmap(self.path, "<f8", "r", len(_npy_header(self.shape)),
+                                      self.shape)[rows])
+        except OSError as error:
+            raise OutputError(f"Cannot read {self.path} again: {error.strerror}. Give every study "
+                              "an output folder of its own.") from None
 
     def __matmul__(self, vector: Floats) -> Floats:
         return np.concatenate([self[part] @ vector for part in parts_of(*self.shape)])
+
+
+def _npy_header(shape: tuple[int, int]) -> bytes:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {
+        "descr": "<f8", "fortran_order": False, "shape": shape})
+    return header.getvalue()
 
 
 @dataclass(frozen=True)

@@ -260,6 +260,8 @@ def _resume(path: Path, key: str, runs: list[_Run]) -> int:
         generators = [np.random.default_rng() for _ in runs]
         for generator, words in zip(generators, json.loads(state.attrs["generators"]), strict=True):
             generator.bit_generator.state = words
+    except MemoryError:
+        raise
     except Exception:  # what is damaged, in whatever way, is as good as nothing
         return 0
     for number, run in enumerate(runs):

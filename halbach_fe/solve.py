@@ -342,6 +342,7 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
     """Run GetDP for every task, ``workshop.jobs`` at a time; the first failure ends them all."""
     counter = _Counter(sum(task.solves for task in tasks), workshop.progress)
     cancel = threading.Event()
+    stored: list[bool] = []
 
     def run(task: Task) -> Floats:
         with _run_folder(workshop.folder, task.name, cancel) as folder:
@@ -363,7 +364,7 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
                 raise _with_history(error, newton_residuals(history)) from None
             result = task.read(folder)
             if kept is not None:
-                kept.store()  # what was read and found sound
+                stored.append(kept.store())  # what was read and found sound
             for name in job.large:  # and not needed to run the folder by hand
                 (folder / name).unlink()
             return result
@@ -380,7 +381,7 @@ def run_tasks(tasks: Sequence[Task], workshop: Workshop) -> list[Floats]:
             cancel.set()  # on failure and on Ctrl-C nobody waits for the others
             for future in futures:
                 future.cancel()
-            if workshop.cache is not None:
+            if workshop.cache is not None and any(stored):
                 workshop.cache.trim()
 
 

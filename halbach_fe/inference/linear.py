@@ -227,13 +227,13 @@ def _by_product(parts: Iterable[Floats], columns: int, root: Floats | Root) -> I
 def _by_rows(parts: Iterable[Floats]) -> Information:
     waiting: list[Floats] = []
     rows, rest, left_out = 0, 0.0, 0.0
-    limit: float = np.inf
+    limit = 0
     for part in parts:
         waiting.append(part)
         rows += len(part)
         columns = part.shape[1]
         enough = max(columns, READINGS_AT_ONCE)
-        limit = min(limit, enough, max(1, NUMBERS_HELD // columns))
+        limit = max(limit, min(enough, max(1, NUMBERS_HELD // columns)))
         if rows <= limit:
             continue
         held = np.vstack(waiting)
@@ -259,8 +259,9 @@ def _compressed(held: Floats) -> tuple[Floats, tuple[float, float]]:
     squares, vectors = linalg.eigh(held[:, :-1] @ held[:, :-1].T)
     kept = squares > NEGLIGIBLE**2
     gone = vectors[:, ~kept].T @ held[:, -1]
+    rounding = np.finfo(float).eps * squares.max(initial=0)  # small ones are known to that
     return vectors[:, kept].T @ held, (float(gone @ gone), float(
-        np.maximum(squares[~kept], 0).sum()))
+        np.maximum(squares[~kept], rounding).sum()))
 
 
 def predict(matrix: Rows, parameters: Gaussian) -> tuple[Floats, Floats]:

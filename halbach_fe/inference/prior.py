@@ -57,12 +57,17 @@ class Root:
     def variances(self, matrix: Floats | sparse.csr_array | None = None) -> Floats:
         """Sums of squares of the rows of a matrix (n, m) times L, (n,); without one those of L.
 
-        To 1e-15 of what they were by the outer root.
+        Those of a sparse matrix, or of L itself, to 1e-15 of what they were by the outer root.
         """
         seen = self.outer if matrix is None else matrix @ self.outer
         along = np.asarray(seen @ self.directions)
         rows, columns = self.directions.shape
-        across = 0.0 if columns == rows else np.maximum(0, _squares(seen) - _squares(along))
+        if columns == rows:
+            across: Floats | float = 0.0
+        elif isinstance(seen, np.ndarray):
+            across = _squares(seen - along @ self.directions.T)
+        else:  # as many as parameters: the difference would be an array of all pairs of them
+            across = np.maximum(0, _squares(seen) - _squares(along))
         return np.asarray(across + _squares(along * self.left))
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Floats:

@@ -9,19 +9,17 @@ independent, and --jobs of them run at a time::
 from __future__ import annotations
 
 import argparse
-import atexit
 import itertools
 import json
 import os
-import shutil
 import sys
-import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -285,21 +283,23 @@ def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
     return rows
 
 
-_known: dict[int, tuple[Workshop, Solver]] = {}
-"""Of each thread of a worker: where it works, and what it solved for other cases."""
+_known: dict[int, tuple[TemporaryDirectory[str], Workshop, Solver]] = {}
+"""Of each thread of a process: where it works, and what it solved for other cases. (On a worker of
+a scheduler, where this file comes with every case, for one case only.)"""
 
 
 def run_one(
-    study: Study, case: Case, getdp: str | None, time_limit_s: float, cache: Cache | None
+    study: Study, case: Case, getdp: str | None, time_limit_s: float, processes: int,
+    cache: Cache | None,
 ) -> dict[str, Any]:
     """Run a case, on any machine; return what came of it, or why nothing did as ``failure``."""
     try:
         if threading.get_ident() not in _known:
-            folder = Path(tempfile.mkdtemp(prefix="halbach-fe-"))
-            atexit.register(shutil.rmtree, folder, ignore_errors=True)
-            workshop = Workshop(find_getdp(getdp), folder, time_limit_s=time_limit_s, cache=cache)
-            _known[threading.get_ident()] = workshop, remembering(workshop)
-        return run_case(study, case, *_known[threading.get_ident()])
+            folder = TemporaryDirectory(prefix="halbach-fe-")
+            workshop = Workshop(find_getdp(getdp), Path(folder.name), time_limit_s=time_limit_s,
+                                cache=cache, processes=processes)
+            _known[threading.get_ident()] = folder, workshop, remembering(workshop)
+        return run_case(study, case, *_known[threading.get_ident()][1:])
     except HalbachError as error:
         return {"failure": str(error)}
 
@@ -312,10 +312,11 @@ def run(arguments: argparse.Namespace) -> int:
         chosen = [one for one in chosen if one.seed in arguments.only]
     paths = {case: arguments.output / "cases" / f"{case.name}.json" for case in chosen}
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the cases share the cores
-    cache = common.cache(arguments)
+    cache = None if arguments.scheduler else common.cache(arguments)  # a folder of this machine
     with common.workers(arguments) as pool:
         waiting = {pool.submit(
-            run_one, study, case, arguments.getdp, arguments.time_limit, cache): case
+            run_one, study, case, arguments.getdp, arguments.time_limit, arguments.mpi,
+            cache): case
                    for case, path in paths.items() if not path.exists()}
         for number, future in enumerate(as_completed(waiting), start=1):
             case, found = waiting[future], future.result()

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
+import signal
+import subprocess
 import sys
 
 import numpy as np
+import psutil
 import pytest
 
 from benchmarks.recovery import (
@@ -16,6 +20,7 @@ from benchmarks.recovery import (
     undisturbed,
     unreadable,
 )
+from halbach_fe.errors import GetDPError, NotConvergedError, StudyError
 from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "studies" / "quadrupole"
@@ -50,6 +55,39 @@ def test_a_process_that_survives_is_seen(tmp_path):
     end = kill_and_run_again([sys.executable, "-c", ORPHANING], dict(os.environ), tmp_path,
                              tmp_path, moment_s=1.0)
     assert end.broken == ["sleep survives"]
+
+
+QUEUED = """
+import argparse, sys, time
+from halbach_fe.cli import common
+def run():
+    with common.workers(argparse.Namespace(scheduler=None, jobs=1)) as pool:
+        waiting = [pool.submit(time.sleep, 2) for _ in range(30)]
+        waiting[0].result()
+        print("one", flush=True)
+        return sum(one.result() is None for one in waiting)
+if __name__ == "__main__":
+    sys.exit(common.guarded(run))
+"""
+
+
+def test_what_waits_is_not_begun_after_an_interrupt(tmp_path):
+    script = tmp_path / "queued.py"
+    script.write_text(QUEUED)
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "one\n"
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=20)  # all of them would take a minute
+    assert (process.returncode, said.strip()) == (130, "interrupted")
+    assert not psutil.wait_procs(children, timeout=5)[1]
+
+
+def test_errors_travel_between_processes():
+    for one in (NotConvergedError("no", (1.0, 2.0)), GetDPError("no"), StudyError("no")):
+        there = pickle.loads(pickle.dumps(one))
+        assert (type(there), str(there), vars(there)) == (type(one), str(one), vars(one))
 
 
 def test_what_is_broken_is_seen(tmp_path):

@@ -246,3 +246,21 @@ def test_two_thousand_blocks(long_array, tmp_path):
     assert np.abs(stored["posterior"].sd - stored["prior"].sd).max() > 0.01 * update.prior.sd.max()
     write_report(update, tmp_path)
     assert Path(tmp_path / "report.html").stat().st_size < 15e6
+
+
+def test_exact_readings_of_many_parameters(generator):
+    """Noise of a millionth of the prior: what readings leave of their own prediction is theirs."""
+    parameters, readings = 120, 40
+    prior = Gaussian(np.zeros(parameters), Root(
+        sparse.eye_array(parameters, format="csr"), np.zeros((parameters, 0)), np.zeros(0)))
+    matrix = generator.standard_normal((readings, parameters))
+    noise = 1e-6
+    found = update(matrix, np.zeros(readings), independent(np.full(readings, noise)), prior)
+    np.testing.assert_allclose(found.distribution.sd_of(matrix), noise, rtol=1e-4)
+    # the control: squares subtracted from squares leave rounding
+    root = found.distribution.root
+    seen = matrix @ root.outer
+    along = seen @ root.directions
+    lost = np.sqrt(np.maximum(0, (seen**2).sum(1) - (along**2).sum(1)) + (
+        (along * root.left) ** 2).sum(1))
+    assert np.abs(lost / noise - 1).max() > 1e-3

@@ -76,5 +76,5 @@ def test_an_mpirun_that_is_none(dipole, workshop, tmp_path, monkeypatch):
 
 def test_no_mpirun(dipole, workshop, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(GetDPError, match=r"`mpirun` \(Debian: openmpi-bin\) could not be started"):
+    with pytest.raises(GetDPError, match=r"`mpirun` was not found \(Debian: openmpi-bin\)"):
         solve_nominal(dipole(), POINTS, replace(workshop, processes=2))

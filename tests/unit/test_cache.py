@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -155,6 +158,51 @@ def test_damage_is_seen_and_computed_again(coarse, shared, damage):
     assert len(runs) == 3
 
 
+def test_a_full_disk_is_no_damage(coarse, shared, monkeypatch):
+    """The entry stays; what cannot be written here is the run's own affair."""
+    workshop, runs = shared
+    first = solve_nominal(coarse(), POINTS, workshop)
+    kept = entries(workshop)
+
+    def full(source, target):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(module, "shutil", SimpleNamespace(copyfile=full, rmtree=shutil.rmtree))
+        assert np.array_equal(solve_nominal(coarse(), POINTS, workshop), first)
+    assert len(runs) == 4
+    assert sorted(entries(workshop)) == sorted(kept)
+
+
+def test_entries_that_cannot_be_changed_are_used(coarse, shared, monkeypatch):
+    """As on a disk that is read-only."""
+    workshop, runs = shared
+    first = solve_nominal(coarse(), POINTS, workshop)
+
+    def refused(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(module.os, "utime", refused)
+    assert np.array_equal(solve_nominal(coarse(), POINTS, workshop), first)
+    assert len(runs) == 2
+
+
+def test_what_is_no_entry_stays(coarse, shared):
+    """Whoever names a wrong folder loses nothing."""
+    workshop, _ = shared
+    solve_nominal(coarse(), POINTS, workshop)
+    folder = workshop.cache.folder
+    (folder / "ff").mkdir(exist_ok=True)
+    (folder / "ff" / "letters.txt").write_text("dear")
+    (folder / "ee").rmdir() if (folder / "ee").exists() else None
+    (folder / "ee").write_text("a file")
+    replace(workshop.cache, limit_bytes=0.0).trim()
+    workshop.cache.clear()
+    assert entries(workshop) == []
+    assert (folder / "ff" / "letters.txt").exists()
+    assert (folder / "ee").exists()
+
+
 def test_damage_that_hashes_would_not_show(coarse, shared):
     """The control: a wrong number with a right hash is found by the verification after it."""
     workshop, _ = shared
@@ -290,6 +338,10 @@ def test_the_environment_says_where_and_how_much(monkeypatch, tmp_path):
     assert default_cache().folder == tmp_path / "halbach-fe"
     monkeypatch.setenv(LIMIT_VARIABLE, "0")
     assert default_cache() is None
+    monkeypatch.setenv(LIMIT_VARIABLE, "1")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(module.os.path, "expanduser", lambda path: path)
+    assert default_cache() is None  # without a home
     for wrong in ("much", "-1", "nan", ""):
         monkeypatch.setenv(LIMIT_VARIABLE, wrong)
         with pytest.raises(OutputError, match="must be the size of the cache in GiB"):
@@ -317,4 +369,4 @@ def test_the_verb(coarse, shared, monkeypatch, capsys):
     assert [path for path in workshop.cache.folder.rglob("*") if path.is_file()] == []
     monkeypatch.setenv(LIMIT_VARIABLE, "0")
     assert main(["cache", "ls"]) == 0
-    assert "limit is 0" in capsys.readouterr().err
+    assert "its limit is 0" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from halbach_fe.getdp import (
     GetDP,
     Job,
     _check_log,
+    _tether,
     declared_constants,
     find_getdp,
     read_vectors,
@@ -69,6 +70,35 @@ def test_a_run_leaves_nothing_else(getdp, staged):
     run(getdp, job, folder)
     left = {path.name for path in folder.iterdir()} - before
     assert left == {FLUX_DENSITY_FILE, SOLUTIONS_FILE, "getdp.log", "magnetostatics_2d.pre"}
+
+
+@pytest.mark.parametrize("other", ["exit 1", ""])
+def test_a_setpriv_that_cannot_is_left_out(getdp, staged, tmp_path, monkeypatch, other):
+    """BusyBox's and old ones know no --pdeathsig; elsewhere there is none."""
+    folder, job = staged
+    path = tmp_path / "bin"
+    path.mkdir()
+    if other:
+        (path / "setpriv").write_text(f"#!/bin/sh\n{other}\n")
+        (path / "setpriv").chmod(0o755)
+    monkeypatch.setenv("PATH", str(path) + ("" if not other else os.pathsep + os.environ["PATH"]))
+    _tether.cache_clear()
+    try:
+        assert run(getdp, job, folder)
+        assert _tether() == []
+    finally:
+        _tether.cache_clear()
+
+
+def test_options_that_nobody_would_know_of_later_do_not_count(getdp, staged, monkeypatch):
+    folder, job = staged
+    monkeypatch.setenv("PETSC_OPTIONS", "-ksp_type nonsense")
+    assert run(getdp, job, folder)
+    monkeypatch.setenv("HOME", str(folder))
+    (folder / ".petscrc").write_text("-ksp_type nonsense\n")
+    assert run(getdp, job, folder)
+    with pytest.raises(GetDPError, match="Unknown type"):  # the control: such an option counts
+        run(getdp, dataclasses.replace(job, options=("-ksp_type", "nonsense")), folder)
 
 
 def test_runs_by_hand_without_options(getdp, staged):
