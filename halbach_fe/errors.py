@@ -132,6 +132,10 @@ EXIT_CODES: dict[int, str] = {
 }
 
 
+NO_BREAK_SPACES = "\u00a0\u202f"
+"""Before units; Python does not count them among what can be printed."""
+
+
 def printable(text: object, most: int) -> str:
     """What a terminal can print on one line without doing anything else; ? for other characters."""
     try:
@@ -139,7 +143,7 @@ def printable(text: object, most: int) -> str:
     except ValueError:  # Python does not print integers of more than 4300 digits
         line = "a number of thousands of digits"
     line = line if len(line) <= most else f"{line[:most]}..."
-    return "".join(c if c.isprintable() else "?" for c in line)
+    return "".join(c if c.isprintable() or c in NO_BREAK_SPACES else "?" for c in line)
 
 
 def must_be(what: str, where: str, expected: str, received: object, hint: str = "") -> str:

@@ -17,6 +17,7 @@ from benchmarks.recovery import unreadable
 from halbach_fe.blocks import blocks_of
 from halbach_fe.cache import LIMIT_VARIABLE
 from halbach_fe.cli import main, parser
+from halbach_fe.cli.common import print_table
 from halbach_fe.errors import EXIT_CODES
 from halbach_fe.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.study import MU_0, Study, read_study
@@ -480,3 +481,11 @@ def test_a_bug_is_called_a_bug(study, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("halbach_fe.cli.solve.points_from", lambda _: 1 / 0)
     assert main(["solve", str(study), "-o", str(tmp_path / "out")]) == 1
     assert "please report it" in capsys.readouterr().err
+
+
+def test_tables_show_units_and_nothing_else_odd(capsys):
+    """No-break spaces stay; what a terminal would obey does not."""
+    print_table([{"what": "99.7\u202f%", "found": "a\u00a0b\x1b[31m"}])
+    shown = capsys.readouterr().out
+    assert "99.7\u202f%" in shown
+    assert "a\u00a0b?[31m" in shown

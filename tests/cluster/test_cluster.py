@@ -120,11 +120,7 @@ def test_work_of_a_lost_worker_is_done_again(grid, cluster, workshop, dipole, tm
     there = replace(workshop, folder=tmp_path / "there", run=cluster.run)
     thread = threading.Thread(target=lambda: found.append(solve_nominal(study, POINTS, there)))
     thread.start()
-    deadline = time.monotonic() + 60
-    while not children_of(doomed.pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    (child,) = children_of(doomed.pid)
+    child = run_of(doomed)
     doomed.send_signal(signal.SIGKILL)
     doomed.wait()
     assert not found
@@ -134,13 +130,16 @@ def test_work_of_a_lost_worker_is_done_again(grid, cluster, workshop, dipole, tm
     assert np.array_equal(found[0], alone)
 
 
-def children_of(pid):
-    """Runs of GetDP that a process has started; asking for the version is none."""
-    found = []
-    for child in psutil.Process(pid).children():
-        with suppress(psutil.Error):  # it has just ended
-            found += [child] * ("-solve" in child.cmdline())
-    return found
+def run_of(worker):
+    """The run of GetDP that a worker starts; asking for the version is none."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        for child in psutil.Process(worker.pid).children():
+            with suppress(psutil.Error):  # it has just ended
+                if "-solve" in child.cmdline():
+                    return child
+        time.sleep(0.02)
+    raise AssertionError("no run was started")
 
 
 def test_what_nobody_waits_for_ends(grid, cluster, workshop, dipole, tmp_path):
@@ -162,11 +161,7 @@ def test_what_nobody_waits_for_ends(grid, cluster, workshop, dipole, tmp_path):
 
     thread = threading.Thread(target=solve)
     thread.start()
-    deadline = time.monotonic() + 60
-    while not children_of(worker.pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    (child,) = children_of(worker.pid)
+    child = run_of(worker)
     cancel.set()
     thread.join(timeout=30)
     assert "cancelled" in errors[0]
