@@ -7,6 +7,7 @@ import io
 import os
 import signal
 import traceback
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -95,7 +96,8 @@ def refusal(reader: Reader, content: bytes, folder: Path) -> str:
 
 
 def _check_sentence(sentence: str, reader: Reader) -> None:
-    if not sentence.isprintable():
+    kinds = {unicodedata.category(character) for character in sentence}
+    if kinds & {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}:  # spaces (Zs) do nothing to a terminal
         raise BrokenError("its sentence has control characters", repr(sentence))
     if not 20 <= len(sentence) <= MAX_SENTENCE + len("..."):
         raise BrokenError(f"its sentence is too {'long' if len(sentence) > 20 else 'short'}",

@@ -97,10 +97,13 @@ def wrong_error(path):
     raise GetDPError(f"Input content of {path} must be something else entirely.")
 
 
-def escapes(path):
-    error = MeasurementError("x")
-    error.args = (f"Input \x1b[31mred\x1b[0m of {path} must be none.",)
-    raise error
+def says(character):
+    """Past `errors.printable`."""
+    def read(path):
+        error = MeasurementError("x")
+        error.args = (f"Input {character}[31m red of {path} must be none.",)
+        raise error
+    return read
 
 
 def warns(path):
@@ -113,7 +116,8 @@ def warns(path):
     (key_error, "KeyError"), (writes, "it writes"), (writes_above, "it writes"),
     (changes, "it writes"), (hangs, "TimeoutError"), (wrong_error, "GetDPError"),
     (lambda path: sys.stdout.write("hello") and None, "it prints"), (warns, "UserWarning"),
-    (escapes, "control"),
+    *((says(character), "control") for character in ("\x1b", "\u2028", "\u202e", "\ud800")),
+    (says("\u00a0"), None),
     (refuses("Input content must be a map; instead received none."), "does not name the file"),
     (refuses(""), "too short"), (lambda path: "not valid", "IndexError"),
     (lambda path: None, None)])
