@@ -14,7 +14,7 @@ import numpy as np
 from halbach_fe.analytic import ideal_sectors, layered_bore_field
 from halbach_fe.cli import common
 from halbach_fe.errors import CheckFailedError, GetDPNotFoundError
-from halbach_fe.getdp import GetDP, find_getdp
+from halbach_fe.getdp import GetDP, blas_of, find_getdp
 from halbach_fe.routes import solve_nominal
 from halbach_fe.solve import Workshop
 from halbach_fe.study import parse_study
@@ -23,6 +23,9 @@ PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "h5netcdf", "xarray", "p
             "matplotlib", "arviz", "rich")
 TOLERANCE = {"direct": 5e-3, "reaction": 5e-4}
 """Of the bore field, on the coarse mesh used here: measured 1.5e-3 and 2e-5, times some safety."""
+
+REFERENCE_BLAS = "blas"
+"""Debian's folder of it; others are in openblas-pthread, blis-openmp and so on."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,11 +46,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise
     findings |= {"getdp": f"{getdp.version} ({getdp.executable})", "petsc": getdp.petsc,
                  "getdp build": " ".join(getdp.build_options)}
+    blas = blas_of(getdp)
+    findings |= {} if blas is None else {"getdp's BLAS": str(blas)}
     errors = {method: solve_error(getdp, method) for method in TOLERANCE}
     findings |= {f"2D {method} solve, error": f"{error:.1e} of the bore field"
                  for method, error in errors.items()}
     extra = {"errors": errors, "tolerances": TOLERANCE} if arguments.json else {}
     _show(findings | extra, arguments.json)
+    if blas is not None and blas.parent.name == REFERENCE_BLAS:
+        common.say("warning: GetDP takes the reference BLAS, by which it factorizes 3D meshes five "
+                   "to eight times slower than by OpenBLAS (Debian, Ubuntu: `apt-get install "
+                   "libopenblas0-pthread`).")
     for method, error in errors.items():
         if not error <= TOLERANCE[method]:
             raise CheckFailedError(

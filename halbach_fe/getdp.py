@@ -71,8 +71,8 @@ _TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1
              "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"}
 """For `mpirun`: containers have no other user than root, and who asks knows the cores."""
 
-_INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp`), or name it with --getdp or "
-            f"{ENVIRONMENT_VARIABLE}.")
+_INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp libopenblas0-pthread`), or name it "
+            f"with --getdp or {ENVIRONMENT_VARIABLE}.")
 _COLOURS = re.compile(r"\x1b\[\d*m")
 _NAMED_FAILURES = (  # pattern in the log, what it means
     (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
@@ -180,6 +180,17 @@ def find_getdp(named: str | Path | None = None) -> GetDP:
     return GetDP(executable=Path(found).resolve(), version=said["Version"],
                  build_options=tuple(said.get("Build options", "").split()),
                  petsc=said.get("PETSc version", ""))
+
+
+def blas_of(getdp: GetDP) -> Path | None:
+    """The system's BLAS that a GetDP loads; None if it has one of its own, or nobody tells."""
+    try:
+        answer = subprocess.run(["ldd", str(getdp.executable)], capture_output=True, text=True,
+                                timeout=30, errors="replace", check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    found = re.search(r"^\s*libblas\S* => (/\S+)", answer.stdout, re.MULTILINE)
+    return Path(found[1]).resolve() if found else None
 
 
 def run(

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from halbach_fe.cli import main, parser
 from halbach_fe.cli.common import print_table
 from halbach_fe.errors import EXIT_CODES
 from halbach_fe.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.getdp import blas_of
 from halbach_fe.study import MU_0, Study, read_study
 from tests.conftest import ROOT, circle
 
@@ -216,6 +220,19 @@ def test_doctor_can_fail(monkeypatch, capsys):
     monkeypatch.setattr("halbach_fe.cli.doctor.TOLERANCE", {"reaction": 1e-9})
     assert main(["doctor"]) == 9
     assert "differs from the closed form" in capsys.readouterr().err
+
+
+def test_doctor_names_a_slow_blas(getdp, tmp_path, monkeypatch, capsys):
+    """Debian's reference BLAS is one in a folder `blas`."""
+    own = blas_of(getdp)
+    assert own is not None
+    for name, warned in (("fast", False), ("blas", True)):
+        (tmp_path / name).mkdir()
+        shutil.copy(own, tmp_path / name / "libblas.so.3")
+        monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path / name))
+        assert main(["doctor"]) == 0
+        assert ("reference BLAS" in capsys.readouterr().err) == warned
+    assert blas_of(replace(getdp, executable=Path(__file__))) is None
 
 
 def test_module_and_version_run():
