@@ -7,6 +7,7 @@ same version and build of it. What a lost worker was doing is done again by anot
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import threading
 import time
@@ -78,15 +79,21 @@ class Cluster:
     ) -> list[str]:
         """Run a job like `halbach_fe.getdp.run`, on some worker; lines come when it has ended."""
         given = {path.name: path.read_bytes() for path in folder.iterdir()}
-        future = self.client.submit(_answer, getdp, job, given, str(folder), pure=False)
         try:
-            while not future.done():
-                if cancel is not None and cancel.is_set():
-                    raise GetDPError("A run of GetDP was cancelled.")
-                time.sleep(POLL_S)
-            answer: Answer = self._result(future)
-        finally:
-            future.cancel()
+            future = self.client.submit(_answer, getdp, job, given, str(folder), pure=False)
+            try:
+                while not future.done():
+                    if cancel is not None and cancel.is_set():
+                        raise GetDPError("A run of GetDP was cancelled.")
+                    time.sleep(POLL_S)
+                answer: Answer = future.result()
+            finally:
+                with contextlib.suppress(Exception):  # the scheduler may be gone, and all with it
+                    future.cancel()
+        except HalbachError:
+            raise
+        except Exception as error:  # of Dask's own, by many names
+            raise _failed(self.address, error) from None
         for name, content in answer.files.items():
             (folder / name).write_bytes(content)
         if on_line is not None:
@@ -95,14 +102,6 @@ class Cluster:
         if answer.failure:
             raise GetDPError(answer.failure)
         return answer.lines
-
-    def _result(self, future: Any) -> Answer:
-        try:
-            return future.result()
-        except HalbachError:
-            raise
-        except Exception as error:  # of Dask's own, by many names
-            raise _failed(self.address, error) from None
 
 
 @contextmanager

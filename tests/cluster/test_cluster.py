@@ -19,7 +19,7 @@ import pytest
 import xarray as xr
 
 from halbach_fe.cli import main
-from halbach_fe.cluster import connected
+from halbach_fe.cluster import Cluster, connected
 from halbach_fe.errors import ExtraMissingError, GetDPError, SchedulerError
 from halbach_fe.field_map import write_hdf5
 from halbach_fe.getdp import ENVIRONMENT_VARIABLE
@@ -234,6 +234,31 @@ def test_a_scheduler_that_ends(grid, cluster, workshop, dipole):
 
     with pytest.raises(SchedulerError, match=r"Dask scheduler .* failed"):
         solve_nominal(dipole(), POINTS, replace(workshop, jobs=1, run=ending))
+    cluster.client.close()
+    with pytest.raises(SchedulerError, match="closed"):
+        solve_nominal(dipole(), POINTS, replace(workshop, jobs=1, run=cluster.run))
+
+
+class Lost:
+    """A client, and its own future, after Dask has given up, which takes it 20 s."""
+
+    def submit(self, *rest, **options):
+        return self
+
+    def done(self):
+        return True
+
+    def result(self):
+        raise RuntimeError("first reason")
+
+    def cancel(self):
+        raise RuntimeError("nobody to tell")
+
+
+def test_a_client_that_has_given_up(dipole, workshop):
+    lost = Cluster(Lost(), "tcp://nowhere:8786")
+    with pytest.raises(SchedulerError, match="first reason"):
+        solve_nominal(dipole(), POINTS, replace(workshop, run=lost.run))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "tcp://127.0.0.1:no"])
