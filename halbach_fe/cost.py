@@ -5,7 +5,7 @@ place of solved. Meshes are counted too: the half-plane's is a grid, and the sta
 from the number of its plane triangles (`halbach_fe.geo.plane_size`), of which there are few.
 
 What one GetDP process takes is a law of its unknowns, see `Law`. Measured with GetDP 3.2, MUMPS
-and reference BLAS, one thread; seconds are in units of a factorization that is timed anew.
+and OpenBLAS, one thread; seconds are in units of a factorization that is timed anew.
 """
 
 from __future__ import annotations

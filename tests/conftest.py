@@ -55,13 +55,13 @@ def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
     return result
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def dipole() -> StudyMaker:
     """Make the 2D dipole study, with changes."""
     return lambda **changes: parse_study(changed(DIPOLE, **changes))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def short_dipole() -> StudyMaker:
     """Make a 3D dipole of two rings, with changes."""
     base = changed(DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,

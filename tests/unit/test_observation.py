@@ -136,33 +136,34 @@ def test_noise_by_component(dipole):
         noise(regions[:3])
 
 
-def displaced(study, observation, sd, generator, count=1500):
-    """Readings (count, readings) of the blocks with every point moved at random."""
-    points = observation.points
-    moved = points + sd * generator.standard_normal((count, *points.shape))
-    fields = field_of(blocks_of(study), moved.reshape(-1, 3), order=4).reshape(moved.shape)
-    return observation.apply(fields)
+NEAR_END = circle(0.075, 12, 0.07)
+POSITION_SD = (3e-4, 1e-5, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def displaced(short_dipole):
+    """B (1500, 12, 3) of the blocks at points that are each moved at random."""
+    moved = NEAR_END + POSITION_SD * np.random.default_rng(2).standard_normal((1500, 12, 3))
+    return field_of(blocks_of(short_dipole()), moved.reshape(-1, 3), order=4).reshape(moved.shape)
 
 
 @pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
 @pytest.mark.parametrize("from_map", [True, False])
-def test_noise_of_positions(short_dipole, generator, quantity, from_map):
+def test_noise_of_positions(short_dipole, displaced, generator, quantity, from_map):
     """Against the exact field at displaced points near the magnet's end; 1500 draws know a
     covariance over the two sd's to 3.7 %, 5 sigma. (The field's curvature adds far less.)
     Components of one point taken as independent are told apart, and so is another axis.
     """
-    sd = np.array([3e-4, 1e-5, 1e-4])
-    points = circle(0.075, 12, 0.07)
     changes = {"noise": {"regions": [{"name": "all", "sigma_T": 1e-5}],
-                         "position_sd_m": sd.tolist()}}
+                         "position_sd_m": POSITION_SD}}
     if quantity == "fourier_coefficients":
         changes["observation"] = FOURIER
     study = short_dipole(**changes)
-    observation = observe(study, points, np.ones((12, 3), bool))
+    observation = observe(study, NEAR_END, np.ones((12, 3), bool))
     sigma = np.full((12, 3), 2e-5)
-    data = field_map(points, np.ones((12, 3)), sigma if from_map else None)
+    data = field_map(NEAR_END, np.ones((12, 3)), sigma if from_map else None)
     noise = reading_noise(study, observation, data)
-    draws = displaced(study, observation, sd, generator)
+    draws = observation.apply(displaced)
     own = (observation.apply(2e-5 * generator.standard_normal((1500, 12, 3))) if from_map
            else 1e-5 * generator.standard_normal(draws.shape))
     scale = np.outer(noise.sd, noise.sd)
@@ -171,7 +172,7 @@ def test_noise_of_positions(short_dipole, generator, quantity, from_map):
     assert not noise.independent
     assert np.abs(np.eye(len(scale)) - covariance).max() > 0.5
     turned = short_dipole(**changes | {"noise": changes["noise"] | {
-        "position_sd_m": np.roll(sd, 1).tolist()}})
+        "position_sd_m": POSITION_SD[-1:] + POSITION_SD[:-1]}})
     other = reading_noise(turned, observation, data).covariance.toarray()
     assert np.abs(other / scale - covariance).max() > 0.3
 
