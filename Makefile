@@ -64,7 +64,7 @@ fuzz: setup-test
 benchmark: setup-test
 	.venv/bin/python -m benchmarks.run
 
-# How time and memory grow, up to 10 240 blocks and a million readings: half an hour.
+# How time and memory grow, up to 10 240 blocks and a million readings: a quarter of an hour.
 benchmark-scaling: setup-test
 	.venv/bin/python -m benchmarks.run scaling
 
