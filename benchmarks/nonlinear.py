@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe import getdp as runner
-from halbach_fe.campaign.bodies import law_of
+from halbach_fe.campaign.bodies import Froehlich, law_of
 from halbach_fe.cli import common
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.getdp import find_getdp
@@ -76,7 +76,9 @@ def faser(note: Note) -> None:
              "peak of this process and of two of GetDP's")
     main_field = float(np.abs(exact_part(study, points) + part).max())
     common.say("the same by NGSolve")
+    assert study.iron_ring is not None
     dipole, iron = dipole_of(study), law_of(study.iron_ring)
+    assert isinstance(iron, Froehlich)
     with ngsolve.TaskManager():
         mesh = ngsolve_model.eighth(dipole, 0.02, bore_size=0.04, far=3.0, grading=0.35)
         theirs = ngsolve_nonlinear.potential_reaction(dipole, iron, mesh, 3, points)
