@@ -27,7 +27,15 @@ if command -v dpkg >/dev/null 2>&1; then
     done
     # without another BLAS Debian's GetDP gets the reference one, and factorizes 5 to 8 times slower
     case "$missing $(readlink -f /usr/lib/*/libblas.so.3)" in
-        *getdp* | */blas/libblas.so*) missing="$missing libopenblas0-pthread" ;;
+        *getdp* | */blas/libblas.so*)
+            faster=libopenblas0-pthread
+            if [ -n "$missing" ]; then
+                missing="$missing $faster"
+            elif [ ! -e .venv ]; then  # nothing needs it: try once
+                { [ "$(id -u)" -eq 0 ] && apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
+                    apt-get install -y -qq --no-install-recommends "$faster"; } >/dev/null 2>&1 ||
+                    echo "3D would be faster with: apt-get install $faster" >&2
+            fi ;;
     esac
 fi
 if [ -n "$missing" ]; then
