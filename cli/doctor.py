@@ -47,15 +47,15 @@ def run(arguments: argparse.Namespace) -> int:
     findings |= {"getdp": f"{getdp.version} ({getdp.executable})", "petsc": getdp.petsc,
                  "getdp build": " ".join(getdp.build_options)}
     blas = blas_of(getdp)
-    findings |= {} if blas is None else {"getdp's BLAS": str(blas)}
+    findings |= {} if blas is None else {"getdp blas": str(blas)}
     errors = {method: solve_error(getdp, method) for method in TOLERANCE}
     findings |= {f"2D {method} solve, error": f"{error:.1e} of the bore field"
                  for method, error in errors.items()}
     extra = {"errors": errors, "tolerances": TOLERANCE} if arguments.json else {}
     _show(findings | extra, arguments.json)
     if blas is not None and blas.parent.name == REFERENCE_BLAS:
-        common.say("warning: GetDP takes the reference BLAS, by which it factorizes 3D meshes five "
-                   "to eight times slower than by OpenBLAS (Debian, Ubuntu: `apt-get install "
+        common.say("warning: GetDP takes the reference BLAS, by which it factorizes 3D meshes four "
+                   "to five times slower than by OpenBLAS (Debian, Ubuntu: `apt-get install "
                    "libopenblas0-pthread`).")
     for method, error in errors.items():
         if not error <= TOLERANCE[method]:

@@ -25,7 +25,7 @@ if command -v dpkg >/dev/null 2>&1; then
         dpkg-query -W -f '${Status}\n' "$package" "${package}t64" 2>/dev/null |
             grep -q "install ok installed" || missing="$missing $package"
     done
-    # without another BLAS Debian's GetDP gets the reference one, and factorizes 5 to 8 times slower
+    # without another BLAS Debian's GetDP gets the reference one, and factorizes 4 to 5 times slower
     case "$missing $(readlink -f /usr/lib/*/libblas.so.3)" in
         *getdp* | */blas/libblas.so*)
             faster=libopenblas0-pthread

@@ -34,8 +34,8 @@ def test_a_few_cases(study, tmp_path):
     assert all(key in names[seed] for key, seed in FEW.items())
     shutil.copy(SCRIPT, tmp_path)  # of blocks in vacuum the mesh matters to few signatures only
     text = SCRIPT.with_name("study.toml").read_text()
-    (tmp_path / "study.toml").write_text(text.replace("block_size_m = 0.027",
-        "block_size_m = 0.06\nmeridian_size_m = 0.03"))
+    (tmp_path / "study.toml").write_text(text.replace(
+        "block_size_m = 0.027", "block_size_m = 0.06\nmeridian_size_m = 0.03"))
     # one at a time: what one case solves, the next one knows
     subprocess.run([sys.executable, SCRIPT.name, "-o", tmp_path, "--jobs", "1", "--only",
                     *map(str, FEW.values())], check=True, timeout=1800, cwd=tmp_path)
