@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from halbach_fe import pro
 from halbach_fe.blocks import (
     Floats,
     Ints,
@@ -257,7 +258,7 @@ def stage(
     ``span`` and ``sources`` are the first and last mode and source, ``printed`` the source that
     GetDP prints in the first mode.
     """
-    problem = resources.files("halbach_fe.pro").joinpath(PROBLEM).read_bytes()
+    problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", study=case.study, regions=case.mesh.regions,
                   points=case.places.tolist(), rings=_rings(case), solved=max(1, len(case.solved)))

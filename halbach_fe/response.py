@@ -15,7 +15,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ import xarray as xr
 
 from halbach_fe import foreign
 from halbach_fe.blocks import Floats, blocks_of
+from halbach_fe.code_digest import code_digest
 from halbach_fe.discretization import error_workshop, reading_errors
 from halbach_fe.errors import GetDPError, OutputError
 from halbach_fe.exact_field import unit_fields
@@ -242,22 +243,12 @@ def _key(study: Study, observation: Observation, workshop: Workshop) -> str:
         digest.update(np.array([curve.H, curve.B]).tobytes())
     versions = [metadata.version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]
     digest.update(f"{versions} {workshop.getdp.version} {workshop.getdp.petsc}".encode())
-    digest.update(code_digest())
+    digest.update(code_digest(__name__))
     digest.update(np.ascontiguousarray(observation.points).tobytes())
     operator = observation.operator.tocoo()
     for part in (*operator.coords, operator.data):
         digest.update(np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
-
-
-def code_digest() -> bytes:
-    """Digest of the program's own text: a changed formula makes what is stored another's."""
-    digest = hashlib.sha256()
-    for package in ("halbach_fe", "halbach_fe.inference", "halbach_fe.geo", "halbach_fe.pro"):
-        for source in sorted(resources.files(package).iterdir(), key=lambda path: path.name):
-            if source.name.endswith((".py", ".pro", ".j2")):
-                digest.update(source.read_bytes())
-    return digest.digest()
 
 
 def _write(path: Path, key: str, built: Response) -> None:

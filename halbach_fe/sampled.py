@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from halbach_fe import foreign
 from halbach_fe.blocks import Floats
+from halbach_fe.code_digest import code_digest
 from halbach_fe.errors import OutputError, SamplingError
 from halbach_fe.field_map import atomic
 from halbach_fe.inference.diagnostics import Diagnostics, diagnose, require_convergence
@@ -34,7 +35,6 @@ from halbach_fe.inference.sampling import (
     sample,
 )
 from halbach_fe.nonlinear import NonlinearModel, nonlinear_model, verify
-from halbach_fe.response import code_digest
 from halbach_fe.solve import Workshop
 from halbach_fe.update import Prediction, Update, write_text
 
@@ -212,7 +212,7 @@ class _Run:
 
 def _key(update: Update, model: NonlinearModel, chains: int, seed: int) -> str:
     """Digest of all that the chains depend on, but their length."""
-    digest = hashlib.sha256(f"{chains} {seed}".encode() + code_digest())
+    digest = hashlib.sha256(f"{chains} {seed}".encode() + code_digest(__name__))
     iron = model.condensed
     noise = update.noise.covariance
     for part in (update.readings, noise.data, noise.indices, noise.indptr, update.held_out,

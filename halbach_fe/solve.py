@@ -21,6 +21,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import getdp as runner
+from halbach_fe import pro
 from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.cache import Cache
 from halbach_fe.errors import GetDPError, NotConvergedError, OutputError, PointsOutsideError
@@ -398,7 +399,7 @@ def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
 
 def render(template: str, *, study: Study, **data: object) -> str:
     """The generated part of a problem, as GetDP text."""
-    source = resources.files("halbach_fe.pro").joinpath(template).read_text("utf-8")
+    source = resources.files(pro).joinpath(template).read_text("utf-8")
     environment = jinja2.Environment(
         variable_start_string="<<", variable_end_string=">>", block_start_string="<%",
         block_end_string="%>", comment_start_string="<#", comment_end_string="#>",
@@ -581,7 +582,7 @@ def stage(
     ``samples`` (k, blocks, 3) in A/m are magnetizations of the whole array; default the nominal.
     """
     for name in (formulation.problem, *PROBLEM_INCLUDES):
-        text = resources.files("halbach_fe.pro").joinpath(name).read_bytes()
+        text = resources.files(pro).joinpath(name).read_bytes()
         (folder / name).write_bytes(text)
     ranks = np.zeros(len(mesh.regions.blocks), int)
     ranks[list(blocks)] = np.arange(1, len(blocks) + 1)

@@ -12,7 +12,7 @@ FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
          for path in (ROOT / folder).rglob("*.py")]
 
 # Later rooms may import earlier ones, never the other way round.
-ORDER = ["errors", "in_the_making", "cells", "foreign", "analytic", "materials", "study",
+ORDER = ["code_digest", "errors", "in_the_making", "cells", "foreign", "analytic", "materials", "study",
          "study_file", "blocks", "symmetry", "extent", "regions", "exact_field", "external", "geo",
          "mesh", "field_map", "formats", "new_study", "instrument", "block_table", "getdp", "cache",
          "cluster", "solutions", "evaluation", "condensed", "inference", "measured_prior", "solve",
