@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from benchmarks.note import Note
-from halbach_fe.errors import StudyError
+from halbach_fe.core.errors import StudyError
 
 SUMMARY = Path(__file__).parent.parent / "results" / "diagnosis" / "summary.json"
 COUNTED = {

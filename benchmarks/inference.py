@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.note import Note
-from halbach_fe.blocks import blocks_of
 from halbach_fe.cli import common
-from halbach_fe.field_map import read_map
-from halbach_fe.getdp import find_getdp
-from halbach_fe.inference import linear
-from halbach_fe.inference.diagnostics import diagnose
-from halbach_fe.inference.noise import independent
-from halbach_fe.inference.prior import Gaussian, block_prior
-from halbach_fe.inference.sampling import Move, Posterior, prior_reference, sample
-from halbach_fe.nonlinear import nonlinear_model
-from halbach_fe.sampled import sample_posterior
-from halbach_fe.solve import Workshop
-from halbach_fe.study import read_study
-from halbach_fe.update import infer
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.mcmc import sample_posterior
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.response.nonlinear import nonlinear_model
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.session import Session
+from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats.convergence import assess_convergence
+from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.noise import independent
+from halbach_fe.stats.pcn import Posterior, Proposal, prior_reference, sample
+from halbach_fe.study.reader import read_study
 
 STUDIES = Path(__file__).parent.parent / "studies"
 REPEATS = 5
@@ -40,7 +40,7 @@ def posterior_time(note: Note) -> None:
     blocks = blocks_of(read_study(STUDIES / "faser" / "campaign.toml"))
     nominal = np.concatenate([block.magnetization for block in blocks])
     matrix = 1e-9 * generator.standard_normal((28_080, len(nominal)))
-    prior = block_prior(nominal, 3, 0.01, 1.0, 0.02)
+    prior = nominal_prior(nominal, 3, 0.01, 1.0, 0.02)
     sigma = np.full(len(matrix), 5e-5)
     readings = matrix @ prior.sample(1, generator)[0]
     times: list[tuple[float, float]] = []
@@ -49,7 +49,7 @@ def posterior_time(note: Note) -> None:
         whitened = matrix / sigma[:, None]
         whitened.T @ whitened
         middle = time.monotonic()
-        linear.update(matrix, readings, independent(sigma), prior)
+        linear_gaussian.update(matrix, readings, independent(sigma), prior)
         times.append((middle - started, time.monotonic() - middle))
     product, all_ = np.min(times, axis=0)
     note("inference.posterior_time_over_gram", all_ / product, "ratio",
@@ -66,7 +66,7 @@ def linear_errors(note: Note) -> None:
     truth = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1).ravel()
     with tempfile.TemporaryDirectory() as name:
         update = infer(study, field.assign(B_T=field["B_T"] + noise),
-                       Workshop(find_getdp(), Path(name), jobs=2))
+                       Session(find_getdp(), Path(name), jobs=2))
     z = (update.posterior.mean - truth) / update.posterior.sd
     note("inference.linear_z_rms", float(np.sqrt(np.mean(z**2))), "",
          f"{len(truth)} parameters from {len(update.readings)} readings of magpylib and NGSolve")
@@ -83,10 +83,10 @@ def nonlinear(note: Note) -> None:
     prior = Gaussian(nominal + mean, np.diag(sd.reshape(2, -1).T.ravel()))
     truth = np.loadtxt(folder / "truth-drawn.csv", delimiter=",", skiprows=1).ravel()
     with tempfile.TemporaryDirectory() as name:
-        workshop = Workshop(find_getdp(), Path(name), jobs=2)
+        session = Session(find_getdp(), Path(name), jobs=2)
         started = time.monotonic()
-        update = infer(study, read_map(folder / "map-drawn.csv"), workshop, prior=prior)
-        found = sample_posterior(update, workshop, DRAWS, say=common.say)
+        update = infer(study, read_map(folder / "map-drawn.csv"), session, prior=prior)
+        found = sample_posterior(update, session, DRAWS, say=common.say)
         note("inference.nonlinear_seconds", time.monotonic() - started, "s",
              f"all of it: 4 chains of {DRAWS} draws, {found.solves} solves")
         note("inference.nonlinear_z_rms", float(np.sqrt(np.mean(
@@ -95,14 +95,14 @@ def nonlinear(note: Note) -> None:
              "effective samples", "worst of 32 parameters")
         note("inference.nonlinear_max_rhat", float(found.diagnostics.r_hat.max()), "", "")
         model = nonlinear_model(study, update.observation, replace(
-            workshop, folder=workshop.folder / "pcn"), np.random.default_rng(1))
+            session, folder=session.folder / "pcn"), np.random.default_rng(1))
         target = Posterior(lambda p: model(p, 1e-7), update.readings,
                            update.noise.plus(model.error), prior)
         common.say(f"the paper's sampler, {PCN_STEPS} steps")
         generator = np.random.default_rng(2)
-        chain = sample(target, [Move(prior_reference(prior), PCN_STEP)], PCN_STEPS, generator,
+        chain = sample(target, [Proposal(prior_reference(prior), PCN_STEP)], PCN_STEPS, generator,
                        np.zeros(prior.root.shape[1]))
-        theirs = diagnose(chain.samples[None]).bulk.min() / PCN_STEPS
+        theirs = assess_convergence(chain.samples[None]).bulk.min() / PCN_STEPS
         note("inference.ess_per_solve_over_pcn",
              float(found.diagnostics.bulk.min()) / found.solves / theirs, "ratio",
              f"pCN with s = 1/80, {PCN_STEPS} steps from the prior's mean: "

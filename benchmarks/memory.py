@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from halbach_fe.getdp import GetDP
+from halbach_fe.solver.getdp import GetDP
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,23 @@ import numpy as np
 
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
-from halbach_fe import getdp as runner
-from halbach_fe.campaign.bodies import Froehlich, law_of
 from halbach_fe.cli import common
-from halbach_fe.discretization import error_workshop, reading_errors
-from halbach_fe.getdp import find_getdp
-from halbach_fe.inference.prior import block_prior
-from halbach_fe.mesh import build_mesh, verify_mesh
-from halbach_fe.nonlinear import newton_readings, nonlinear_model
-from halbach_fe.observation import observe, points_from
-from halbach_fe.routes import exact_part, finite_element_part
-from halbach_fe.solve import CROSS_SECTION, Workshop, newton_history, stage
-from halbach_fe.study import Study, read_study
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
+from halbach_fe.solver import getdp as runner
+from halbach_fe.solver.field import finite_element_part, vacuum_part
+from halbach_fe.solver.formulations import CROSS_SECTION
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.magnetostatics import fill_run_folder
+from halbach_fe.solver.mesh import build_mesh, verify_mesh
+from halbach_fe.solver.runs import newton_history
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import nominal_prior
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.bodies import FroehlichLaw, law_of
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
 
 STUDIES = Path(__file__).parent.parent / "studies"
@@ -46,7 +51,8 @@ def getdp_seconds(study: Study, samples: np.ndarray, folder: Path) -> float:
     """
     mesh = verify_mesh(build_mesh(study, folder))
     started = time.monotonic()
-    job = stage(study, mesh, np.array([[0.0123, 0.0321, 0.0]]), folder / "run", CROSS_SECTION,
+    job = fill_run_folder(study, mesh, np.array([[0.0123, 0.0321, 0.0]]), folder / "run",
+                          CROSS_SECTION,
                 samples=samples)
     runner.run(find_getdp(), replace(
         job, resolution="Newton", solutions=None, outputs=("newton_flux_density.txt",),
@@ -62,23 +68,23 @@ def faser(note: Note) -> None:
     common.say("FASER dipole in a tube that saturates, in 3D")
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
-        workshop = Workshop(scales.getdp, Path(name), jobs=2)
+        session = Session(scales.getdp, Path(name), jobs=2)
         started = time.monotonic()
-        parts = finite_element_part(study, points, workshop, columns=False)
+        parts = finite_element_part(study, points, session, columns=False)
         part = parts.nominal
         note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
-             f"Newton's method, {len(newton_history(workshop.folder)) - 1} steps")
+             f"Newton's method, {len(newton_history(session.folder)) - 1} steps")
         started = time.monotonic()
-        stated = reading_errors(study, observation, parts, error_workshop(workshop))
+        stated = reading_errors(study, observation, parts, error_bar_session(session))
         note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
              "the dual formulation, Newton's method again")
         note("nonlinear.faser_3d_memory_GiB", own_peak() + 2 * scales.peak, "GiB",
              "peak of this process and of two of GetDP's")
-    main_field = float(np.abs(exact_part(study, points) + part).max())
+    main_field = float(np.abs(vacuum_part(study, points) + part).max())
     common.say("the same by NGSolve")
     assert study.iron_ring is not None
     dipole, iron = dipole_of(study), law_of(study.iron_ring)
-    assert isinstance(iron, Froehlich)
+    assert isinstance(iron, FroehlichLaw)
     with ngsolve.TaskManager():
         mesh = ngsolve_model.eighth(dipole, 0.02, bore_size=0.04, far=3.0, grading=0.35)
         theirs = ngsolve_nonlinear.potential_reaction(dipole, iron, mesh, 3, points)
@@ -101,16 +107,16 @@ def run(note: Note) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "run").mkdir()
-        workshop = Workshop(find_getdp(), folder / "model", jobs=2)
+        session = Session(find_getdp(), folder / "model", jobs=2)
         common.say("condensed model of the cross-section")
         started = time.monotonic()
-        model = nonlinear_model(study, observation, workshop, generator)
+        model = nonlinear_model(study, observation, session, generator)
         note("nonlinear.build_seconds", time.monotonic() - started, "s",
              "error bars and verification included")
         unknowns = verify_mesh(build_mesh(study, folder)).inner.nodes
         note("nonlinear.unknowns", unknowns, "", f"of them {len(model.condensed.potential)} in "
              "the iron")
-        prior = block_prior(model.nominal, 2, 0.01, 1.0)
+        prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
         draws = prior.sample(MANY, generator)
         blocks = np.zeros((LOOPED + 1, len(model.nominal) // 2, 3))
         blocks[..., :2] = draws[:LOOPED + 1].reshape(LOOPED + 1, -1, 2)
@@ -144,7 +150,7 @@ def run(note: Note) -> None:
         worst = 0.0
         for part, cold in ((draws[:SAMPLES], False), (hard, True)):
             theirs = newton_readings(study, observation, replace(
-                workshop, folder=folder / "compared"), part, cold)
+                session, folder=folder / "compared"), part, cold)
             worst = max(worst, float(np.abs(model(part) - theirs).max()))
         note("nonlinear.engine_error_T", worst, "T", f"largest difference at {len(observation)} "
              f"readings of {SAMPLES} draws of the prior and {HARD} saturated ones, cold, to "

@@ -18,8 +18,8 @@ import psutil
 import xarray as xr
 
 from benchmarks.note import Note
-from halbach_fe.cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.cli import common
+from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 
 EXAMPLE = Path(__file__).parent.parent / "studies" / "quadrupole"
 ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}

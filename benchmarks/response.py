@@ -12,19 +12,21 @@ import numpy as np
 
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
-from halbach_fe import getdp as runner
-from halbach_fe.azimuthal import solve_modes
-from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.cli import common
-from halbach_fe.discretization import reading_errors, refined
-from halbach_fe.getdp import find_getdp
-from halbach_fe.inference.prior import block_prior
-from halbach_fe.observation import observe, points_from
-from halbach_fe.response import Response, response
-from halbach_fe.routes import exact_part, finite_element_part
-from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, parse_study, read_study
-from halbach_fe.verification import verify
+from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.discretization_error import reading_errors, refined
+from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.response.mesh_convergence import verify
+from halbach_fe.solver import getdp as runner
+from halbach_fe.solver.azimuthal_modes import solve_modes
+from halbach_fe.solver.field import finite_element_part, vacuum_part
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import nominal_prior
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import changed
 from tests.oracles import dipole_of
 from tests.oracles import ngsolve_model as oracle
@@ -35,19 +37,19 @@ COLUMNS_BY_PROCESS = 2
 ORACLE_POINTS = 13  # every 13th point of the map is compared with NGSolve
 
 
-def built(study: Study, points: np.ndarray, workshop: Workshop) -> tuple[Response, float]:
+def built(study: Study, points: np.ndarray, session: Session) -> tuple[Response, float]:
     """H from nothing, with permeability and iron, and the seconds it took."""
     observation = observe(study, points, np.ones_like(points, bool))
     started = time.monotonic()
-    found = response(study, observation, workshop)
+    found = response_matrix(study, observation, session)
     return found, time.monotonic() - started
 
 
 def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
     """The full array: by refinement, and against NGSolve's vector potential of high order."""
-    workshop = Workshop(find_getdp(), folder, jobs=2)
+    session = Session(find_getdp(), folder, jobs=2)
     common.say("error of the full array by refinement")
-    found = verify(study, workshop, common.say)
+    found = verify(study, session, common.say)
     note("response.error_pointwise", found.error_pointwise, "of the main field",
          "refinement and farther boundary, extrapolated")
     note("response.error_fourier", found.error_fourier or np.nan, "of the main field",
@@ -55,8 +57,8 @@ def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
     common.say("error of the full array against NGSolve")
     dipole = dipole_of(study)
     some = points[::ORACLE_POINTS]
-    ours = finite_element_part(study, some, workshop, columns=False).nominal
-    main_field = float(np.abs(exact_part(study, some) + ours).max())
+    ours = finite_element_part(study, some, session, columns=False).nominal
+    main_field = float(np.abs(vacuum_part(study, some) + ours).max())
     with ngsolve.TaskManager():
         theirs = oracle.vector_potential(dipole, oracle.eighth(dipole, 0.02), 4, some)
     note("response.error_against_ngsolve",
@@ -65,13 +67,13 @@ def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
 
 
 def matrix_error(
-    study: Study, points: np.ndarray, base: Response, workshop: Workshop
+    study: Study, points: np.ndarray, base: Response, session: Session
 ) -> float:
     """Largest change of predicted readings by a finer mesh, over 20 draws of magnetizations (1 %,
     1 degree), relative to the main field.
     """
-    finer, _ = built(refined(study, 4 / 3), points, workshop)
-    draws = block_prior(base.nominal, 3, 0.01, 1.0).sample(20, np.random.default_rng(1)).T
+    finer, _ = built(refined(study, 4 / 3), points, session)
+    draws = nominal_prior(base.nominal, 3, 0.01, 1.0).sample(20, np.random.default_rng(1)).T
     scale = np.abs(base.matrix @ base.nominal).max()
     return float(np.abs(finer.matrix @ draws - base.matrix @ draws).max() / scale)
 
@@ -130,7 +132,7 @@ def against_ngsolve(
     dipole = dipole_of(study)
     number = study.array.blocks_per_ring * (study.array.rings // 2 - 1) + 3
     block = blocks_of(study)[number]
-    ours = solve_modes(study, points, [number], Workshop(find_getdp(), folder, jobs=2))[1]
+    ours = solve_modes(study, points, [number], Session(find_getdp(), folder, jobs=2))[1]
     started = time.monotonic()
     mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     meshing = time.monotonic() - started
@@ -159,19 +161,19 @@ def symmetry(study: Study, folder: Path, note: Note) -> None:
                                 "z_min_m": -0.2, "z_max_m": 0.2, "count": 9})
     short = parse_study(document)
     points = points_from(short.observation.positions)
-    workshop = Workshop(find_getdp(), folder, jobs=2)
+    session = Session(find_getdp(), folder, jobs=2)
     fields, seconds = [], []
     for used in (True, False):
         started = time.monotonic()
         variant = parse_study(changed(document, solver__symmetry=used))
-        parts = finite_element_part(variant, points, workshop)
+        parts = finite_element_part(variant, points, session)
         fields.append(sum(parts.block(n, slice(None)) @ (np.array(b.easy_axis) * b.remanence)
                           for n, b in enumerate(blocks_of(short))))
         seconds.append(time.monotonic() - started)
     note("response.symmetry_speedup", seconds[1] / seconds[0], "ratio",
          f"all {3 * len(blocks_of(short))} columns of 2 rings on one 3D mesh, one by one")
     observation = observe(short, points, np.ones_like(points, bool))
-    stated = reading_errors(short, observation, parts, workshop).max()
+    stated = reading_errors(short, observation, parts, session).max()
     note("response.symmetry_difference", float(np.abs(fields[0] - fields[1]).max() / stated),
          "of the stated error", "the array's reaction, with and without symmetry")
 
@@ -184,7 +186,7 @@ def run(note: Note) -> None:
         folder = Path(name)
         common.say("response matrix from nothing")
         scales = Weighed.of(find_getdp(), folder)
-        base, seconds = built(study, points, Workshop(scales.getdp, folder / "response", jobs=2))
+        base, seconds = built(study, points, Session(scales.getdp, folder / "response", jobs=2))
         note("response.seconds", seconds, "s",
              f"{base.matrix.shape[1]} columns x {base.matrix.shape[0]} readings")
         note("response.memory_GiB", own_peak() + 2 * scales.peak, "GiB",
@@ -197,7 +199,7 @@ def run(note: Note) -> None:
         note("response.time_over_magpylib", seconds / magpylib_seconds(study, points), "ratio",
              "magpylib CylinderSegment, recoil permeability 1, no iron, one process")
         note("response.matrix_error", matrix_error(
-            study, points, base, Workshop(find_getdp(), folder / "finer", jobs=2)),
+            study, points, base, Session(find_getdp(), folder / "finer", jobs=2)),
              "of the main field", "mesh finer by 4/3, 20 draws of block errors of 1 %, 1 deg")
         errors(study, points, folder / "errors", note)
         symmetry(study, folder / "symmetry", note)

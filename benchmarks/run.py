@@ -16,7 +16,7 @@ from pathlib import Path
 
 from benchmarks import diagnosis, inference, nonlinear, recovery, response, scaling
 from halbach_fe.cli import common
-from halbach_fe.update import write_text
+from halbach_fe.core.files import write_text
 
 RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,

@@ -25,19 +25,21 @@ import tomlkit
 
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
-from halbach_fe.azimuthal import solve_modes
-from halbach_fe.blocks import blocks_of
 from halbach_fe.cli import common
 from halbach_fe.cli import main as halbach_fe
-from halbach_fe.cost import of_infer
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.getdp import find_getdp
-from halbach_fe.inference.prior import block_prior
-from halbach_fe.observation import observe, points_from
-from halbach_fe.routes import solve_nominal
-from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, parse_study
-from halbach_fe.update import write_text
+from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.resource_estimate import estimate_infer
+from halbach_fe.solver.azimuthal_modes import solve_modes
+from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import nominal_prior
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed
 from tests.oracles.cuboids import cuboid_field, long_dipole
 
@@ -83,7 +85,7 @@ def write_campaign(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     study = parse_study(document)
     nominal = np.concatenate([block.magnetization for block in blocks_of(study)])
     prior = study.prior
-    truth = block_prior(nominal, 3, prior.magnitude_sd, prior.direction_sd_deg,
+    truth = nominal_prior(nominal, 3, prior.magnitude_sd, prior.direction_sd_deg,
                         prior.common_mode_sd).sample(1, generator)[0]
     points = points_from(study.observation.positions)
     field = cuboid_field(document, truth.reshape(-1, 3), points)
@@ -101,7 +103,7 @@ def infer(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise RuntimeError("halbach-fe infer failed")
     study = parse_study(document)
     points = points_from(study.observation.positions)
-    foretold = of_infer(study, observe(study, points, np.ones_like(points, bool)), 1)
+    foretold = estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1)
     summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
     written = {path.name: path.stat().st_size / 2**20 for path in (folder / "out").iterdir()}
     unseen = next(one for one in summary["scores"] if one["part"] != "training")
@@ -141,9 +143,10 @@ def modes(size: float, jobs: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_modes(study, points, range(0, 96, 16), Workshop(scales.getdp, Path(name), jobs=jobs))
+        solve_modes(study, points, range(0, 96, 16), Session(scales.getdp, Path(name), jobs=jobs))
         seconds, peak = time.monotonic() - started, scales.peak
-    problem = max(of_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
+    problem = max(
+        estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": jobs, "seconds": seconds,
             "getdp_GiB": peak}
@@ -161,9 +164,10 @@ def solid(size: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_nominal(study, points, Workshop(scales.getdp, Path(name), jobs=1))
+        solve_nominal(study, points, Session(scales.getdp, Path(name), jobs=1))
         seconds, peak = time.monotonic() - started, scales.peak
-    problem = max(of_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
+    problem = max(
+        estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": 1, "seconds": seconds,
             "getdp_GiB": peak}

@@ -28,7 +28,7 @@ from halbach_fe.cli import (
     tolerance,
     verify,
 )
-from halbach_fe.errors import EXIT_CODES
+from halbach_fe.core.errors import EXIT_CODES
 
 VERBS = {
     "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
@@ -50,11 +50,12 @@ def parser() -> argparse.ArgumentParser:
         text = (module.__doc__ or "").strip()
         verb = verbs.add_parser(name, help=text.splitlines()[0], description=text,
                                 formatter_class=argparse.RawDescriptionHelpFormatter)
+        verb.set_defaults(parser=top)
         module.add_arguments(verb)
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; return its exit code (`halbach_fe.errors.EXIT_CODES`)."""
+    """Run one verb; return its exit code (`halbach_fe.core.errors.EXIT_CODES`)."""
     arguments = parser().parse_args(argv)
     return common.guarded(lambda: VERBS[arguments.verb].run(arguments))

@@ -11,8 +11,8 @@ import argparse
 from datetime import datetime
 from pathlib import Path
 
-from halbach_fe.cache import default_cache
 from halbach_fe.cli import common
+from halbach_fe.solver.getdp_cache import default_cache
 
 ROWS = 30
 

@@ -29,19 +29,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from halbach_fe.cache import Cache, default_cache
-from halbach_fe.cluster import connected
-from halbach_fe.cost import TIME_FACTOR, Estimate
-from halbach_fe.errors import (
+from halbach_fe.core.errors import (
     MAX_QUOTED,
     OUT_OF_MEMORY,
     HalbachError,
     HalbachWarning,
     printable,
 )
-from halbach_fe.getdp import find_getdp
-from halbach_fe.multipoles import DEFAULT_ORDERS, Reference
-from halbach_fe.solve import Workshop
+from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
+from halbach_fe.response.resource_estimate import TIME_FACTOR, Estimate
+from halbach_fe.solver.dask_cluster import connected
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.getdp_cache import Cache, default_cache
+from halbach_fe.solver.session import Session
 
 MAX_ORDER = 100
 """Of a multipole: beyond, nothing is left of it in the bore."""
@@ -166,9 +166,9 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
                         help="largest unwanted multipole allowed, in units of 1e-4 of the main one")
 
 
-def reference(arguments: argparse.Namespace) -> Reference:
+def reference(arguments: argparse.Namespace) -> MultipoleReference:
     """What `add_multipole_arguments` was given."""
-    return Reference(arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
+    return MultipoleReference(arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
 
 
 def add_seed_argument(parser: argparse.ArgumentParser) -> None:
@@ -273,11 +273,11 @@ def _claim_buffers() -> None:
 
 
 @contextmanager
-def workshop(arguments: argparse.Namespace) -> Iterator[Workshop]:
-    """A workshop in the output folder; shows progress on a terminal's stderr."""
+def session(arguments: argparse.Namespace) -> Iterator[Session]:
+    """A session in the output folder; shows progress on a terminal's stderr."""
     getdp = find_getdp(arguments.getdp)
     with progress_bar("solving") as show, ExitStack() as stack:
-        made = Workshop(
+        made = Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)

@@ -22,7 +22,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    from halbach_fe.cli import parser  # which knows this verb
-
-    sys.stdout.write(shtab.complete(parser(), shell=arguments.shell) + "\n")
+    sys.stdout.write(shtab.complete(arguments.parser, shell=arguments.shell) + "\n")
     return 0

@@ -1,7 +1,8 @@
 """Map how near the blocks are to the knee of their demagnetization curve, at temperature.
 
-From the study's `demagnetization`: coercivity, coefficients and temperature of the material. Writes
-demagnetization.html and its figures, .json, .csv (by block) and .vtu (by cell, for ParaView).
+From the study's `demagnetization`: coercivity, coefficients and temperature of the material.
+Writes demagnetization.html and its figures, .json, .csv (by block) and .vtu (by cell, for
+ParaView).
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.demagnetization import ACROSS, demagnetization
-from halbach_fe.study import read_study
+from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,15 +23,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write everything, print the blocks with the least margin."""
-    from halbach_fe.report.demagnetization import (  # matplotlib loads when needed
+    from halbach_fe.report.demagnetization import (
         demagnetization_summary,
         worst_blocks,
         write_demagnetization,
     )
 
     study = read_study(arguments.study)
-    with common.workshop(arguments) as workshop:
-        found = demagnetization(study, workshop, arguments.across)
+    with common.session(arguments) as session:
+        found = demagnetization_map(study, session, arguments.across)
     write_demagnetization(found, arguments.output)
     summary = demagnetization_summary(found)
     if arguments.json:

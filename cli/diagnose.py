@@ -12,16 +12,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.effects import catalogue
-from halbach_fe.effects.base import Effect
-from halbach_fe.field_map import read_map
-from halbach_fe.study import Study, read_study
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 
 if TYPE_CHECKING:
-    from halbach_fe.diagnose import Diagnosis
-    from halbach_fe.next_measurement import Separation
+    from halbach_fe.diagnosis.discriminating_measurements import Separation
+    from halbach_fe.diagnosis.result import Diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,20 +52,20 @@ def effects_of(text: str) -> list[Effect]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose, write everything, print what was found."""
-    from halbach_fe.diagnose import diagnose
-    from halbach_fe.diagnosed import summary
-    from halbach_fe.next_measurement import separations
+    from halbach_fe.diagnosis.diagnose import diagnose
+    from halbach_fe.diagnosis.discriminating_measurements import separations
+    from halbach_fe.diagnosis.summary import diagnosis_summary
 
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     text = arguments.study.read_text(encoding="utf-8")
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     unseen = read_map(arguments.held_out) if arguments.held_out else None
-    with common.workshop(arguments) as workshop:
-        found = diagnose(study, data, workshop, blocks, arguments.effects, unseen, common.say)
-        next_ones = separations(found, data, workshop, arguments.effects)
+    with common.session(arguments) as session:
+        found = diagnose(study, data, session, blocks, arguments.effects, unseen, common.say)
+        next_ones = separations(found, data, session, arguments.effects)
     write(found, next_ones, study, text, arguments.output)
     if arguments.json:
-        common.print_json(summary(found, next_ones))
+        common.print_json(diagnosis_summary(found, next_ones))
         return 0
     tell(found, arguments.output)
     return 0
@@ -75,11 +76,13 @@ def write(
     assumptions: Sequence[str] = (),
 ) -> None:
     """Write summary, report and the study, whose file is ``text``, with what it lacked."""
-    from halbach_fe.diagnosed import write_study, write_summary
-    from halbach_fe.report.diagnosis import write_report  # matplotlib loads only when needed
+    from halbach_fe.diagnosis.summary import write_study, write_summary
+    from halbach_fe.report.diagnosis import (
+        write_diagnosis_report,  # matplotlib loads only when needed
+    )
 
     write_summary(found, next_ones, folder)
-    write_report(found, next_ones, folder, assumptions)
+    write_diagnosis_report(found, next_ones, folder, assumptions)
     write_study(text, study, found, folder)
 
 

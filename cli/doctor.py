@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.analytic import ideal_sectors, layered_bore_field
 from halbach_fe.cli import common
-from halbach_fe.errors import CheckFailedError, GetDPNotFoundError
-from halbach_fe.getdp import GetDP, blas_of, find_getdp
-from halbach_fe.routes import solve_nominal
-from halbach_fe.solve import Workshop
-from halbach_fe.study import parse_study
+from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
+from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
+from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.getdp import GetDP, blas_of, find_getdp
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
 
 PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "h5netcdf", "xarray", "pydantic", "jinja2",
             "matplotlib", "arviz", "rich")
@@ -89,5 +89,5 @@ def solve_error(getdp: GetDP, method: str) -> float:
     points = 0.07 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     exact = layered_bore_field(ideal_sectors(1, 16, 1.0), inner, outer, mu, points[:, :2], iron)
     with tempfile.TemporaryDirectory() as folder:
-        found = solve_nominal(study, points, Workshop(getdp, Path(folder)))[:, :2]
+        found = solve_nominal(study, points, Session(getdp, Path(folder)))[:, :2]
     return float(np.abs(found - exact).max() / np.abs(exact).max())

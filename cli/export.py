@@ -10,8 +10,8 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.field_map import read_map
-from halbach_fe.formats import WRITERS, export_map
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.measurement.formats import WRITERS, export_map
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
-from halbach_fe.field_map import points_of, write_map
-from halbach_fe.formats import READERS, Found, import_map
-from halbach_fe.formats.declared import Declared
-from halbach_fe.formats.units import ANGLES, FIELDS, LENGTHS
-from halbach_fe.study import COMPONENTS
+from halbach_fe.measurement.field_map import points_of, write_map
+from halbach_fe.measurement.formats import READERS, ImportedFile, import_map
+from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.units import ANGLES, FIELDS, LENGTHS
+from halbach_fe.study.types import COMPONENTS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def summary(found: Found) -> dict[str, object]:
+def summary(found: ImportedFile) -> dict[str, object]:
     """What was read, for people to check and for machines."""
     points, field = points_of(found.data), found.data["B_T"].values
     measured = [i for i in range(3) if not np.isnan(field[:, i]).all()]

@@ -9,13 +9,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.cost import of_infer
-from halbach_fe.errors import StudyError
-from halbach_fe.field_map import read_map
-from halbach_fe.study import is_nonlinear, read_study
-from halbach_fe.update import infer, observed, summary, write_update
+from halbach_fe.core.errors import StudyError
+from halbach_fe.inference.infer import infer, observation_of
+from halbach_fe.inference.storage import inference_summary, write_inference
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.response.resource_estimate import estimate_infer
+from halbach_fe.study.model import is_nonlinear
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,38 +49,32 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         if arguments.samples:
             common.say("The chains of --samples are not counted.")
-        found = of_infer(study, observed(study, data, blocks, unseen), common.jobs(arguments))
+        found = estimate_infer(study, observation_of(study, data, blocks, unseen),
+                               common.jobs(arguments))
         return common.print_estimate(found, arguments.json)
-    from halbach_fe.report.inference import (  # matplotlib loads only when needed
-        score_table,
-        write_report,
-    )
+    from halbach_fe.report.inference import score_table, write_inference_report
 
-    with common.workshop(arguments) as workshop:
-        update = infer(study, data, workshop, blocks, linearized_only=bool(arguments.samples),
+    with common.session(arguments) as session:
+        update = infer(study, data, session, blocks, linearized_only=bool(arguments.samples),
                        unseen=unseen)
         if arguments.samples:
-            write_update(update, arguments.output)  # should the chains not do
-            from halbach_fe.sampled import (  # ArviZ takes seconds to load
-                sample_posterior,
-                with_samples,
-                write_sampled,
-            )
+            write_inference(update, arguments.output)  # should the chains not do
+            from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 
             with common.workers(arguments) as pool:
-                sampled = sample_posterior(update, workshop, arguments.samples,
+                sampled = sample_posterior(update, session, arguments.samples,
                                            seed=arguments.seed, say=common.say, mapped=pool.map)
             update = with_samples(update, sampled)
             write_sampled(sampled, arguments.output)
     if update.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
-    write_update(update, arguments.output)
-    write_report(update, arguments.output, provenance={
-        "GetDP": workshop.getdp.version, **common.digests({
+    write_inference(update, arguments.output)
+    write_inference_report(update, arguments.output, provenance={
+        "GetDP": session.getdp.version, **common.digests({
             "study file": arguments.study, "measurements": arguments.measurements,
             "held-out map": arguments.held_out, "blocks": arguments.blocks})})
     if arguments.json:
-        common.print_json(summary(update))
+        common.print_json(inference_summary(update))
     else:
         common.print_table(score_table(update), "Median relative error, before and after")
         common.say(f"Report: {arguments.output / 'report.html'}")

@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.multipoles import multipole_models, text_table
-from halbach_fe.study import read_study
-from halbach_fe.tolerance import assembled_prior
-from halbach_fe.update import read_posterior
+from halbach_fe.design.tolerance import assembled_prior
+from halbach_fe.inference.storage import read_posterior
+from halbach_fe.response.multipoles import multipole_models, text_table
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,23 +28,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write everything, print the tables."""
-    from halbach_fe.report.multipoles import (  # matplotlib loads when needed
-        multipoles_summary,
-        write_multipoles,
-    )
+    from halbach_fe.report.multipoles import multipoles_summary, write_multipoles
 
     study, wanted = read_study(arguments.study), common.reference(arguments)
     known = read_posterior(study, arguments.posterior) if arguments.posterior else None
     references = [wanted]
     if study.dimension == 3:
         references = [replace(wanted, z_m=None), replace(wanted, z_m=wanted.z_m or 0.0)]
-    with common.workshop(arguments) as workshop:
-        models = multipole_models(study, references, workshop)
+    with common.session(arguments) as session:
+        models = multipole_models(study, references, session)
     magnets = known or {"prior": assembled_prior(study, models[0].nominal)}
     tables = [(model, {name: model.of(one) for name, one in magnets.items()}) for model in models]
     limit = arguments.limit_units
     write_multipoles(study, tables, limit, arguments.output, {
-        "GetDP": workshop.getdp.version, **common.digests(
+        "GetDP": session.getdp.version, **common.digests(
             {"study file": arguments.study, "posterior": arguments.posterior})})
     if arguments.json:
         common.print_json(multipoles_summary(study, tables, limit))

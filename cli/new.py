@@ -9,12 +9,12 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.new_study import Magnet, write_new_study
+from halbach_fe.study.template import MagnetTemplate, write_new_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    usual = Magnet()
+    usual = MagnetTemplate()
     parser.add_argument("study", type=Path, metavar="STUDY", help="file to write (TOML)")
     for name, kind, what in (
             ("multipole-order", common.positive, "1 dipole, 2 quadrupole, ..."),
@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and say what to do with it."""
     given = {name: value for name, value in vars(arguments).items()
-             if name in Magnet.__dataclass_fields__ and value is not None}
+             if name in MagnetTemplate.__dataclass_fields__ and value is not None}
     if "inner_radius_m" in given:
         given.setdefault("outer_radius_m", round(1.8 * given["inner_radius_m"], 6))
-    write_new_study(arguments.study, Magnet(**given))
+    write_new_study(arguments.study, MagnetTemplate(**given))
     common.say(f"Wrote {arguments.study}. Next: halbach-fe solve {arguments.study} -o DIR")
     return 0

@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.planning import plan
-from halbach_fe.study import read_study
+from halbach_fe.design.measurement_plan import plan_measurement
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,8 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.plan import plan_summary, write_plan  # matplotlib loads when needed
 
     study = read_study(arguments.study)
-    with common.workshop(arguments) as workshop:
-        found = plan(study, workshop, arguments.points)
+    with common.session(arguments) as session:
+        found = plan_measurement(study, session, arguments.points)
     write_plan(study, found, arguments.output)
     if arguments.json:
         common.print_json(plan_summary(found))

@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.measured_prior import prior_from_blocks
-from halbach_fe.study import read_study
+from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,11 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Estimate, write everything, print the table of types."""
-    from halbach_fe.report.prior import (  # matplotlib loads when needed
-        prior_summary,
-        type_table,
-        write_prior,
-    )
+    from halbach_fe.report.prior import prior_summary, type_table, write_prior
 
     study = read_study(arguments.study)
     prior = prior_from_blocks(study, read_blocks(arguments.blocks))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.study import Study
+from halbach_fe.study.model import Study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

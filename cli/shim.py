@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.errors import StudyError
-from halbach_fe.field_map import read_map
-from halbach_fe.multipoles import multipole_model, text_table
-from halbach_fe.shimming import shim
-from halbach_fe.study import read_study
-from halbach_fe.update import infer
+from halbach_fe.core.errors import StudyError
+from halbach_fe.design.shimming import shim
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.response.multipoles import multipole_model, text_table
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,11 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Infer, choose, write everything, print moves and multipoles."""
-    from halbach_fe.report.shimming import (  # matplotlib loads when needed
-        move_table,
-        shim_summary,
-        write_shim,
-    )
+    from halbach_fe.report.shimming import move_table, shim_summary, write_shim
 
     if arguments.stock and not arguments.replace:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
@@ -56,10 +52,10 @@ def run(arguments: argparse.Namespace) -> int:
     study, data = read_study(arguments.study), read_map(arguments.measurements)
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     stock = read_blocks(arguments.stock) if arguments.stock else None
-    with common.workshop(arguments) as workshop:
-        update = infer(study, data, workshop, blocks)
+    with common.session(arguments) as session:
+        update = infer(study, data, session, blocks)
         model = multipole_model(study, common.reference(arguments), replace(
-            workshop, folder=arguments.output / "multipoles"))
+            session, folder=arguments.output / "multipoles"))
     found = shim(update, model, np.random.default_rng(arguments.seed), {
         "swap": arguments.swaps, "turn": arguments.turns, "replace": arguments.replace},
         arguments.limit_units, stock)

@@ -12,11 +12,11 @@ import argparse
 
 import numpy as np
 
-from halbach_fe.campaign.effects import EFFECTS, Wanted, signature, wanted
-from halbach_fe.campaign.reaction import Elements
-from halbach_fe.campaign.simulate import COIL_SD, simulate, write_campaign
 from halbach_fe.cli import common
-from halbach_fe.study import read_study
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.hidden_effects import EFFECTS, Wanted, signature, wanted
+from halbach_fe.synthetic.ngsolve_reaction import Elements
+from halbach_fe.synthetic.simulate import COIL_SD, simulate_campaign, write_campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     study = read_study(arguments.study)
     elements = Elements(arguments.element_size, arguments.order)
     with common.progress_bar("magpylib") as show:
-        campaign = simulate(study, arguments.seed, arguments.coil_sd, arguments.hide,
+        campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
                             arguments.hide_random, elements, show)
     written = write_campaign(campaign, arguments.output)
     write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,

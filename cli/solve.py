@@ -15,14 +15,16 @@ from importlib import metadata
 import numpy as np
 
 from halbach_fe.cli import common
-from halbach_fe.cost import of_solve
-from halbach_fe.discretization import error_workshop, reading_errors
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.observation import observe, points_from
-from halbach_fe.routes import check_points, exact_part, finite_element_part
-from halbach_fe.solve import newton_history
-from halbach_fe.study import is_nonlinear, read_study
-from halbach_fe.update import write_text
+from halbach_fe.core.files import write_text
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.resource_estimate import estimate_solve
+from halbach_fe.solver.field import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.runs import newton_history
+from halbach_fe.study.model import is_nonlinear
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,22 +45,22 @@ def run(arguments: argparse.Namespace) -> int:
     check_points(study, places)
     if arguments.dry_run:
         return common.print_estimate(
-            of_solve(study, observation, common.jobs(arguments)), arguments.json)
-    from halbach_fe.report.solution import Solution, write_report  # matplotlib when needed
+            estimate_solve(study, observation, common.jobs(arguments)), arguments.json)
+    from halbach_fe.report.solution import Solution, write_solution_report  # matplotlib when needed
 
-    with common.workshop(arguments) as workshop:
-        part = finite_element_part(study, places, workshop, columns=False)
-        field = exact_part(study, places) + part.nominal
+    with common.session(arguments) as session:
+        part = finite_element_part(study, places, session, columns=False)
+        field = vacuum_part(study, places) + part.nominal
         flux_density = field[:len(points)]
         data = field_map(points, flux_density, attributes={
             "study": study.name, "halbach_fe": metadata.version("halbach-fe"),
-            "getdp": workshop.getdp.version, "method": study.solver.method})
+            "getdp": session.getdp.version, "method": study.solver.method})
         for suffix in (".h5", ".csv", ".vtu"):
             write_map(data, arguments.output / f"field_map{suffix}")
         last = slice(-len(read_at), None)
         errors = reading_errors(study, observation, replace(
             part, nominal=part.nominal[last], error=None if part.error is None
-            else part.error[last]), error_workshop(workshop))
+            else part.error[last]), error_bar_session(session))
     readings = observation.apply(field[last])
     lines = ["label,x_m,y_m,z_m,value_T,error_T"] + [
         f"{label},{x!r},{y!r},{z!r},{value!r},{error!r}"
@@ -75,8 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
         "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
-    write_report(Solution(study, points, flux_density, observation, readings, errors, {
-        "study file": common.digest(arguments.study), "GetDP": workshop.getdp.version,
+    write_solution_report(Solution(study, points, flux_density, observation, readings, errors, {
+        "study file": common.digest(arguments.study), "GetDP": session.getdp.version,
         "method": study.solver.method, "points, readings": f"{len(points)}, {len(readings)}",
         "solved in": f"{summary['seconds']} s"}), arguments.output)
     if is_nonlinear(study):

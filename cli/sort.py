@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.multipoles import multipole_model
-from halbach_fe.sorting import sort_blocks
-from halbach_fe.study import read_study
+from halbach_fe.design.sorting import sort_blocks
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.response.multipoles import multipole_model
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,15 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sort, write everything, print the multipoles."""
-    from halbach_fe.report.sorting import (  # matplotlib loads when needed
-        order_table,
-        sort_summary,
-        write_sorted,
-    )
+    from halbach_fe.report.sorting import order_table, sort_summary, write_sorted
 
     study, table = read_study(arguments.study), read_blocks(arguments.blocks)
-    with common.workshop(arguments) as workshop:
-        model = multipole_model(study, common.reference(arguments), workshop)
+    with common.session(arguments) as session:
+        model = multipole_model(study, common.reference(arguments), session)
     with common.progress_bar("sorting") as show:
         found = sort_blocks(study, table, model, np.random.default_rng(arguments.seed), show)
     write_sorted(found, arguments.limit_units, arguments.output)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common
-from halbach_fe.measured_prior import prior_from_blocks
-from halbach_fe.multipoles import multipole_model
-from halbach_fe.study import read_study
-from halbach_fe.tolerance import assembled_prior, tolerance
+from halbach_fe.design.tolerance import assembled_prior, predict_tolerance
+from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.response.multipoles import multipole_model
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,19 +31,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw, write everything, print the quantiles."""
-    from halbach_fe.report.tolerance import (  # matplotlib loads when needed
-        quantile_table,
-        tolerance_summary,
-        write_tolerance,
-    )
+    from halbach_fe.report.tolerance import quantile_table, tolerance_summary, write_tolerance
 
     study = read_study(arguments.study)
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
-    with common.workshop(arguments) as workshop:
-        model = multipole_model(study, common.reference(arguments), workshop)
+    with common.session(arguments) as session:
+        model = multipole_model(study, common.reference(arguments), session)
     prior = (prior_from_blocks(study, blocks).gaussian if blocks
              else assembled_prior(study, model.nominal))
-    found = tolerance(model, study, prior, arguments.draws, np.random.default_rng(arguments.seed),
+    found = predict_tolerance(model, study, prior, arguments.draws,
+                              np.random.default_rng(arguments.seed),
                       arguments.limit_units)
     write_tolerance(found, arguments.output)
     if arguments.json:

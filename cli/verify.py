@@ -10,9 +10,9 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.cost import of_verify
-from halbach_fe.study import read_study
-from halbach_fe.verification import verify
+from halbach_fe.response.mesh_convergence import verify
+from halbach_fe.response.resource_estimate import estimate_verify
+from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,11 +27,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     if arguments.dry_run:
-        return common.print_estimate(of_verify(study, common.jobs(arguments)), arguments.json)
-    with common.workshop(arguments) as workshop:
-        found = verify(study, workshop, say=lambda what: common.say(f"solving {what}"))
+        return common.print_estimate(estimate_verify(study, common.jobs(arguments)), arguments.json)
+    with common.session(arguments) as session:
+        found = verify(study, session, say=lambda what: common.say(f"solving {what}"))
     write_verification(study, found, arguments.output, {
-        "GetDP": workshop.getdp.version, "study file": common.digest(arguments.study)})
+        "GetDP": session.getdp.version, "study file": common.digest(arguments.study)})
     if arguments.json:
         common.print_json(found.plain())
     else:

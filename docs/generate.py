@@ -7,8 +7,8 @@ import inspect
 from pathlib import Path
 
 from halbach_fe.cli import VERBS, parser
-from halbach_fe.errors import EXIT_CODES
-from halbach_fe.study import Study
+from halbach_fe.core.errors import EXIT_CODES
+from halbach_fe.study.model import Study
 
 MODULES = ("study", "field_map", "block_table", "update", "diagnose", "effects.base", "observation",
            "response", "exact_field", "analytic", "inference.linear", "inference.prior",

@@ -4,9 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from halbach_fe.errors import HalbachError
-from halbach_fe.mesh import build_mesh
-from halbach_fe.study import read_study
+from halbach_fe.core.errors import HalbachError
+from halbach_fe.solver.mesh import build_mesh
+from halbach_fe.study.reader import read_study
 
 
 def main() -> int:

@@ -7,13 +7,15 @@ from pathlib import Path
 import gmsh
 import numpy as np
 
-from halbach_fe import regions as tags
-from halbach_fe.blocks import MagnetBlock, Outline, blocks_of
-from halbach_fe.errors import StudyError
-from halbach_fe.extent import boundary_radius, magnet_radius
+from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.regions import BlockRegion, Regions
-from halbach_fe.study import Study
+from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.domain import boundary_radius, magnet_radius
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.regions import BlockRegion, Regions
+from halbach_fe.study.model import Study
 
 LINE, TRIANGLE = 1, 2  # Gmsh's element types
 COUNTED = 4000

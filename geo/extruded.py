@@ -14,13 +14,14 @@ from pathlib import Path
 import gmsh
 import numpy as np
 
-from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, Ints, blocks_of, iron_half_length, ring_limits
-from halbach_fe.extent import boundary_half_length, boundary_radius
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geo.cross_section import draw, regions_of
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.regions import Regions
-from halbach_fe.study import Study
+from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry.magnet import blocks_of, iron_half_length, ring_limits
+from halbach_fe.geometry.regions import Regions
+from halbach_fe.study.model import Study
 
 TRIANGLE6, TETRAHEDRON10 = 9, 11  # Gmsh's element types
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))

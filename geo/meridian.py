@@ -12,12 +12,13 @@ from pathlib import Path
 import gmsh
 import numpy as np
 
-from halbach_fe import regions as tags
-from halbach_fe.blocks import Floats, array_half_length, iron_half_length, ring_limits
-from halbach_fe.extent import boundary_half_length, boundary_radius, magnet_half_length
+from halbach_fe.core.arrays import Floats
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.regions import BlockRegion, Regions
-from halbach_fe.study import Study
+from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius, magnet_half_length
+from halbach_fe.geometry.magnet import array_half_length, iron_half_length, ring_limits
+from halbach_fe.geometry.regions import BlockRegion, Regions
+from halbach_fe.study.model import Study
 
 LINE, QUADRANGLE = 1, 3  # Gmsh's element types
 _GROWTH = 1.35

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import gmsh
 
-from halbach_fe.errors import HalbachError, MeshError
+from halbach_fe.core.errors import HalbachError, MeshError
 
 _ALONE = threading.Lock()
 """There is one Gmsh in a process, whatever its threads would like."""

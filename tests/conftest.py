@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from halbach_fe.cache import LIMIT_VARIABLE
-from halbach_fe.getdp import GetDP, find_getdp
-from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, parse_study
+from halbach_fe.solver.getdp import GetDP, find_getdp
+from halbach_fe.solver.getdp_cache import LIMIT_VARIABLE
+from halbach_fe.solver.session import Session
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study
 
 ROOT = Path(__file__).parent.parent
 
@@ -76,8 +77,8 @@ def getdp() -> GetDP:
 
 
 @pytest.fixture
-def workshop(getdp: GetDP, tmp_path: Path) -> Workshop:
-    return Workshop(getdp, tmp_path / "work", jobs=2)
+def session(getdp: GetDP, tmp_path: Path) -> Session:
+    return Session(getdp, tmp_path / "work", jobs=2)
 
 
 @pytest.fixture

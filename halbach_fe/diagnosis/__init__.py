@@ -1,1 +1,1 @@
-"""Where a model and a measurement disagree, and which missing effect explains it; arrays only."""
+"""Where a model and a measurement disagree, and which missing effect explains it."""

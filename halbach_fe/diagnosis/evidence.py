@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as linalg
 
-from halbach_fe.blocks import Floats
+from halbach_fe.core.arrays import Floats
 
 ROWS_AT_ONCE = 8192
 

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import KDTree
 
-from halbach_fe.blocks import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.inference.noise import Noise
-from halbach_fe.study import COMPONENTS, Component, ExcludedReading, Study
-from halbach_fe.update import HELD_OUT_MAP, Update
+from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
+from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.inference import ExcludedReading
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS, Component
 
 NEIGHBOURS = 24
 """Of the same component; a polynomial of second order has ten coefficients."""
@@ -84,7 +86,7 @@ class Outlier:
     sd_T: float
 
 
-def outliers_of(update: Update) -> tuple[Outlier, ...]:
+def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
     """Find readings of a map that are off; none among Fourier coefficients, each of which is made
     of many.
     """
@@ -128,7 +130,7 @@ class Foretold:
 
 
 def foretold(
-    root: Floats, residual: Floats, noise: Noise, used: NDArray[np.bool_]
+    root: Floats, residual: Floats, noise: NoiseCovariance, used: NDArray[np.bool_]
 ) -> Foretold:
     """What used readings foretell of every reading, of a used one all others.
 
@@ -163,7 +165,7 @@ def foretold(
 
 
 def find_outliers(
-    root: Floats, residual: Floats, noise: Noise, training: NDArray[np.bool_],
+    root: Floats, residual: Floats, noise: NoiseCovariance, training: NDArray[np.bool_],
     labels: Sequence[str], positions: Floats, largest: float,
 ) -> NDArray[np.bool_]:
     """Tell which readings are off.

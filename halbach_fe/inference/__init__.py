@@ -1,1 +1,1 @@
-"""Bayesian update of the block magnetizations. Sees arrays and labels only."""
+"""The update of a magnet by its measurements."""

@@ -1,1 +1,1 @@
-"""Figures and HTML pages. The only room that plots."""
+"""Pages and figures."""

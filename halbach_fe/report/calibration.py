@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Ints
-from halbach_fe.inference.calibration import BINS
+from halbach_fe.core.arrays import Ints
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, save, write_page
+from halbach_fe.stats.sbc import BINS
 
 
 def write_calibration(

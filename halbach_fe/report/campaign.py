@@ -9,10 +9,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from halbach_fe.block_table import BlockTable
-from halbach_fe.blocks import Floats
-from halbach_fe.campaign.simulate import observed_components, point_noise
-from halbach_fe.field_map import points_of
+from halbach_fe.core.arrays import Floats
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.field_map import points_of
 from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
@@ -24,7 +23,9 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.view import Points, of_nominal
-from halbach_fe.study import COMPONENTS, Study
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
+from halbach_fe.synthetic.simulate import observed_components, point_noise
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 

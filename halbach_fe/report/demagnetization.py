@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats, Ints
-from halbach_fe.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
-from halbach_fe.field_map import atomic, write_csv
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
+from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
 from halbach_fe.report.view import Colours, Known, magnet_view
-from halbach_fe.update import write_text
 
 PAST = "#D55E00"
 SWEEP_K = 40.0

@@ -5,26 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from halbach_fe.diagnose import Diagnosis, Named
-from halbach_fe.diagnosed import (
+from halbach_fe.diagnosis.discriminating_measurements import ENOUGH, Separation
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.loo_residuals import DISCOVERIES, ResidualGroup
+from halbach_fe.diagnosis.model_selection import ALIKE, EFFECT_ODDS, FOUND, MOST
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.diagnosis.summary import (
     NOTHING,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
     others,
+    place_in_words,
+    region_scores,
     rivals,
-    scores,
-    where,
 )
-from halbach_fe.diagnosis.residuals import DISCOVERIES, Group
-from halbach_fe.diagnosis.selection import ALIKE, EFFECT_ODDS, FOUND, MOST
-from halbach_fe.effects import catalogue
-from halbach_fe.next_measurement import ENOUGH, Separation
+from halbach_fe.inference.result import ALL_READINGS
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
 from halbach_fe.report.view import of_update
-from halbach_fe.update import ALL_READINGS
 
 UNUSUAL = 20.0
 """Prior standard deviations: what nobody would expect of a magnet that was built with care."""
@@ -103,8 +103,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 "no effect of the catalogue explains it, nor anything smooth: look at the noise."]
     if diagnosis.named:
         held = ["".join(f", of held-out ones {one.chi2_per_reading:.3g}" for one in found[1:2])
-                for found in (scores(before, diagnosis.left_out_before),
-                              scores(after, diagnosis.left_out_after))]
+                for found in (region_scores(before, diagnosis.left_out_before),
+                              region_scores(after, diagnosis.left_out_after))]
         said.append(f"With {'it' if len(diagnosis.named) == 1 else 'them'} in the model, chi² per "
                     f"reading is {after.prior_conflict:.3g}{held[1]} (before: "
                     f"{before.prior_conflict:.3g}{held[0]}).")
@@ -113,7 +113,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     return said
 
 
-def _over_usual(named: Named) -> float:
+def _over_usual(named: IdentifiedEffect) -> float:
     """The largest amplitude over its prior standard deviation; of what is there or not, none."""
     first = int(named.hypothesis.effect.certain or named.hypothesis.effect.discrete)
     return max((abs(value) / parameter.sd for value, parameter in zip(
@@ -126,7 +126,7 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
               "log Bayes factor": one.factor, "it could be": one.instead}
              for one in others(diagnosis)]
     return found + [
-        {"effect": one.found.candidate.effect, "place": where(one.hypothesis.place),
+        {"effect": one.found.candidate.effect, "place": place_in_words(one.hypothesis.place),
          "amplitude": "; ".join(amounts(one)),
          "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
          "it could be": ", ".join(candidate.effect for candidate, _ in rivals(one)) or NOTHING}
@@ -135,7 +135,7 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Rows of scores before and after, as text."""
-    found = [scores(one.update, one.left_out) for one in states(diagnosis)]
+    found = [region_scores(one.update, one.left_out) for one in states(diagnosis)]
     rows = []
     for number, one in enumerate(found[0]):
         region = "" if one.region == ALL_READINGS else f", {one.region}"
@@ -147,7 +147,7 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     return rows
 
 
-def write_report(
+def write_diagnosis_report(
     diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path,
     assumptions: Sequence[str] = (),
 ) -> None:
@@ -182,10 +182,10 @@ def write_report(
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
-def _named(one: Named, titles: dict[str, str]) -> str:
+def _named(one: IdentifiedEffect, titles: dict[str, str]) -> str:
     """An effect in words, with its place and amplitude."""
     effect = one.hypothesis.effect
-    parts = [_title(effect.name, titles), where(one.hypothesis.place),
+    parts = [_title(effect.name, titles), place_in_words(one.hypothesis.place),
              "" if effect.certain else "; ".join(amounts(one))]
     return ", ".join(part for part in parts if part)
 
@@ -196,7 +196,7 @@ def _catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
         *catalogue(), *(one.hypothesis.effect for one in diagnosis.named))}
 
 
-def _titles(named: Named, titles: dict[str, str]) -> list[str]:
+def _titles(named: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
     """Rivals of an effect in words."""
     return [_title(candidate.effect, titles) for candidate, _ in rivals(named)]
 
@@ -207,7 +207,7 @@ def _title(name: str, titles: dict[str, str]) -> str:
     return f"{title} ({name})" if list(titles.values()).count(title) > 1 else title
 
 
-def _disagreeing(found: Sequence[Group]) -> str:
+def _disagreeing(found: Sequence[ResidualGroup]) -> str:
     """How many groups of readings disagree, and which most."""
     wrong = [one for one in found if one.disagrees]
     if not wrong:
@@ -217,7 +217,7 @@ def _disagreeing(found: Sequence[Group]) -> str:
             f"({worst.chi2_per_reading:.2g})")
 
 
-def _class(one: Named, titles: dict[str, str]) -> str:
+def _class(one: IdentifiedEffect, titles: dict[str, str]) -> str:
     """What cannot be told apart, in words."""
     found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
              for title, (candidate, factor) in zip(_titles(one, titles), rivals(one), strict=True)]
@@ -225,10 +225,11 @@ def _class(one: Named, titles: dict[str, str]) -> str:
             f"{one.found.log_bayes_factor:.1f}) could as well be: {'; '.join(found)}.")
 
 
-def _entry(one: Named, titles: dict[str, str]) -> dict[str, str]:
+def _entry(one: IdentifiedEffect, titles: dict[str, str]) -> dict[str, str]:
     """Row of the page's table of effects."""
     effect = one.hypothesis.effect
-    return {"what": _title(effect.name, titles), "where": where(one.hypothesis.place) or NOTHING,
+    return {"what": _title(effect.name, titles),
+            "where": place_in_words(one.hypothesis.place) or NOTHING,
             "how much": "; ".join(text.replace(" ", "\u00a0") for text in amounts(one)),
             "log Bayes factor": f"{one.found.log_bayes_factor:.1f}", "kind": effect.kind}
 
@@ -238,7 +239,7 @@ def _either(parts: Sequence[str]) -> str:
 
 
 def _next(
-    named: Named, own: Sequence[Separation], titles: dict[str, str],
+    named: IdentifiedEffect, own: Sequence[Separation], titles: dict[str, str],
 ) -> dict[str, object]:
     """What would separate an effect from its rivals, in words and numbers."""
     choices = {choice.name: choice.title for one in own for choice in one.options}

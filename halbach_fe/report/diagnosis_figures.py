@@ -13,14 +13,14 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from halbach_fe.blocks import Floats, Ints
-from halbach_fe.diagnose import Diagnosis
-from halbach_fe.diagnosed import rivals
-from halbach_fe.diagnosis.residuals import Group
-from halbach_fe.diagnosis.selection import FOUND
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.diagnosis.loo_residuals import ResidualGroup
+from halbach_fe.diagnosis.model_selection import FOUND
+from halbach_fe.diagnosis.result import Diagnosis
+from halbach_fe.diagnosis.summary import rivals
+from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
 from halbach_fe.report.prediction import places
-from halbach_fe.update import COVERAGE_Z, Update
 
 MOST_BARS = 8
 RESIDUAL_LIMIT = 5.0
@@ -34,8 +34,8 @@ class State:
     """A model in a report: the study as it was, or with what was missing."""
 
     when: str
-    update: Update
-    groups: Sequence[Group]
+    update: InferenceResult
+    groups: Sequence[ResidualGroup]
     left_out: Floats
     colour: str
     marker: str
@@ -130,7 +130,7 @@ def residuals(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def _residual_map(axis: Axes, update: Update, readings: Ints, values: Floats) -> bool:
+def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: Floats) -> bool:
     """Residuals over z and angle, or along a line or circle where there is no more; tells which."""
     x, y, z = update.observation.positions[readings].T
     numbers = ["".join(c for c in update.observation.labels[one] if c.isdigit())
@@ -234,7 +234,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def _line(update: Update, left_out: Floats) -> tuple[str, Ints, Floats, str]:
+def _line(update: InferenceResult, left_out: Floats) -> tuple[str, Ints, Floats, str]:
     """The readings of a profile: the line along z, circle, or coefficients of one kind that fitted
     worst.
 
@@ -257,7 +257,7 @@ def _line(update: Update, left_out: Floats) -> tuple[str, Ints, Floats, str]:
     return str(labels[index[0]]), index[order], along[index][order], name
 
 
-def _parts(update: Update, vectors: Floats) -> dict[str, Floats]:
+def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
     """Magnetizations (parameters, ...) in A/m by block, (blocks, ...): along and across the easy
     axis and along z, in % and mrad of the nominal one.
     """
@@ -276,7 +276,7 @@ def _parts(update: Update, vectors: Floats) -> dict[str, Floats]:
     return found
 
 
-def _deviations(update: Update) -> dict[str, Floats]:
+def _deviations(update: InferenceResult) -> dict[str, Floats]:
     """Posterior less prior mean by component, (rings, slots)."""
     array = update.study.array
     return {name: values.reshape(array.rings, array.blocks_per_ring) for name, values in

@@ -9,27 +9,23 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.inference.linear import contraction
-from halbach_fe.multipoles import circle_models
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
-from halbach_fe.report.prediction import (
-    Published,
-    profile,
-    quantiles,
-    relative_error,
-    residuals,
-)
+from halbach_fe.report.prediction import Published, profile, quantiles, relative_error, residuals
 from halbach_fe.report.view import of_update
-from halbach_fe.update import Update
+from halbach_fe.response.multipoles import circle_models
+from halbach_fe.stats.linear_gaussian import contraction
 
 NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """More do not find room for their numbers."""
 
 
-def score_table(update: Update, published: Published | None = None) -> list[dict[str, str]]:
+def score_table(update: InferenceResult,
+                published: Published | None = None) -> list[dict[str, str]]:
     """Rows of the before/after table, as text."""
     rows = []
     for score in update.scores:
@@ -53,8 +49,8 @@ def score_table(update: Update, published: Published | None = None) -> list[dict
     return rows
 
 
-def write_report(
-    update: Update, folder: Path, published: Published | None = None,
+def write_inference_report(
+    update: InferenceResult, folder: Path, published: Published | None = None,
     assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
 ) -> None:
     """Write report.html, self-contained, and its figures as PNG into ``folder``; and
@@ -97,7 +93,7 @@ def write_report(
         view=of_update(update))
 
 
-def _conflict(update: Update) -> str:
+def _conflict(update: InferenceResult) -> str:
     """Say so when prior, model and readings cannot all be right."""
     if update.prior_conflict <= update.conflict_limit:
         return ""
@@ -113,7 +109,7 @@ def _percent(value: float | None) -> str:
     return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
 
 
-def _z_of(update: Update, region: str, part: str) -> Floats:
+def _z_of(update: InferenceResult, region: str, part: str) -> Floats:
     return update.observation.positions[update.chosen(region, part), 2]
 
 
@@ -122,7 +118,7 @@ def _height(rings: int) -> float:
     return 1.8 + 0.25 * min(rings, NUMBERED_RINGS)
 
 
-def _blocks(update: Update) -> Figure:
+def _blocks(update: InferenceResult) -> Figure:
     array = update.study.array
     dimension = update.study.dimension
     nominal = update.response.nominal.reshape(-1, dimension)
@@ -145,7 +141,7 @@ def _blocks(update: Update) -> Figure:
     return figure
 
 
-def _contraction(update: Update) -> Figure:
+def _contraction(update: InferenceResult) -> Figure:
     array = update.study.array
     percent = 100 * contraction(update.prior, update.posterior, update.study.dimension).reshape(
         array.rings, array.blocks_per_ring)

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.inference.prior import Gaussian
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, save, write_page
-from halbach_fe.study import COMPONENTS, Study
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
 
 
 def scores(one: Gaussian, truth: Floats) -> dict[str, float]:

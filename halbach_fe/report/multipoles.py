@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.field_map import atomic, write_csv
-from halbach_fe.multipoles import MultipoleModel, Multipoles, met, plain, text_table
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, save, write_page
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
+from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
+from halbach_fe.study.model import Study
 
 Table = tuple[MultipoleModel, Mapping[str, Multipoles]]
 """Where, and of which magnets by name."""

@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.field_map import atomic
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.study.model import Study
 
 # Okabe and Ito's colours, told apart by every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"

@@ -13,11 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.planning import MeasurementPlan
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
+from halbach_fe.study.model import Study
 
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:

@@ -12,9 +12,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from halbach_fe.blocks import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.inference.result import (
+    COVERAGE_Z,
+    HELD_OUT,
+    HELD_OUT_MAP,
+    TRAINING,
+    InferenceResult,
+    Prediction,
+)
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, axes_along
-from halbach_fe.update import COVERAGE_Z, HELD_OUT, HELD_OUT_MAP, TRAINING, Prediction, Update
 
 MARKERS: dict[str, dict[str, Any]] = {
     TRAINING: {"marker": ".", "ms": 4}, HELD_OUT: {"marker": "o", "mfc": "none", "ms": 4},
@@ -69,7 +76,7 @@ class Line:
     axis: str
 
 
-def places(update: Update) -> tuple[Floats, str]:
+def places(update: InferenceResult) -> tuple[Floats, str]:
     """Where all readings stand in a figure, and what that is: z, or in a plane the angle, or the
     order of Fourier coefficients if there is nothing else.
     """
@@ -81,7 +88,7 @@ def places(update: Update) -> tuple[Floats, str]:
     return np.array([float(label[1:]) for label in update.observation.labels]), "harmonic"
 
 
-def main_line(update: Update) -> Line:
+def main_line(update: InferenceResult) -> Line:
     """The line through the strongest reading: of its label and radius, at each place the reading
     that is nearest to it in the plane.
     """
@@ -101,7 +108,7 @@ def main_line(update: Update) -> Line:
                 axis)
 
 
-def profile(update: Update) -> Figure:
+def profile(update: InferenceResult) -> Figure:
     """Readings along the main line, their predictions, and what the posterior leaves of them."""
     line = main_line(update)
     index = line.index
@@ -126,7 +133,7 @@ def profile(update: Update) -> Figure:
     return figure
 
 
-def relative_error(update: Update, published: Published | None) -> Figure:
+def relative_error(update: InferenceResult, published: Published | None) -> Figure:
     """|measured - predicted| / |measured| along the main line."""
     line = main_line(update)
     figure, (axis,) = axes_along(1)
@@ -149,7 +156,7 @@ def relative_error(update: Update, published: Published | None) -> Figure:
     return figure
 
 
-def residuals(update: Update) -> Figure:
+def residuals(update: InferenceResult) -> Figure:
     """Standardized residuals of all readings, before and after the update."""
     place, label = places(update)
     figure, axes = axes_along(2)
@@ -169,7 +176,7 @@ def residuals(update: Update) -> Figure:
     return figure
 
 
-def quantiles(update: Update) -> Figure:
+def quantiles(update: InferenceResult) -> Figure:
     """Whitened residuals of the readings that were not seen against normal quantiles; of the
     training readings by the prior, which has not seen them either, if nothing was held out.
     """
@@ -197,12 +204,12 @@ def quantiles(update: Update) -> Figure:
     return figure
 
 
-def _predictions(update: Update) -> list[tuple[str, Prediction, str]]:
+def _predictions(update: InferenceResult) -> list[tuple[str, Prediction, str]]:
     return [("prior", update.prediction_prior, PRIOR),
             ("posterior", update.prediction_posterior, POSTERIOR)]
 
 
-def _parts(update: Update, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def _parts(update: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Parts that some of the readings belong to, and which."""
     parts = np.array(update.parts)[index]
     for part in MARKERS:

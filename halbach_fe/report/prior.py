@@ -10,13 +10,13 @@ import scipy.stats as stats
 import xarray as xr
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats
-from halbach_fe.field_map import write_hdf5
-from halbach_fe.measured_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.page import MEASURED, PUBLISHED, save, write_page
-from halbach_fe.response import parameter_names
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
+from halbach_fe.response.matrix import parameter_names
+from halbach_fe.study.model import Study
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """From relative deviations to percent along the magnetization and degrees across it."""

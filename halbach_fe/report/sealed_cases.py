@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
-from halbach_fe.study import Study
+from halbach_fe.study.model import Study
 
 Confusion = Mapping[tuple[str, tuple[str, ...]], int]
 """Cases by what was hidden alone, and the names that were given to something found."""

@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.files import write_text
 from halbach_fe.report.page import IRON, POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
+from halbach_fe.study.model import Study
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.multipoles import plain, text_table
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, SECOND, draw_magnet, save, write_page
-from halbach_fe.shimming import STOPS, Placement, Shim, Step
-from halbach_fe.study_file import amended
-from halbach_fe.update import Update, write_text
+from halbach_fe.response.multipoles import plain, text_table
+from halbach_fe.study.edit import edited_text
 
 
-def shim_summary(shim: Shim, update: Update) -> dict[str, object]:
+def shim_summary(shim: Shim, update: InferenceResult) -> dict[str, object]:
     """What a script wants to know of a shim."""
     unit = shim.model.unit
     return {
@@ -83,7 +85,7 @@ def _text(shim: Shim, one: Placement) -> str:
     return f"{source} {where}, then turned by {sign * angle:.0f}° about its {about} axis"
 
 
-def write_shim(shim: Shim, update: Update, text: str, folder: Path) -> None:
+def write_shim(shim: Shim, update: InferenceResult, text: str, folder: Path) -> None:
     """Write shim.json, shim.html and its figures, and study.shimmed.toml from the study file's
     text, if blocks are moved and the study can say so.
     """
@@ -92,7 +94,7 @@ def write_shim(shim: Shim, update: Update, text: str, folder: Path) -> None:
     note = f"shimmed: {len(shim.steps)} moves"
     summary["study_file"] = "study.shimmed.toml" if shimmed else None
     if shimmed:
-        write_text(folder / "study.shimmed.toml", amended(text, [(shimmed, note)]))
+        write_text(folder / "study.shimmed.toml", edited_text(text, [(shimmed, note)]))
     write_text(folder / "shim.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     figures = {"shim_multipoles.png": (
         multipole_figure({"before": shim.before, "after": shim.after}, shim.limit),

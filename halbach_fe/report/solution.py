@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats, blocks_of
-from halbach_fe.multipoles import solved_circles
-from halbach_fe.observation import Observation
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import (
     MEASURED,
@@ -25,7 +25,9 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.view import field_points, of_nominal
-from halbach_fe.study import COMPONENTS, Study
+from halbach_fe.response.multipoles import solved_circles
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
@@ -54,7 +56,7 @@ class Solution:
     provenance: Mapping[str, str]
 
 
-def write_report(solution: Solution, folder: Path) -> None:
+def write_solution_report(solution: Solution, folder: Path) -> None:
     """Write report.html, self-contained, and its figures as PNG into ``folder``; and
     multipoles.csv, if the positions are full circles.
     """

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.block_table import write_blocks
-from halbach_fe.multipoles import Multipoles, plain, text_table
+from halbach_fe.core.files import write_text
+from halbach_fe.design.sorting import Sorted
+from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
-from halbach_fe.sorting import Sorted
-from halbach_fe.update import write_text
+from halbach_fe.response.multipoles import Multipoles, plain, text_table
 
 QUANTILES = (0.01, 0.5, 0.99)
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.blocks import Floats
-from halbach_fe.multipoles import plain
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.design.tolerance import QUANTILES, Tolerance
 from halbach_fe.report.multipoles import reference_summary, reference_text
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
-from halbach_fe.tolerance import QUANTILES, Tolerance
-from halbach_fe.update import write_text
+from halbach_fe.response.multipoles import plain
 
 
 def tolerance_summary(found: Tolerance) -> dict[str, object]:

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from halbach_fe.discretization import REFINEMENT
-from halbach_fe.field_map import atomic, write_csv
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -25,9 +25,9 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.view import Points, of_nominal
-from halbach_fe.study import Study
-from halbach_fe.update import write_text
-from halbach_fe.verification import EXACT, FLATTEST, STEEPEST, Verification
+from halbach_fe.response.discretization_error import REFINEMENT
+from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, Verification
+from halbach_fe.study.model import Study
 
 COLOURS = (PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("^", "o", ".", "s", "x")

@@ -13,10 +13,13 @@ import scipy.sparse as sparse
 from markupsafe import Markup
 from scipy.spatial import Delaunay
 
-from halbach_fe.blocks import Floats, Ints, MagnetBlock, blocks_of, outline_contains, turn_of
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.outline import outline_contains
+from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.page import IRON, MEASURED
-from halbach_fe.study import Study
-from halbach_fe.update import Update
+from halbach_fe.study.model import Study
 
 ARC_POINTS = 5
 SIGNED, UNSIGNED = "RdBu_r", "Cividis"
@@ -125,7 +128,7 @@ def of_nominal(study: Study, points: Points) -> Markup:
         points, positions=points.positions[few], values=points.values[few]))
 
 
-def of_update(update: Update) -> Markup:
+def of_update(update: InferenceResult) -> Markup:
     """The view of an update: the posterior, and what it leaves of each reading."""
     size = update.study.dimension
     nominal = update.response.nominal.reshape(-1, size)
@@ -258,7 +261,7 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
                        np.column_stack([ring, ahead + count, ring + count])])
     corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
-    corners = (corners - block.middle) @ turn_of(block.turn).T + block.middle + block.shift
+    corners = (corners - block.middle) @ rotation_matrix(block.turn).T + block.middle + block.shift
     return corners, np.vstack([face, face + count, sides])
 
 

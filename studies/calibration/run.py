@@ -17,20 +17,21 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import Floats
 from halbach_fe.cli import common
-from halbach_fe.errors import CheckFailedError
-from halbach_fe.inference import linear
-from halbach_fe.inference.calibration import ranks, uniformity
-from halbach_fe.inference.noise import independent
-from halbach_fe.inference.prior import block_prior
-from halbach_fe.inference.sampling import Move, Posterior, laplace, prior_reference, sample
-from halbach_fe.nonlinear import nonlinear_model
-from halbach_fe.observation import observe, points_from
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import CheckFailedError
+from halbach_fe.core.files import write_text
+from halbach_fe.inference.mcmc import LAPLACE_STEPS, PRIOR_STEP
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.calibration import write_calibration
-from halbach_fe.sampled import LAPLACE_STEPS, PRIOR_STEP
-from halbach_fe.study import read_study
-from halbach_fe.update import write_text
+from halbach_fe.response.nonlinear import nonlinear_model
+from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats.gaussian import nominal_prior
+from halbach_fe.stats.noise import independent
+from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
+from halbach_fe.stats.sbc import ranks, uniformity
+from halbach_fe.study.reader import read_study
 
 STUDY = Path(__file__).parent.parent / "nonlinear-2d" / "study.toml"
 DRAWS, THIN, WARM_UP = 99, 4, 40
@@ -50,15 +51,15 @@ def run(arguments: argparse.Namespace) -> int:
     measured = np.ones_like(points, bool)
     observation = observe(study, points, measured)
     generator = np.random.default_rng(arguments.seed)
-    with common.workshop(arguments) as workshop:
+    with common.session(arguments) as session:
         model = nonlinear_model(study, observation, replace(
-            workshop, folder=workshop.folder / "model"), generator)
-    prior = block_prior(model.nominal, 2, 0.01, 1.0)
+            session, folder=session.folder / "model"), generator)
+    prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
     noise = independent(np.full(len(observation), SIGMA_T))
     tangent = model.jacobian(model.nominal)
 
     def closed_form(readings: Floats, generator: np.random.Generator) -> Floats:
-        return linear.posterior(tangent, readings, noise, prior).sample(DRAWS, generator)
+        return linear_gaussian.posterior(tangent, readings, noise, prior).sample(DRAWS, generator)
 
     def target(readings: Floats) -> Posterior:
         return Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
@@ -66,13 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
     def chains(readings: Floats, generator: np.random.Generator) -> Floats:
         posterior = target(readings)
         reference, _ = laplace(posterior, model.jacobian)
-        moves = [Move(reference, step) for step in LAPLACE_STEPS] + [
-            Move(prior_reference(prior), PRIOR_STEP)]
+        moves = [Proposal(reference, step) for step in LAPLACE_STEPS] + [
+            Proposal(prior_reference(prior), PRIOR_STEP)]
         chain = sample(posterior, moves, WARM_UP + THIN * DRAWS, generator, reference.centre)
         return chain.samples[WARM_UP::THIN]
 
     def short(readings: Floats, generator: np.random.Generator) -> Floats:
-        chain = sample(target(readings), [Move(prior_reference(prior), PCN_STEP)], PCN_STEPS,
+        chain = sample(target(readings), [Proposal(prior_reference(prior), PCN_STEP)], PCN_STEPS,
                        generator, np.zeros(prior.root.shape[1]))
         return chain.samples[:: PCN_STEPS // DRAWS][:DRAWS]
 

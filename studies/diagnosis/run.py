@@ -25,23 +25,29 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from halbach_fe.block_table import BlockTable
-from halbach_fe.cache import Cache
-from halbach_fe.campaign.effects import EFFECTS as CAN_BE_HIDDEN
-from halbach_fe.campaign.extras import needed
-from halbach_fe.campaign.simulate import simulate
 from halbach_fe.cli import common
-from halbach_fe.diagnose import Diagnosis, Solver, diagnose, remembering
-from halbach_fe.diagnosis.selection import best_factors
-from halbach_fe.effects import catalogue
-from halbach_fe.errors import CheckFailedError, HalbachError
-from halbach_fe.extent import magnet_half_length
-from halbach_fe.field_map import points_of
-from halbach_fe.getdp import find_getdp
+from halbach_fe.core.errors import CheckFailedError, HalbachError
+from halbach_fe.core.files import write_text
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.model_selection import best_factors
+from halbach_fe.diagnosis.result import Diagnosis
+from halbach_fe.diagnosis.search import NominalSolver, memoized_solver
+from halbach_fe.geometry.domain import magnet_half_length
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.result import HELD_OUT
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.field_map import points_of
 from halbach_fe.report.sealed_cases import write_sealed_cases
-from halbach_fe.solve import Workshop
-from halbach_fe.study import HeldOut, Study, read_study
-from halbach_fe.update import HELD_OUT, infer, write_text
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.getdp_cache import Cache
+from halbach_fe.solver.session import Session
+from halbach_fe.study.inference import HeldOut
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.extras import needed
+from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
+from halbach_fe.synthetic.simulate import simulate_campaign
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0
@@ -122,27 +128,27 @@ OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
 
 
 def run_case(
-    study: Study, case: Case, workshop: Workshop, solver: Solver
+    study: Study, case: Case, session: Session, solver: NominalSolver
 ) -> dict[str, Any]:
     """Simulate, diagnose, and compare with what is sealed."""
-    campaign = simulate(study, case.seed, hide=[(CAN_BE_HIDDEN[name], None)
+    campaign = simulate_campaign(study, case.seed, hide=[(CAN_BE_HIDDEN[name], None)
                                                 for name in case.hidden])
     readings = campaign.readings
     if case.outside:
         added = OUTSIDE[case.outside](points_of(readings), np.random.default_rng(case.seed))
         readings = readings.assign(B_T=readings["B_T"] + added)
-    found = diagnose(study, readings, workshop, campaign.blocks, solver=solver)
+    found = diagnose(study, readings, session, campaign.blocks, solver=solver)
     result = {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
               "truth": campaign.truth["effects"], **outcome(found),
               "best": own_factors(found, case.hidden)}
     if case.hidden == ("iron_ring",):
         exact = readings.assign(B_T=(readings["B_T"].dims, campaign.without_noise))
         result["fringe_T"] = [fringe(one, readings, exact, replace(
-            workshop, folder=workshop.folder / f"fringe-{when}"), campaign.blocks)
+            session, folder=session.folder / f"fringe-{when}"), campaign.blocks)
             for when, one in (("before", found.read), ("after", found.study))]
     if not case.hidden and not case.outside and case.seed % 4 == 0:  # it takes long
         sure = study.model_copy(update={"prior": study.prior.model_copy(update=NO_BLOCKS)})
-        alarm = diagnose(sure, readings, workshop, solver=solver)
+        alarm = diagnose(sure, readings, session, solver=solver)
         result["without_blocks"] = bool(alarm.anything or alarm.unknown)
     return result
 
@@ -165,7 +171,7 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
 
 
 def fringe(
-    study: Study, readings: xr.Dataset, exact: xr.Dataset, workshop: Workshop, blocks: BlockTable
+    study: Study, readings: xr.Dataset, exact: xr.Dataset, session: Session, blocks: BlockTable
 ) -> float:
     """Rms error in T of the fringe field, beyond the magnet's ends, as it is foretold by a model
     that was updated with the readings of the bore alone.
@@ -174,7 +180,7 @@ def fringe(
     kept = HeldOut(z_ranges_m=((-FAR_M, -end), (end, FAR_M)))
     update = infer(study.model_copy(update={
         "inference": study.inference.model_copy(update={"held_out": kept})}),
-        readings, workshop, blocks)
+        readings, session, blocks)
     truth = update.observation.read(exact["B_T"].values)[update.held_out]
     return float(np.sqrt(np.mean((update.prediction_posterior.mean[update.held_out] - truth)**2)))
 
@@ -283,7 +289,7 @@ def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
     return rows
 
 
-_known: dict[int, tuple[TemporaryDirectory[str], Workshop, Solver]] = {}
+_known: dict[int, tuple[TemporaryDirectory[str], Session, NominalSolver]] = {}
 """Of each thread of a process: where it works, and what it solved for other cases. (On a worker of
 a scheduler, where this file comes with every case, for one case only.)"""
 
@@ -296,9 +302,9 @@ def run_one(
     try:
         if threading.get_ident() not in _known:
             folder = TemporaryDirectory(prefix="halbach-fe-")
-            workshop = Workshop(find_getdp(getdp), Path(folder.name), time_limit_s=time_limit_s,
+            session = Session(find_getdp(getdp), Path(folder.name), time_limit_s=time_limit_s,
                                 cache=cache, processes=processes)
-            _known[threading.get_ident()] = folder, workshop, remembering(workshop)
+            _known[threading.get_ident()] = folder, session, memoized_solver(session)
         return run_case(study, case, *_known[threading.get_ident()][1:])
     except HalbachError as error:
         return {"failure": str(error)}

@@ -16,10 +16,10 @@ from run import HERE, assumptions, options, profile_to_map, with_step
 
 from halbach_fe.cli import common
 from halbach_fe.cli.diagnose import tell, write
-from halbach_fe.diagnose import diagnose
-from halbach_fe.field_map import read_map
-from halbach_fe.next_measurement import separations
-from halbach_fe.study import read_study
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.discriminating_measurements import separations
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.study.reader import read_study
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -28,9 +28,9 @@ def run(arguments: argparse.Namespace) -> int:
     profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, arguments.z_step_m)
     study = with_step(read_study(arguments.study), arguments.z_step_m)
     data = read_map(measured)
-    with common.workshop(arguments) as workshop:
-        found = diagnose(study, data, workshop, say=common.say)
-        next_ones = separations(found, data, workshop)
+    with common.session(arguments) as session:
+        found = diagnose(study, data, session, say=common.say)
+        next_ones = separations(found, data, session)
     assumed = assumptions(found.before, arguments.z_step_m)
     text = arguments.study.read_text(encoding="utf-8")
     write(found, next_ones, study, text, arguments.output, assumed)

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from halbach_fe.campaign.simulate import simulate, write_campaign
-from halbach_fe.field_map import write_map
-from halbach_fe.study import FluxDensity, LinePositions, read_study
+from halbach_fe.measurement.field_map import write_map
+from halbach_fe.study.measurement import FluxDensity, LinePositions
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.simulate import simulate_campaign, write_campaign
 
 HERE = Path(__file__).parent
 SEED = 4
@@ -21,11 +22,12 @@ SEED = 4
 def main() -> None:
     """Write the folder twin."""
     study = read_study(HERE / "twin.toml")
-    twin = replace(simulate(study, SEED), held_out=None)  # the axis takes its place
+    twin = replace(simulate_campaign(study, SEED), held_out=None)  # the axis takes its place
     write_campaign(twin, HERE / "twin")
     axis = FluxDensity(quantity="flux_density", components=("x",), positions=LinePositions(
         kind="line", start_m=(0, 0, -0.775), end_m=(0, 0, 0.775), count=156))
-    profile = simulate(study.model_copy(update={"observation": axis}), SEED)  # the same magnet
+    profile = simulate_campaign(study.model_copy(update={"observation": axis}),
+                                SEED)  # the same magnet
     write_map(profile.readings, HERE / "twin" / "axis.csv")
 
 

@@ -15,13 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import Floats
 from halbach_fe.cli import common
-from halbach_fe.field_map import field_map, read_map, write_map
-from halbach_fe.report.inference import score_table, write_report
+from halbach_fe.core.arrays import Floats
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.result import InferenceResult
+from halbach_fe.inference.storage import write_inference
+from halbach_fe.measurement.field_map import field_map, read_map, write_map
+from halbach_fe.report.inference import score_table, write_inference_report
 from halbach_fe.report.prediction import Published
-from halbach_fe.study import Study, read_study
-from halbach_fe.update import Update, infer, write_update
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 
 HERE = Path(__file__).parent
 Z_STEP_M = 0.010
@@ -60,7 +63,7 @@ def width_at_half_maximum(z: Floats, field: Floats) -> float:
                  - np.interp(half, field[first - 1:first + 1], z[first - 1:first + 1]))
 
 
-def assumptions(update: Update, z_step: float) -> list[str]:
+def assumptions(update: InferenceResult, z_step: float) -> list[str]:
     """What the reader must know before the numbers."""
     z = update.observation.positions[:, 2]
     measured = width_at_half_maximum(z, update.readings)
@@ -87,10 +90,11 @@ def run(arguments: argparse.Namespace) -> int:
     study = with_step(read_study(arguments.study), arguments.z_step_m)
     common.say(f"FASER dipole: {study.array.rings * study.array.blocks_per_ring} blocks, "
                f"{len(published.z)} readings.")
-    with common.workshop(arguments) as workshop:
-        update = infer(study, read_map(measured), workshop)
-    write_update(update, arguments.output)
-    write_report(update, arguments.output, published, assumptions(update, arguments.z_step_m))
+    with common.session(arguments) as session:
+        update = infer(study, read_map(measured), session)
+    write_inference(update, arguments.output)
+    write_inference_report(update, arguments.output, published,
+                           assumptions(update, arguments.z_step_m))
     common.print_table(score_table(update, published),
                        "Median relative error of B_x on the axis, before and after the update")
     common.say(f"Report: {arguments.output / 'report.html'}")

@@ -15,18 +15,21 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.block_table import read_blocks
-from halbach_fe.blocks import Floats
 from halbach_fe.cli import common
-from halbach_fe.field_map import points_of, read_map
-from halbach_fe.inference.linear import predict
-from halbach_fe.inference.prior import Gaussian
-from halbach_fe.observation import observe
-from halbach_fe.report.inference import write_report
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.storage import write_inference
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import points_of, read_map
+from halbach_fe.measurement.observation import observe
+from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.magnetizations import scores, write_magnetizations
-from halbach_fe.response import response
-from halbach_fe.study import FluxDensity, PointPositions, read_study
-from halbach_fe.update import infer, write_text, write_update
+from halbach_fe.response.matrix import response_matrix
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.linear_gaussian import predict
+from halbach_fe.study.measurement import FluxDensity, PointPositions
+from halbach_fe.study.reader import read_study
 
 HERE = Path(__file__).parent
 HOMOGENEOUS_M = (-0.43, 0.42)
@@ -51,17 +54,17 @@ def published() -> dict[str, dict[str, float]]:
 def run(arguments: argparse.Namespace) -> int:
     """Run the twin and print its table."""
     study, axis = read_study(arguments.study), read_map(HERE / "twin" / "axis.csv")
-    with common.workshop(arguments) as workshop:
-        update = infer(study, read_map(HERE / "twin" / "map.csv"), workshop,
+    with common.session(arguments) as session:
+        update = infer(study, read_map(HERE / "twin" / "map.csv"), session,
                        read_blocks(HERE / "twin" / "blocks.csv"))
         points = points_of(axis)
         line = study.model_copy(update={"observation": FluxDensity(
             quantity="flux_density", components=("x",), positions=PointPositions(
                 kind="points", points_m=tuple(map(tuple, points.tolist()))))})
         seen = observe(line, points, ~np.isnan(axis["B_T"].values))
-        on_axis = response(line, seen, replace(workshop, folder=arguments.output / "axis"))
-    write_update(update, arguments.output)
-    write_report(update, arguments.output)
+        on_axis = response_matrix(line, seen, replace(session, folder=arguments.output / "axis"))
+    write_inference(update, arguments.output)
+    write_inference_report(update, arguments.output)
     measured = seen.apply(np.nan_to_num(axis["B_T"].values))
     blocks = json.loads((HERE / "twin" / "truth" / "truth.json").read_text())["blocks"]
     truth = np.array([one["magnetization_A_per_m"] for one in blocks]).ravel()

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.campaign.blocks import draw
-from halbach_fe.campaign.bodies import magnet_of
-from halbach_fe.campaign.reaction import Elements
-from halbach_fe.campaign.simulate import field_of, model_of
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.observation import points_from
-from halbach_fe.study import read_study
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.drawn_blocks import draw_magnet
+from halbach_fe.synthetic.ngsolve_reaction import Elements
+from halbach_fe.synthetic.simulate import model_of, true_field
 
 HERE = Path(__file__).parent
 SEED = 3
@@ -29,8 +29,8 @@ def main() -> None:
     """Write field.h5 and truth.csv."""
     study = read_study(HERE / "study.toml")
     points = points_from(study.observation.positions)
-    magnet = draw(study, magnet_of(study), np.random.default_rng(SEED)).mounted
-    field = field_of(magnet, points, ELEMENTS).astype(np.float32)  # to 3e-8 T, to be stored
+    magnet = draw_magnet(study, magnet_of(study), np.random.default_rng(SEED)).mounted
+    field = true_field(magnet, points, ELEMENTS).astype(np.float32)  # to 3e-8 T, to be stored
     write_map(field_map(points, field, attributes={
         "source": ", ".join(model_of(magnet).values()) + f", magnetizations of seed {SEED}"}),
         HERE / "field.h5")

@@ -15,13 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import Floats
 from halbach_fe.cli import common
-from halbach_fe.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.inference.prior import Gaussian
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.storage import write_inference
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.report.magnetizations import scores, write_magnetizations
-from halbach_fe.study import FourierCoefficients, Study, read_study
-from halbach_fe.update import infer, write_text, write_update
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.measurement import FourierCoefficients
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 
 HERE = Path(__file__).parent
 SEED = 11
@@ -113,9 +117,9 @@ def run(arguments: argparse.Namespace) -> int:
                              dict(field.attrs) | {"noise": f"{sigma:g} T, seed {SEED}"})
         folder = arguments.output / reading
         write_map(measured, folder / "map.h5")
-        with common.workshop(arguments) as workshop:
-            update = infer(one, measured, replace(workshop, folder=folder))
-        write_update(update, folder)
+        with common.session(arguments) as session:
+            update = infer(one, measured, replace(session, folder=folder))
+        write_inference(update, folder)
         known = {"prior": update.prior} | known | {f"posterior from {reading}": update.posterior}
         results["here"][reading] = figures(update.prior, update.posterior, truth)
         common.say(f"q_{reading}: {len(update.readings)} readings, solver's error up to "

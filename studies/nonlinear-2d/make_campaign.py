@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import blocks_of
-from halbach_fe.campaign.bodies import magnet_of
-from halbach_fe.campaign.reaction import Elements
-from halbach_fe.campaign.simulate import field_of
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.observation import points_from
-from halbach_fe.study import read_study
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.ngsolve_reaction import Elements
+from halbach_fe.synthetic.simulate import true_field
 
 HERE = Path(__file__).parent
 SEED = 3
@@ -40,7 +40,7 @@ def main() -> None:
     sigma = study.noise.regions[0].sigma_T
     for name, deviation in (("paper", table["truth_A_per_m"]), ("drawn", drawn)):
         truth = nominal + deviation.reshape(2, -1).T
-        field = field_of(magnet_of(study).with_magnetizations(truth), points, Elements(0.01))
+        field = true_field(magnet_of(study).with_magnetizations(truth), points, Elements(0.01))
         field[:, :2] += sigma * generator.standard_normal((len(points), 2))
         field[:, 2] = np.nan
         write_map(field_map(points, field, attributes={

@@ -16,14 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.cli import common
-from halbach_fe.field_map import read_map
-from halbach_fe.inference.prior import Gaussian
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
+from halbach_fe.measurement.field_map import read_map
 from halbach_fe.report.magnetizations import scores, write_magnetizations
-from halbach_fe.sampled import sample_posterior, sampled_summary, with_samples, write_sampled
-from halbach_fe.study import Study, read_study
-from halbach_fe.update import infer, write_text
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 
 HERE = Path(__file__).parent
 CASES = {"paper": "the paper's truth", "drawn": "a truth drawn from the prior"}
@@ -56,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     for case, what in CASES.items():
         truth = np.loadtxt(HERE / f"truth-{case}.csv", delimiter=",", skiprows=1).ravel()
         folder = arguments.output / case
-        with common.workshop(arguments) as workshop:
-            there = replace(workshop, folder=folder)
+        with common.session(arguments) as session:
+            there = replace(session, folder=folder)
             update = infer(study, read_map(HERE / f"map-{case}.csv"), there, prior=prior)
             with common.workers(arguments) as pool:
                 found = sample_posterior(update, there, arguments.samples, effective=EFFECTIVE,

@@ -15,16 +15,19 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.blocks import Floats, blocks_of
 from halbach_fe.cli import common
-from halbach_fe.observation import observe, points_from
-from halbach_fe.planning import plan
+from halbach_fe.core.arrays import Floats
+from halbach_fe.design.measurement_plan import plan_measurement
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.plan import plan_summary, write_plan
 from halbach_fe.report.sensitivity import Sensitivity, write_sensitivity
-from halbach_fe.response import Response, response
-from halbach_fe.sensitivity import derivative
-from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, curve_of, read_study
+from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.solver.gateaux import gateaux_derivative
+from halbach_fe.solver.session import Session
+from halbach_fe.study.model import Study, curve_of
+from halbach_fe.study.reader import read_study
 
 HERE = Path(__file__).parent
 BLOCK = 13
@@ -33,13 +36,13 @@ BLOCK = 13
 MAP_HALF_WIDTH_M, MAP_POINTS = 0.25, 201
 
 
-def plane(study: Study, workshop: Workshop) -> tuple[Floats, Floats]:
+def plane(study: Study, session: Session) -> tuple[Floats, Floats]:
     """The map's axis (n,) in m, and |B'| (n, n) in T m/A."""
     # off the lines of symmetry, where the derivative of an edge between elements is two-valued
     axis = np.linspace(-MAP_HALF_WIDTH_M, MAP_HALF_WIDTH_M, MAP_POINTS) + 1e-6
     x, y = np.meshgrid(axis, axis)
     points = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
-    found = derivative(study, BLOCK - 1, points, workshop)
+    found = gateaux_derivative(study, BLOCK - 1, points, session)
     return axis, np.linalg.norm(found, axis=1).reshape(x.shape)
 
 
@@ -57,7 +60,7 @@ def by_block(study: Study, model: Response) -> tuple[Floats, Floats]:
     return size[0], size[1]
 
 
-def printed_form_error(study: Study, model: Response, workshop: Workshop) -> float:
+def printed_form_error(study: Study, model: Response, session: Session) -> float:
     """Largest relative error on the circle if the iron is that of the derivative's own, small,
     field: at its initial permeability.
     """
@@ -67,8 +70,8 @@ def printed_form_error(study: Study, model: Response, workshop: Workshop) -> flo
     initial = study.model_copy(update={"iron_ring": ring.model_copy(
         update={"curve": None, "relative_permeability": curve.initial})})
     points = points_from(study.observation.positions)
-    other = response(initial, observe(study, points, np.ones_like(points, bool)),
-                     replace(workshop, folder=workshop.folder / "printed-form"))
+    other = response_matrix(initial, observe(study, points, np.ones_like(points, bool)),
+                     replace(session, folder=session.folder / "printed-form"))
     column = 2 * (BLOCK - 1)
     change = blocks_of(study)[BLOCK - 1].magnetization[:2]
     ours, theirs = (one.matrix[:, column:column + 2] @ change for one in (model, other))
@@ -80,18 +83,18 @@ def run(options: argparse.Namespace) -> int:
     study = read_study(options.study)
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool))
-    with common.workshop(options) as workshop:
-        def room(name: str) -> Workshop:
-            return replace(workshop, folder=workshop.folder / name)
+    with common.session(options) as session:
+        def room(name: str) -> Session:
+            return replace(session, folder=session.folder / name)
 
         axis, size = plane(study, room("map"))
-        model = response(study, observation, room("circle"))
+        model = response_matrix(study, observation, room("circle"))
         on_circle = study.model_copy(update={"plan": study.plan.model_copy(
             update={"candidates": tuple(one for one in study.plan.candidates
                                         if one.radius_m == study.observation.positions.radius_m)})})
-        plans = {"on the circle": plan(on_circle, room("plan-circle")),
-                 "wherever the probe can go": plan(study, room("plan"))}
-        error = printed_form_error(study, model, workshop)
+        plans = {"on the circle": plan_measurement(on_circle, room("plan-circle")),
+                 "wherever the probe can go": plan_measurement(study, room("plan"))}
+        error = printed_form_error(study, model, session)
     along, across = by_block(study, model)
     one = plans["on the circle"]
     information = {"equally spaced circle": (one.baseline_counts, one.baseline_gain)} | {

@@ -17,14 +17,16 @@ import numpy as np
 import pytest
 
 from benchmarks.recovery import unreadable
-from halbach_fe.blocks import blocks_of
-from halbach_fe.cache import LIMIT_VARIABLE
 from halbach_fe.cli import main, parser
 from halbach_fe.cli.common import print_table
-from halbach_fe.errors import EXIT_CODES
-from halbach_fe.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.getdp import blas_of
-from halbach_fe.study import MU_0, Study, read_study
+from halbach_fe.core.errors import EXIT_CODES
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.solver.getdp import blas_of
+from halbach_fe.solver.getdp_cache import LIMIT_VARIABLE
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT, circle
 
 STUDY = """

@@ -14,16 +14,16 @@ import magpylib
 import numpy as np
 import pytest
 
-from halbach_fe.blocks import blocks_of, position_angle_deg
 from halbach_fe.cli import main
-from halbach_fe.diagnosed import summary
-from halbach_fe.diagnosis.misread import PLAUSIBLE
-from halbach_fe.effects import catalogue
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.study import parse_study
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.map_conventions import PLAUSIBLE
+from halbach_fe.diagnosis.summary import diagnosis_summary
+from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT, circle
 
-STUDY = """# of the workshop's drawing
+STUDY = """# of the session's drawing
 name = "small"
 dimension = 3
 
@@ -283,9 +283,9 @@ def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
 ):
     """Were a gap found to be negative, no study could hold it."""
     gap = next(one for one in catalogue() if one.name == "azimuthal_gap")
-    monkeypatch.setattr("halbach_fe.diagnosed._steps", lambda study, _: [
+    monkeypatch.setattr("halbach_fe.diagnosis.summary._steps", lambda study, _: [
         (gap.apply(study, gap.places(study)[0], [-1e-4]), "a gap")])
-    monkeypatch.setattr("halbach_fe.diagnose.unknown", lambda *_: None)  # takes its time
+    monkeypatch.setattr("halbach_fe.diagnosis.diagnose.find_unknown_cause", lambda *_: None)
     out = tmp_path / "out"
     assert main(["diagnose", str(study), "--measurements", str(measured(tmp_path, 0.0)),
                  "-o", str(out), "--effects", "gain_x"]) == 3
@@ -306,7 +306,7 @@ def test_the_readme_says_what_is_in_the_file():
         numerical=None, unknown=None, anything=False, probabilities={}, groups_before=[],
         groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1,
         at_rest=True)
-    assert keys == list(summary(nothing))
+    assert keys == list(diagnosis_summary(nothing))
     assert all(f"`{name}`" in section for name in PLAUSIBLE)
     rows = [line.split("|") for line in section.splitlines()
             if line.startswith(("| field |", "| instrument |"))]

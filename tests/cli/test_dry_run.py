@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from halbach_fe import cost
 from halbach_fe.cli import main
-from halbach_fe.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.response import resource_estimate
 from tests.cli.test_cli import STUDY
 from tests.conftest import circle
 
@@ -54,7 +54,7 @@ def test_the_table(commands, capsys):
     (1e-3, ["0.001 GiB left"]), (0.36, ["--jobs 1"]), (64.0, []), (None, [])])
 def test_too_little_memory(commands, capsys, monkeypatch, available, hints):
     """It is a warning; what would help is said, but only if it does."""
-    monkeypatch.setattr(cost, "available_memory", lambda: available)
+    monkeypatch.setattr(resource_estimate, "available_memory", lambda: available)
     assert main([*commands["solve"], "--jobs", "2", "--dry-run"]) == 0
     said = capsys.readouterr().err
     assert said.startswith("warning: This needs about") == bool(hints)
@@ -63,7 +63,7 @@ def test_too_little_memory(commands, capsys, monkeypatch, available, hints):
 
 
 def test_the_machine_says_what_it_has():
-    assert 0 < cost.available_memory() < 1e6
+    assert 0 < resource_estimate.available_memory() < 1e6
 
 
 @pytest.mark.parametrize(("old", "new"), [

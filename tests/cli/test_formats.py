@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
-from halbach_fe.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from tests.cli.test_cli import refused
-from tests.unit.test_import_map import FIELD, MM_MT, POINTS, rows
+from tests.measurement.test_import_map import FIELD, MM_MT, POINTS, rows
 
 
 def test_import_and_export(tmp_path, capsys):

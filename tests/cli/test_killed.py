@@ -20,7 +20,7 @@ from benchmarks.recovery import (
     undisturbed,
     unreadable,
 )
-from halbach_fe.errors import GetDPError, NotConvergedError, StudyError
+from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError
 from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "studies" / "quadrupole"

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from halbach_fe.block_table import read_blocks
 from halbach_fe.cli import common, main
-from halbach_fe.field_map import read_map
-from halbach_fe.multipoles import UNITS
-from halbach_fe.study import read_study
-from halbach_fe.update import read_posterior
+from halbach_fe.inference.storage import read_posterior
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.response.multipoles import UNITS
+from halbach_fe.study.reader import read_study
 from tests.pages import page
 
 STUDY = """

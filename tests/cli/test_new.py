@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
-from halbach_fe.errors import StudyError
-from halbach_fe.new_study import Magnet, new_study, studied
-from halbach_fe.observation import held_out, observe, points_from
-from halbach_fe.study import read_study
+from halbach_fe.core.errors import StudyError
+from halbach_fe.measurement.observation import held_out, observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.study.reader import read_study
+from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
 
-MAGNETS = [Magnet(shape=shape, iron_ring=iron, ring_length_m=length, rings=3 if length else 1,
+MAGNETS = [
+    MagnetTemplate(shape=shape, iron_ring=iron, ring_length_m=length, rings=3 if length else 1,
                   multipole_order=order)
            for shape, iron, length, order in itertools.product(
                ("sector", "trapezoid", "cuboid"), (False, True), (None, 0.03), (1, 2))]
@@ -28,10 +30,10 @@ def test_every_option_can_be_used_as_it_stands(magnet):
     whole = re.sub(r"(?m)^#: ", "", text)
     if magnet.shape == "cuboid":
         assert "side_gap_m" not in whole
-    assert studied(whole) != studied(text)
+    assert parse_new_study(whole) != parse_new_study(text)
     spoiled = whole.replace("remanence_T", "remanance_T")  # the comparison would see it
     with pytest.raises(StudyError, match="remanance_T"):
-        studied(spoiled)
+        parse_new_study(spoiled)
 
 
 def test_command_writes_what_was_asked_for(tmp_path):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import magpylib
 import numpy as np
 
-from halbach_fe.blocks import blocks_of, position_angle_deg
-from halbach_fe.field_map import field_map
-from halbach_fe.study import Study, parse_study
+from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 
 NOISE_T = 5e-5

@@ -5,19 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.blocks import blocks_of
-from halbach_fe.diagnose import Hypothesis, Named, _possible, diagnose
-from halbach_fe.diagnosis.selection import Candidate, Found
-from halbach_fe.effects import catalogue
-from halbach_fe.effects.base import Place
-from halbach_fe.effects.blocks_swapped import BlocksSwapped
-from halbach_fe.exact_field import field_of
-from halbach_fe.field_map import field_map, points_of
-from halbach_fe.study import parse_study
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
+from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
+from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.search import _possible
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.study.reader import parse_study
 from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
 
 
-class Restless(BlocksSwapped):
+class Restless(BlocksSwappedEffect):
     """Looks at more pairs in every round."""
 
     looked = 0
@@ -32,7 +34,7 @@ def uniform(data):
 
 
 @pytest.mark.parametrize("name", ["offset_x", "z_scale", "none"])
-def test_a_search_among_pairs_of_blocks(name, workshop, generator):
+def test_a_search_among_pairs_of_blocks(name, session, generator):
     """Which pairs are looked at closely changes from round to round; the rest is the same."""
     if name == "z_scale":  # 1 mm at the ends of the map
         data = measured(STUDY, generator, at=CIRCLES * [1.0, 1.0, 1.005])
@@ -41,7 +43,7 @@ def test_a_search_among_pairs_of_blocks(name, workshop, generator):
         data = uniform(data) if name == "offset_x" else data
     some = [effect for effect in catalogue() if effect.name in (
         "background", "gain_x", "gain_z", "length", "offset_x", "z_scale")]
-    found = diagnose(STUDY, data, workshop, effects=[Restless(), *some])
+    found = diagnose(STUDY, data, session, effects=[Restless(), *some])
     assert found.unknown is None
     assert [name] == [one for each in found.named for one in each.found.effects if one == name] or (
         name == "none" and not found.named)
@@ -52,7 +54,7 @@ def test_a_search_among_pairs_of_blocks(name, workshop, generator):
 
 
 @pytest.mark.parametrize("name", ["azimuthal_gap", "radial_gap"])
-def test_impossible_amplitudes_are_no_explanation(workshop, generator, name):
+def test_impossible_amplitudes_are_no_explanation(session, generator, name):
     """Blocks that are wider than their sectors, or nearer to the axis than their neighbours let
     them: what that does is not called a gap.
     """
@@ -65,14 +67,14 @@ def test_impossible_amplitudes_are_no_explanation(workshop, generator, name):
     wider, narrower = (field_map(CIRCLES, nominal + sign * change + noise) for sign in (-1, 1))
     tight = study.model_copy(update={"prior": study.prior.model_copy(update={
         "magnitude_sd": 1e-4, "direction_sd_deg": 0.01, "common_mode_sd": 1e-4})})
-    (named,) = diagnose(tight, narrower, workshop, effects=[gap]).named
+    (named,) = diagnose(tight, narrower, session, effects=[gap]).named
     assert named.values == pytest.approx([3e-4], abs=4 * named.sd[0])
-    assert diagnose(tight, wider, workshop, effects=[gap]).named == ()
+    assert diagnose(tight, wider, session, effects=[gap]).named == ()
 
 
 def test_no_recoil_permeability_is_below_one():
     effect = next(one for one in catalogue() if one.name == "recoil_permeability_across")
     for value, there in ((0.1, True), (-0.1, False)):
-        named = Named(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
-                      Found(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
+        named = IdentifiedEffect(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
+                      SelectedEffect(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
         assert _possible(with_array(recoil_permeability=1.05), [named], CIRCLES) == there

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from halbach_fe.blocks import blocks_of, mountings
-from halbach_fe.effects import catalogue
-from halbach_fe.effects.base import Place
-from halbach_fe.exact_field import field_of
-from halbach_fe.external import external_field
-from halbach_fe.instrument import probe, remainder
-from halbach_fe.scene import Scene
-from halbach_fe.study import parse_study
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.mounting import mountings
+from halbach_fe.measurement.instrument import probe, remainder
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle
 
 STUDY = parse_study(changed(
@@ -42,7 +43,7 @@ def shown(study):
 
 @pytest.fixture(scope="module")
 def scene():
-    return Scene(STUDY, POINTS, TIME, lambda study: field_of(blocks_of(study), POINTS))
+    return NominalFields(STUDY, POINTS, TIME, lambda study: field_of(blocks_of(study), POINTS))
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED))

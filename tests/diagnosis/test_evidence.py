@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.residuals import groups, left_out
-from halbach_fe.diagnosis.selection import (
+from halbach_fe.diagnosis.loo_residuals import loo_residuals, residual_groups
+from halbach_fe.diagnosis.model_selection import (
     Candidate,
     best_factors,
-    gains,
+    log_bayes_factors,
     log_evidence,
-    select,
+    select_effects,
 )
 
 
@@ -72,7 +72,7 @@ def test_a_certain_effect_shifts_the_readings(problem):
     expected = dense(response, signatures[:, :0], residual - signatures[:, 1]) - dense(
         response, signatures[:, :0], residual)
     certain = Candidate("missing", "", (1,), certain=True)
-    assert gains(evidence, [certain])[0] == pytest.approx(expected)
+    assert log_bayes_factors(evidence, [certain])[0] == pytest.approx(expected)
     other = Candidate("other", "", (3,))
     together = dense(response, signatures[:, [3]], residual - signatures[:, 1]) - dense(
         response, signatures[:, :0], residual)
@@ -86,14 +86,14 @@ def test_left_out_residuals_are_those_of_each_reading_given_the_others(problem):
     others = np.arange(1, 40)
     weights = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, 0])
     mean, variance = weights @ residual[others], covariance[0, 0] - weights @ covariance[others, 0]
-    assert left_out(Marginal.of(response), residual)[0] == pytest.approx(
+    assert loo_residuals(Marginal.of(response), residual)[0] == pytest.approx(
         (residual[0] - mean) / np.sqrt(variance))
 
 
 def test_groups_are_judged_given_all_other_readings(problem):
     response, _, residual = problem
     members = {"half": ["first"] * 15 + ["second"] * 25}
-    found = groups(Marginal.of(response), residual, members)
+    found = residual_groups(Marginal.of(response), residual, members)
     covariance = np.eye(40) + response @ response.T
     one, two = np.arange(15), np.arange(15, 40)
     weights = np.linalg.solve(covariance[np.ix_(two, two)], covariance[np.ix_(two, one)])
@@ -108,9 +108,9 @@ def test_a_group_disagrees_where_readings_do():
     names = {"third": [str(number // 20) for number in range(60)]}
     clean = response @ generator.standard_normal(4) + generator.standard_normal(60)
     marginal = Marginal.of(response)
-    assert not any(group.disagrees for group in groups(marginal, clean, names))
+    assert not any(group.disagrees for group in residual_groups(marginal, clean, names))
     clean[20:40] += 3.0 * (-1) ** np.arange(20)
-    wrong = groups(marginal, clean, names)
+    wrong = residual_groups(marginal, clean, names)
     assert wrong[1].disagrees
     assert wrong[1].chi2_per_reading > 2 * max(wrong[0].chi2_per_reading, wrong[2].chi2_per_reading)
 
@@ -129,18 +129,18 @@ def hidden(amplitudes, seed=0, readings=200):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nothing_is_found_where_nothing_is(seed):
-    assert select(*hidden({}, seed)) == []
+    assert select_effects(*hidden({}, seed)) == []
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_several_effects_are_found_together(seed):
-    found = select(*hidden({3: 1.0, 7: -0.8}, seed))
+    found = select_effects(*hidden({3: 1.0, 7: -0.8}, seed))
     assert {one.candidate.effect for one in found} == {"effect 3", "effect 7"}
     assert all(one.effects == (one.candidate.effect,) for one in found)
 
 
 def test_twins_are_named_together():
-    (found,) = select(*hidden({0: 1.0}))
+    (found,) = select_effects(*hidden({0: 1.0}))
     assert set(found.effects) == {"effect 0", "effect 19"}
 
 
@@ -159,10 +159,10 @@ def test_factors_beside_others_are_what_is_left_for_an_effect():
 
 def test_one_large_effect_is_not_two(monkeypatch):
     """Twenty standard deviations; with the usual prior alone, a twin takes half of it."""
-    (found,) = select(*hidden({0: 20.0}))
+    (found,) = select_effects(*hidden({0: 20.0}))
     assert found.candidate.effect == "effect 0"
-    monkeypatch.setattr("halbach_fe.diagnosis.selection.WIDE", 1.0)
-    both = select(*hidden({0: 20.0}))
+    monkeypatch.setattr("halbach_fe.diagnosis.model_selection.WIDE", 1.0)
+    both = select_effects(*hidden({0: 20.0}))
     assert {one.candidate.effect for one in both} == {"effect 0", "effect 19"}
 
 
@@ -171,5 +171,5 @@ def test_shuffled_signatures_break_the_naming():
     names = [candidate.effect for candidate in candidates]
     wrong = [Candidate(names[(number + 5) % 20], "", candidate.columns)
              for number, candidate in enumerate(candidates)]
-    assert {one.candidate.effect for one in select(evidence, wrong)}.isdisjoint(
+    assert {one.candidate.effect for one in select_effects(evidence, wrong)}.isdisjoint(
         {"effect 3", "effect 7"})

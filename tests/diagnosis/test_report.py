@@ -7,46 +7,47 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from halbach_fe.blocks import blocks_of
-from halbach_fe.diagnose import Unknown, diagnose
-from halbach_fe.diagnosed import amounts, human_unit, note, where
-from halbach_fe.diagnosis.selection import MOST, Candidate
-from halbach_fe.effects import catalogue
-from halbach_fe.effects.base import Parameter, Place
-from halbach_fe.exact_field import field_of
-from halbach_fe.field_map import field_map
-from halbach_fe.next_measurement import separations
-from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_report
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.discriminating_measurements import separations
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Parameter, Place
+from halbach_fe.diagnosis.model_selection import MOST, Candidate
+from halbach_fe.diagnosis.result import UnknownCause
+from halbach_fe.diagnosis.summary import amounts, human_unit, note, place_in_words
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_diagnosis_report
+from halbach_fe.solver.vacuum_field import field_of
 from tests.conftest import circle
 
 EFFECTS = {effect.name: effect for effect in catalogue()}
 NOISE = {"regions": [{"name": "all", "sigma_T": 2e-5}]}
 
 
-def diagnosed(study, points, add, names, workshop, generator):
+def diagnosed(study, points, add, names, session, generator):
     """Diagnose the nominal map with something added and noise."""
     field = field_of(blocks_of(study), points)
     data = field_map(points, field + add(field) + 2e-5 * generator.standard_normal(points.shape))
     effects = [EFFECTS[name] for name in names]
-    found = diagnose(study, data, workshop, effects=effects)
-    return found, separations(found, data, workshop, effects)
+    found = diagnose(study, data, session, effects=effects)
+    return found, separations(found, data, session, effects)
 
 
 @pytest.fixture
-def flat(dipole, workshop, generator):
+def flat(dipole, session, generator):
     """A cross-section by Fourier coefficients; the sensor of x shows 2 % more."""
     study = dipole(array__recoil_permeability=1.0, noise=NOISE,
                    observation={"quantity": "fourier_coefficients", "harmonics": 6, "positions": {
                        "kind": "circles", "radius_m": [0.05, 0.075], "angles": 24}})
     points = np.vstack([circle(0.05, 24), circle(0.075, 24)])
     return diagnosed(study, points, lambda field: field * [0.02, 0, 0],
-                     ["background", "gain_x", "offset_y"], workshop, generator)
+                     ["background", "gain_x", "offset_y"], session, generator)
 
 
 def test_a_cross_section(flat, tmp_path):
     found, further = flat
     assert [one.hypothesis.effect.name for one in found.named] == ["gain_x"]
-    write_report(found, further, tmp_path)
+    write_diagnosis_report(found, further, tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert page.count("<img alt=") == 5
     assert "along z" not in page.split("<h2>Structure")[1].split("<img")[0]  # no M_z
@@ -54,18 +55,18 @@ def test_a_cross_section(flat, tmp_path):
     assert " %" in verdict(found)[0]
 
 
-def test_a_line(short_dipole, workshop, generator, tmp_path):
+def test_a_line(short_dipole, session, generator, tmp_path):
     study = short_dipole(array__recoil_permeability=1.0, noise=NOISE, observation={
         "quantity": "flux_density", "components": ["x"], "positions": {
             "kind": "line", "start_m": [0, 0, -0.2], "end_m": [0, 0, 0.2], "count": 41}})
     points = np.linspace([0, 0, -0.2], [0, 0, 0.2], 41)
     points[:, :2] = 0 * points[:, 2:]  # -0 below the middle, which is no angle of 180 degrees
     found, further = diagnosed(study, points, lambda _: [3e-4, 0, 0],
-                               ["background", "gain_x", "offset_x"], workshop, generator)
+                               ["background", "gain_x", "offset_x"], session, generator)
     (one,) = found.named
     rivals = {candidate.effect for candidate, _ in one.found.alternatives}
     assert {one.hypothesis.effect.name, *rivals} >= {"background", "offset_x"}
-    write_report(found, further, tmp_path)
+    write_diagnosis_report(found, further, tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "It does not tell" in page
     assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page
@@ -75,10 +76,10 @@ def test_a_line(short_dipole, workshop, generator, tmp_path):
     assert row["it could be"] == ", ".join(dict.fromkeys(
         candidate.effect for candidate, _ in one.found.alternatives))
     assert not any(group.kind == "angle" for group in found.groups_before)  # on the axis
-    write_report(found, [], tmp_path)  # nothing would tell
+    write_diagnosis_report(found, [], tmp_path)  # nothing would tell
     assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
     alone = replace(one, found=replace(one.found, alternatives=()))
-    write_report(replace(found, named=(alone,)), [], tmp_path)
+    write_diagnosis_report(replace(found, named=(alone,)), [], tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "It does not tell" not in page
     assert "No two effects have to be told apart" in page
@@ -90,7 +91,7 @@ def test_places_are_named_without_rounding_errors():
 
 def test_verdicts(flat):
     found, _ = flat
-    unknown = Unknown("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
+    unknown = UnknownCause("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
     assert "nothing" not in " ".join(verdict(found))
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
     tie = replace(unknown, as_well=True)
@@ -116,8 +117,9 @@ def test_verdicts(flat):
 
 def test_the_page_of_what_is_unknown(flat, tmp_path):
     found, _ = flat
-    unknown = Unknown("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
-    write_report(replace(found, named=(), after=found.before, unknown=unknown), [], tmp_path)
+    unknown = UnknownCause("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
+    write_diagnosis_report(replace(found, named=(), after=found.before, unknown=unknown), [],
+                           tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert 'class="warning"' in page
     assert "tells a field from the sensors" in page
@@ -141,9 +143,9 @@ def test_numbers_for_people(flat):
     assert human_unit(Parameter("gain", "1", 1.0)) == ("%", 100.0)
     assert human_unit(Parameter("factor", "1", 1.0)) == ("", 1.0)
     assert human_unit(Parameter("spin", "furlong", 1.0)) == ("furlong", 1.0)
-    assert where(Place(2, 11)) == "ring 2, slot 11"
-    assert where(Place(at_m=(0.5,))) == "at 0.5 m"
-    assert where(Place()) == ""
+    assert place_in_words(Place(2, 11)) == "ring 2, slot 11"
+    assert place_in_words(Place(at_m=(0.5,))) == "at 0.5 m"
+    assert place_in_words(Place()) == ""
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from halbach_fe.study import read_study
+from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
 SCRIPT = ROOT / "studies" / "diagnosis" / "run.py"

@@ -20,12 +20,12 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from halbach_fe.field_map import field_map
-from halbach_fe.formats.grid import grid_of
-from halbach_fe.formats.openpmd import content as openpmd_content
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.formats.grid import grid_of
+from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from tests.fuzz.contract import BrokenError, refusal
 from tests.fuzz.readers import by_name, edge_elements
-from tests.unit.test_import_map import FIELD, POINTS
+from tests.measurement.test_import_map import FIELD, POINTS
 
 SECRET = b"root:x:0:0:what no reader may show, 0123456789" * 3
 MEMORY = 1 << 29

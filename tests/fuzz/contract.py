@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from halbach_fe.errors import MAX_SENTENCE, HalbachError
+from halbach_fe.core.errors import MAX_SENTENCE, HalbachError
 
 TIME_LIMIT_S = 10
 """Inputs of some tens of kilobytes take milliseconds; the limit leaves room for a busy machine."""

@@ -7,7 +7,7 @@ from functools import cache
 from random import Random
 from typing import Any
 
-from halbach_fe.study import Study
+from halbach_fe.study.model import Study
 
 RICH = b"""
 name = "rich"

@@ -15,42 +15,43 @@ import meshio
 import numpy as np
 import xarray as xr
 
-from halbach_fe import sampled
-from halbach_fe import solve as solving
-from halbach_fe.block_table import BlockTable, read_blocks, write_blocks
-from halbach_fe.blocks import blocks_of
-from halbach_fe.cache import MANIFEST, Cache, Kept, Manifest
-from halbach_fe.errors import (
+from halbach_fe.core.errors import (
     GetDPError,
     HalbachWarning,
     MeasurementError,
     MeshError,
     StudyError,
 )
-from halbach_fe.field_map import check_readings, field_map, read_map, write_map
-from halbach_fe.formats import READERS as FORMATS
-from halbach_fe.formats import import_map
-from halbach_fe.formats.declared import Declared
-from halbach_fe.formats.grid import grid_of
-from halbach_fe.formats.openpmd import content as openpmd_content
-from halbach_fe.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
-from halbach_fe.inference.prior import Gaussian, Root, block_prior
-from halbach_fe.mesh import MeshFiles, build_mesh, verify_mesh
-from halbach_fe.regions import Regions
-from halbach_fe.response import Response, StoredMatrix, _beside
-from halbach_fe.response import _read as read_response
-from halbach_fe.response import _write as write_response
-from halbach_fe.routes import finite_element_part
-from halbach_fe.sampled import _Run
-from halbach_fe.solutions import read_matrix, read_saved, read_solutions, read_unknowns
-from halbach_fe.solve import Workshop
-from halbach_fe.study import Study, _with_table, curve_of, parse_study, read_study
-from halbach_fe.study_file import amended
-from halbach_fe.update import _stored_root, read_posterior
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.regions import Regions
+from halbach_fe.inference import mcmc
+from halbach_fe.inference.mcmc import _Run
+from halbach_fe.inference.storage import _stored_root, read_posterior
+from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
+from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
+from halbach_fe.measurement.formats import READERS as FORMATS
+from halbach_fe.measurement.formats import import_map
+from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.grid import grid_of
+from halbach_fe.measurement.formats.openpmd import content as openpmd_content
+from halbach_fe.response.matrix import Response, StoredMatrix, _beside
+from halbach_fe.response.matrix import _read as read_response
+from halbach_fe.response.matrix import _write as write_response
+from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
+from halbach_fe.solver.field import finite_element_part
+from halbach_fe.solver.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
+from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
+from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
+from halbach_fe.solver.runs import newton_residuals
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian, Root, nominal_prior
+from halbach_fe.study.edit import edited_text
+from halbach_fe.study.model import Study, curve_of
+from halbach_fe.study.reader import _with_table, parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import RICH, document
-from tests.unit.test_import_map import (
+from tests.measurement.test_import_map import (
     COMSOL,
     FIELD,
     MM_MT,
@@ -61,7 +62,7 @@ from tests.unit.test_import_map import (
     comsol_sections,
     rows,
 )
-from tests.unit.test_solutions import ROWS, SOLUTIONS, matrix, saved, vectors
+from tests.solver.test_dofs import ROWS, SOLUTIONS, matrix, saved, vectors
 
 TINY = parse_study(changed(
     DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__growth=4.0,
@@ -131,7 +132,7 @@ def posterior() -> bytes:
             ("nominal", 1), ("prior_mean", 1), ("prior_sd", 0.01), ("posterior_mean", 1.01),
             ("posterior_sd", 0.001))},
         coords={"parameter": [f"p{n}" for n in range(count)]}, attrs={"study": "{}"})
-    prior = block_prior(nominal, 2, 0.01, 1.0, 0.005)
+    prior = nominal_prior(nominal, 2, 0.01, 1.0, 0.005)
     size = prior.root.shape[1]
     after = Gaussian(nominal, Root(
         prior.root.outer, np.eye(size)[:, :3], np.array([0.1, 0.2, 1.0])))
@@ -168,7 +169,7 @@ def check_matrix(found: np.ndarray | None) -> None:
 
 
 def chains() -> bytes:
-    return written(".nc", lambda path: sampled._store(
+    return written(".nc", lambda path: mcmc._store(
         path, "the key", [_Run(np.random.default_rng(n), np.zeros(2), np.ones((5, 2)), 0.3)
                           for n in range(2)], ("a", "b"), 7))
 
@@ -177,7 +178,7 @@ def resumed(path: Path) -> tuple[int, list[_Run], list[dict]]:
     """What of an interrupted run goes on, with the states that nothing had gone on from."""
     runs = [_Run(np.random.default_rng(n + 10), np.full(2, 9.0)) for n in range(2)]
     before = [run.generator.bit_generator.state for run in runs]
-    return sampled._resume(path, "the key", runs), runs, before
+    return mcmc._resume(path, "the key", runs), runs, before
 
 
 def check_resumed(found: tuple[int, list[_Run], list[dict]]) -> None:
@@ -251,7 +252,7 @@ def changed_study(path: Path) -> tuple[str, Study]:
         parse_study(after.model_dump())
     except StudyError:
         return "", study
-    return amended(path.read_bytes().decode(), [(after, "for a reason")]), after
+    return edited_text(path.read_bytes().decode(), [(after, "for a reason")]), after
 
 
 def check_changed(found: tuple[str, Study]) -> None:
@@ -288,9 +289,9 @@ def run_of_getdp() -> dict[str, bytes]:
     """Mesh, regions and all that GetDP leaves of a tiny problem."""
     with tempfile.TemporaryDirectory() as folder:
         files = build_mesh(TINY, Path(folder))
-        workshop = Workshop(find_getdp(), Path(folder) / "work", jobs=1)
-        finite_element_part(TINY, PLACES, workshop)
-        run = workshop.folder / "getdp-real"
+        session = Session(find_getdp(), Path(folder) / "work", jobs=1)
+        finite_element_part(TINY, PLACES, session)
+        run = session.folder / "getdp-real"
         return {"mesh": files.mesh.read_bytes(), "regions": files.regions.read_bytes(),
                 "pre": (run / "magnetostatics_2d.pre").read_bytes(),
                 "vectors": (run / "flux_density.txt").read_bytes(),
@@ -329,7 +330,7 @@ def log_of(path: Path) -> None:
     lines = path.read_bytes().decode(errors="replace").split("\n")
     try:
         _check_log(lines, Job("p.pro", path.name, "R", ()), path.parent)
-        solving.newton_residuals(lines)
+        newton_residuals(lines)
     except GetDPError as error:
         raise GetDPError(f"{error} {path.name}") from None
 

@@ -9,9 +9,9 @@ import sys
 import h5py
 import pytest
 
-from halbach_fe.errors import MeasurementError
-from halbach_fe.field_map import read_map
-from halbach_fe.solve import newton_residuals
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.solver.runs import newton_residuals
 from tests.conftest import ROOT
 from tests.fuzz.bombs import BOMBS, SECRET
 from tests.fuzz.contract import refusal

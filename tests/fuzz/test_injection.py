@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 import tomlkit
 
-from halbach_fe.block_table import read_blocks
-from halbach_fe.blocks import blocks_of
 from halbach_fe.cli import main
 from halbach_fe.cli.common import print_table
-from halbach_fe.errors import MeasurementError, MeshError, StudyError
-from halbach_fe.field_map import field_map, read_map, write_map
-from halbach_fe.mesh import build_mesh, verify_mesh
-from halbach_fe.regions import Regions
+from halbach_fe.core.errors import MeasurementError, MeshError, StudyError
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.regions import Regions
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.report.page import write_page
-from halbach_fe.solve import CROSS_SECTION, stage
-from halbach_fe.study import Study, parse_study, read_study
+from halbach_fe.solver.formulations import CROSS_SECTION
+from halbach_fe.solver.magnetostatics import fill_run_folder
+from halbach_fe.solver.mesh import build_mesh, verify_mesh
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, changed, circle
 from tests.fuzz.documents import HOSTILE
 from tests.fuzz.readers import STEEL, WITH_STEEL
@@ -72,7 +74,7 @@ def staged(tmp_path_factory):
 
     def files(study):
         folder = tmp_path_factory.mktemp("run")
-        stage(study, mesh, circle(0.05, 3), folder, CROSS_SECTION)
+        fill_run_folder(study, mesh, circle(0.05, 3), folder, CROSS_SECTION)
         return {path.name: path.read_text() for path in folder.iterdir() if path.suffix == ".pro"}
     return files
 

@@ -10,18 +10,20 @@ import pytest
 import scipy.sparse as sparse
 from scipy import stats
 
-from halbach_fe import response as response_module
-from halbach_fe.blocks import blocks_of
-from halbach_fe.field_map import field_map
-from halbach_fe.inference import linear
-from halbach_fe.inference.linear import update, whitened
-from halbach_fe.inference.noise import Noise, independent
-from halbach_fe.inference.prior import Gaussian, Root, block_prior
-from halbach_fe.observation import observe, points_from
-from halbach_fe.report.inference import write_report
-from halbach_fe.response import StoredMatrix, response
-from halbach_fe.study import parse_study
-from halbach_fe.update import infer, read_posterior, write_update
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.inference import write_inference_report
+from halbach_fe.response import matrix as response_module
+from halbach_fe.response.matrix import StoredMatrix, response_matrix
+from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats.gaussian import Gaussian, Root, nominal_prior
+from halbach_fe.stats.linear_gaussian import update, whitened
+from halbach_fe.stats.noise import NoiseCovariance, independent
+from halbach_fe.study.reader import parse_study
 from tests.oracles.cuboids import cuboid_field, long_dipole
 
 
@@ -30,13 +32,13 @@ def correlated(generator, count):
     lower = np.tril(generator.standard_normal((count // 3, 3, 3))) + 3 * np.eye(3)
     blocks = 0.01 * lower @ lower.transpose(0, 2, 1)
     number = np.arange(len(blocks) + 1)
-    return Noise(sparse.csr_array(sparse.bsr_array((blocks, number[:-1], number))))
+    return NoiseCovariance(sparse.csr_array(sparse.bsr_array((blocks, number[:-1], number))))
 
 
 def problem(generator, readings, blocks):
     """Smooth fields of blocks in a row, one of them missing, with a common mode."""
     nominal = np.tile([1.0, 0.2, 0.0], blocks) * np.where(np.arange(3 * blocks) // 3 == 2, 0, 1)
-    prior = block_prior(nominal, 3, 0.1, 3.0, 0.05)
+    prior = nominal_prior(nominal, 3, 0.1, 3.0, 0.05)
     place = np.linspace(0, 1, readings)[:, None] - np.linspace(0, 1, 3 * blocks)
     matrix = np.exp(-(place / 0.1) ** 2)
     noise = correlated(generator, readings)
@@ -87,7 +89,7 @@ def test_against_the_dense_formula(generator, readings, blocks):
     assert np.all(found.distribution.sd[6:9] == 0)
     # negative control: 1 % less noise
     matrix, values, noise, prior = case
-    other = update(matrix, values, Noise(0.98 * noise.covariance), prior)
+    other = update(matrix, values, NoiseCovariance(0.98 * noise.covariance), prior)
     assert farthest(case, other) > 1e-3
 
 
@@ -97,9 +99,9 @@ def test_in_parts_and_compressed(generator, monkeypatch, blocks):
     parameters without any loss, of many without those combinations of readings that say nothing.
     """
     case = problem(generator, 600, blocks)
-    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 7)
-    monkeypatch.setattr(linear, "NUMBERS_HELD", 100 * 3 * blocks)
-    monkeypatch.setattr(linear, "WORST_CONDITION", 0.0)  # by rows in any case
+    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(linear_gaussian, "NUMBERS_HELD", 100 * 3 * blocks)
+    monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", 0.0)  # by rows in any case
     found = update(*case)
     assert (found.left_out > 0) == (blocks == 200)
     # what is left out bounds the change of variances; of the mean it is its root that does
@@ -109,7 +111,7 @@ def test_in_parts_and_compressed(generator, monkeypatch, blocks):
     assert isinstance(root, Root)
     assert root.directions.shape[1] <= min(600, 3 * blocks + 1)
     if blocks == 200:  # negative control: what says something must not be left out
-        monkeypatch.setattr(linear, "NEGLIGIBLE", 0.5)
+        monkeypatch.setattr(linear_gaussian, "NEGLIGIBLE", 0.5)
         coarse = update(*case)
         assert coarse.left_out > 0.1
         assert farthest(case, coarse) > 1e-2
@@ -120,12 +122,12 @@ def test_parts_that_cut_correlations_are_wrong(generator, monkeypatch):
     with that of the next part.
     """
     matrix, readings, noise, prior = problem(generator, 60, 30)
-    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
     part = np.arange(60) // 7
     entries = noise.covariance.tocoo()
     rows, columns = entries.coords
     same = part[rows] == part[columns]
-    cut = Noise(sparse.csr_array((entries.data[same], (rows[same], columns[same]))))
+    cut = NoiseCovariance(sparse.csr_array((entries.data[same], (rows[same], columns[same]))))
     case = matrix, readings, noise, prior
     assert farthest(case, update(*case)) < 1e-9
     assert farthest(case, update(matrix, readings, cut, prior)) > 1e-3
@@ -139,7 +141,7 @@ def test_whitened_residuals_of_many_parameters(generator, monkeypatch):
     white = noise.whitening.toarray()
     values, vectors = np.linalg.eigh(white @ covariance @ white.T)
     expected = (vectors / np.sqrt(values)) @ vectors.T @ (white @ residual)
-    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 7)
+    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 7)
     columns = root.shape[1]
     np.testing.assert_allclose(whitened(residual, noise, root.__getitem__, columns), expected,
                                atol=1e-9)
@@ -170,7 +172,7 @@ def peak(work):
 
 
 def test_memory_does_not_grow_with_readings_times_parameters(monkeypatch):
-    monkeypatch.setattr(linear, "READINGS_AT_ONCE", 500)
+    monkeypatch.setattr(linear_gaussian, "READINGS_AT_ONCE", 500)
     prior = Gaussian(np.zeros(120), np.eye(120))
 
     def used(count):
@@ -184,17 +186,17 @@ def test_memory_does_not_grow_with_readings_times_parameters(monkeypatch):
     assert peak(lambda: Made(20_000, 120)[np.arange(20_000)]) > 120 * 20_000 * 8
 
 
-def test_a_matrix_on_the_disk(monkeypatch, workshop, tmp_path):
+def test_a_matrix_on_the_disk(monkeypatch, session, tmp_path):
     """One that is too large for the memory: the same rows, reused, and made anew if it is gone."""
     document = long_dipole(2, 5)
     study = parse_study(document)
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool))
-    whole = response(study, observation, workshop)
+    whole = response_matrix(study, observation, session)
     monkeypatch.setattr(response_module, "LOADED_BYTES", 1000)
-    monkeypatch.setattr(linear, "NUMBERS_AT_ONCE", 700)
-    (workshop.folder / "response.h5").unlink()
-    parts = response(study, observation, workshop)
+    monkeypatch.setattr(linear_gaussian, "NUMBERS_AT_ONCE", 700)
+    (session.folder / "response.h5").unlink()
+    parts = response_matrix(study, observation, session)
     assert isinstance(parts.matrix, StoredMatrix)
     scale = np.abs(whole.matrix).max()
     # panels of the exact field depend on the points that are taken together: 1e-12
@@ -202,25 +204,25 @@ def test_a_matrix_on_the_disk(monkeypatch, workshop, tmp_path):
                                atol=1e-11 * scale)
     np.testing.assert_allclose(parts.matrix @ parts.nominal, whole.matrix @ whole.nominal,
                                atol=1e-12)
-    again = response(study, observation, workshop)
+    again = response_matrix(study, observation, session)
     assert again.reused
     np.testing.assert_array_equal(again.matrix[np.arange(9)], parts.matrix[np.arange(9)])
     parts.matrix.path.write_bytes(b"")
-    assert not response(study, observation, workshop).reused
-    assert len(list(workshop.folder.glob("response-*.npy"))) == 1
+    assert not response_matrix(study, observation, session).reused
+    assert len(list(session.folder.glob("response-*.npy"))) == 1
 
 
 @pytest.fixture
-def long_array(generator, workshop):
+def long_array(generator, session):
     """The update of 2 000 blocks with a map of 252 readings by magpylib; and the truth."""
     document = long_dipole(125, 21, angles=4)
     study = parse_study(document)
     nominal = np.array([block.magnetization for block in blocks_of(study)])
-    truth = block_prior(nominal.ravel(), 3, 0.01, 1.0, 0.005).sample(1, generator)[0]
+    truth = nominal_prior(nominal.ravel(), 3, 0.01, 1.0, 0.005).sample(1, generator)[0]
     points = points_from(study.observation.positions)
     field = cuboid_field(document, truth.reshape(-1, 3), points)
     field += 5e-5 * generator.standard_normal(field.shape)
-    return infer(study, field_map(points, field), workshop), truth
+    return infer(study, field_map(points, field), session), truth
 
 
 def test_two_thousand_blocks(long_array, tmp_path):
@@ -236,7 +238,7 @@ def test_two_thousand_blocks(long_array, tmp_path):
     root = update.posterior.root
     assert isinstance(root, Root)
     assert root.directions.shape == (6001, 204)
-    write_update(update, tmp_path)
+    write_inference(update, tmp_path)
     # far below the 288 MB of one covariance
     assert Path(tmp_path / "posterior.h5").stat().st_size < 20e6
     stored = read_posterior(update.study, tmp_path / "posterior.h5")
@@ -244,7 +246,7 @@ def test_two_thousand_blocks(long_array, tmp_path):
         np.testing.assert_allclose(stored[name].mean, one.mean)
         np.testing.assert_allclose(stored[name].sd, one.sd)
     assert np.abs(stored["posterior"].sd - stored["prior"].sd).max() > 0.01 * update.prior.sd.max()
-    write_report(update, tmp_path)
+    write_inference_report(update, tmp_path)
     assert Path(tmp_path / "report.html").stat().st_size < 15e6
 
 

@@ -1,7 +1,7 @@
 """Other people's solvers, and the studies' numbers for them."""
 
-from halbach_fe.blocks import blocks_of
-from halbach_fe.study import Study
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.study.model import Study
 from tests.oracles import ngsolve_model
 
 

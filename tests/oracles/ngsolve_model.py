@@ -13,8 +13,8 @@ import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 
-from halbach_fe.campaign.bodies import Sector
-from halbach_fe.campaign.reaction import outline_face
+from halbach_fe.synthetic.bodies import SectorBody
+from halbach_fe.synthetic.ngsolve_reaction import outline_face
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Dipole:
 def _wedge(inner, outer, start, stop, z_min, z_max):
     """A sector between two angles; the arcs are true arcs."""
     middle = (start + stop) / 2
-    sector = Sector(inner, outer, (stop - start) / 2, z_max - z_min)
+    sector = SectorBody(inner, outer, (stop - start) / 2, z_max - z_min)
     centre = sector.middle * np.array([np.cos(middle), np.sin(middle)])
     return outline_face(sector, centre, middle, z_min).Extrude(occ.Vec(0, 0, z_max - z_min))
 

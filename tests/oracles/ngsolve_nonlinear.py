@@ -7,13 +7,13 @@ from __future__ import annotations
 import ngsolve as ngs
 import numpy as np
 
-from halbach_fe.campaign.bodies import Froehlich, Magnet
-from halbach_fe.campaign.reaction import half_field, newton, permeability
-from halbach_fe.materials import MU_0
+from halbach_fe.study.materials import MU_0
+from halbach_fe.synthetic.bodies import FroehlichLaw, TrueMagnet
+from halbach_fe.synthetic.ngsolve_reaction import half_field, newton, permeability
 from tests.oracles.ngsolve_model import Dipole, even_field
 
 
-def reluctivity(law: Froehlich, square):
+def reluctivity(law: FroehlichLaw, square):
     """mu_0 H / B at B^2 in T^2: the positive root of mu_0 H^2 + (mu_0 h + J_s - B) H = B h."""
     root = ngs.sqrt if isinstance(square, ngs.CoefficientFunction) else np.sqrt
     size, half = root(square + 1e-24), half_field(law)  # the root has no slope at 0
@@ -21,7 +21,7 @@ def reluctivity(law: Froehlich, square):
     return 2 * half / (p + root(p * p + 4 * half * size))
 
 
-def section_field(magnet: Magnet, mesh: ngs.Mesh, order: int, points: np.ndarray) -> np.ndarray:
+def section_field(magnet: TrueMagnet, mesh: ngs.Mesh, order: int, points: np.ndarray) -> np.ndarray:
     """B (n, 3) in T of a cross-section at points, by the vector potential."""
     space = ngs.H1(mesh, order=order, dirichlet="far")
     u, v = space.TnT()
@@ -52,7 +52,7 @@ def section_field(magnet: Magnet, mesh: ngs.Mesh, order: int, points: np.ndarray
 
 
 def potential_reaction(
-    dipole: Dipole, law: Froehlich, mesh: ngs.Mesh, order: int, points: np.ndarray,
+    dipole: Dipole, law: FroehlichLaw, mesh: ngs.Mesh, order: int, points: np.ndarray,
     remanence: tuple[float, float, float] | None = None,
 ) -> np.ndarray:
     """What permeability and iron add to B (n, 3) in T at points, by the scalar potential in an

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.study import Study, is_nonlinear, parse_study
+from halbach_fe.study.model import Study, is_nonlinear
+from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle
 
 FOLDER = Path(__file__).parent

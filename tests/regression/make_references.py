@@ -8,10 +8,10 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from halbach_fe.field_map import field_map, write_map
-from halbach_fe.getdp import find_getdp
-from halbach_fe.routes import solve_nominal
-from halbach_fe.solve import Workshop
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.session import Session
 from tests.regression.cases import CASES, FOLDER, points_of_case
 
 
@@ -21,7 +21,7 @@ def main() -> None:
     for name, study in CASES.items():
         points = points_of_case(study)
         with tempfile.TemporaryDirectory() as folder:
-            field = solve_nominal(study, points, Workshop(getdp, Path(folder), jobs=2))
+            field = solve_nominal(study, points, Session(getdp, Path(folder), jobs=2))
         write_map(field_map(points, field, attributes={"case": name, "getdp": getdp.version}),
                   FOLDER / f"{name}.h5")
 

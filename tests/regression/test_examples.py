@@ -8,7 +8,7 @@ import json
 import pytest
 
 from halbach_fe.cli import main
-from halbach_fe.field_map import read_map
+from halbach_fe.measurement.field_map import read_map
 from tests.conftest import ROOT
 
 

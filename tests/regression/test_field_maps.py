@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.field_map import read_map
-from halbach_fe.routes import solve_nominal
-from halbach_fe.study import parse_study
+from halbach_fe.measurement.field_map import read_map
+from halbach_fe.solver.field import solve_nominal
+from halbach_fe.study.reader import parse_study
 from tests.conftest import changed
 from tests.regression.cases import CASES, FOLDER, difference, points_of_case, tolerance
 
@@ -24,36 +24,36 @@ def stored(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_map_is_unchanged(name, workshop):
+def test_map_is_unchanged(name, session):
     study = CASES[name]
-    found = solve_nominal(study, points_of_case(study), workshop)
+    found = solve_nominal(study, points_of_case(study), session)
     assert difference(found, stored(name)) < tolerance(study)
 
 
 @pytest.mark.parametrize(("name", "change"), [
     (name, change) for name in CASES for change in CHANGES[:TRIED.get(name)]])
-def test_a_perturbed_model_fails(name, change, workshop):
+def test_a_perturbed_model_fails(name, change, session):
     document = CASES[name].model_dump(exclude_none=True)
     study = parse_study(changed(document, **change))
-    found = solve_nominal(study, points_of_case(study), workshop)
+    found = solve_nominal(study, points_of_case(study), session)
     assert difference(found, stored(name)) > tolerance(study)
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "dipole_3d_direct"])
-def test_forgotten_iron_fails(name, workshop):
+def test_forgotten_iron_fails(name, session):
     """In 3D the direct field is not exact enough to show it; its reaction is."""
     study = CASES[name].model_copy(update={"iron_ring": None})
-    found = solve_nominal(study, points_of_case(study), workshop)
+    found = solve_nominal(study, points_of_case(study), session)
     assert difference(found, stored(name)) > tolerance(study)
 
 
 @pytest.mark.parametrize("permeability", [100.0, 1000.0])
-def test_linear_iron_in_place_of_the_curve_fails(permeability, workshop):
+def test_linear_iron_in_place_of_the_curve_fails(permeability, session):
     document = CASES["dipole_2d_saturated"].model_dump(exclude_none=True)
     document["iron_ring"] = {"inner_radius_m": 0.19, "outer_radius_m": 0.192,
                              "relative_permeability": permeability}
     study = parse_study(document)
-    found = solve_nominal(study, points_of_case(study), workshop)
+    found = solve_nominal(study, points_of_case(study), session)
     assert difference(found, stored("dipole_2d_saturated")) > tolerance(study)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.report.page import geometry
-from halbach_fe.study import read_study
+from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT, circle
 
 

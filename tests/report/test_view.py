@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from halbach_fe.blocks import blocks_of
+from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.report import view
 from halbach_fe.report.view import Colours, Known, magnet_view, prism, residuals
-from halbach_fe.study import read_study
+from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
 STUDIES = ("quadrupole", "mri", "faser")

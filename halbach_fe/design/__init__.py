@@ -1,0 +1,1 @@
+"""What follows for the magnet: tolerances, sorting, shimming, plans, demagnetization."""

@@ -1,0 +1,283 @@
+"""How near the blocks are to losing magnetization: H along the easy axis against the knee.
+
+Inside a block ``mu_0 H`` is the exact field of all blocks in vacuum, as their surface charge makes
+it, and the finite-element reaction of permeability and iron. Along the edges it is logarithmic:
+the least value grows with ever smaller cells, the share of the volume does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError
+from halbach_fe.core.files import atomic
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.outline import places_in
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.field import is_vacuum
+from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
+from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
+from halbach_fe.solver.session import Session
+from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.study.magnet import BlockException, Demagnetization
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study, is_nonlinear
+
+ORDER = 6
+"""Gauss points per panel, panels being no longer than half a cell: 1e-6 of the field."""
+
+ACROSS = 6
+"""Cells across the thickness of a block, unless one says otherwise."""
+
+SHARES = (0.0, 0.01)
+"""Of the magnet's volume, of which it is said at what temperature they are past the knee."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Blocks cut into small cells, layer by layer.
+
+    Attributes
+    ----------
+    vertices : ndarray, shape (v, 3), in m
+    corners : ndarray, shape (cells, 8), or in 2D (cells, 4)
+        Vertices of each, as VTK orders them.
+    block : ndarray, shape (cells,)
+        Number of each cell's block, from 0.
+    middles : ndarray, shape (cells, 3), in m
+    volumes : ndarray, shape (cells,)
+        In m^3, in 2D in m^2.
+    """
+
+    vertices: Floats
+    corners: Ints
+    block: Ints
+    middles: Floats
+    volumes: Floats
+
+
+@dataclass(frozen=True)
+class DemagnetizationMap:
+    """H in the blocks of a magnet at a temperature, against the knee there.
+
+    Attributes
+    ----------
+    study : Study
+        As it was given.
+    material : Demagnetization
+    blocks : tuple of MagnetBlock
+    cells : Cells
+    along : ndarray, shape (cells,), in A/m
+        H along the magnetization: negative where it is driven back.
+    """
+
+    study: Study
+    material: Demagnetization
+    blocks: tuple[MagnetBlock, ...]
+    cells: Cells
+    along: Floats
+
+    @property
+    def margin(self) -> Floats:
+        """What is left to the knee, (cells,) in A/m; negative beyond it."""
+        return self.along + knee(self.material, self.material.temperature_C)
+
+    @property
+    def share_beyond_now(self) -> float:
+        """Share of the volume past the knee at the map's temperature."""
+        volumes = self.cells.volumes
+        return float(volumes[self.margin < 0].sum() / volumes.sum())
+
+    def share_beyond(self, temperature_C: Floats) -> Floats:
+        """Share of the volume past the knee, at each of (t,) temperatures.
+
+        Away from the map's temperature H is taken to change as the remanence does, which it does
+        in vacuum and in iron of constant permeability.
+        """
+        weight = self.cells.volumes / self.cells.volumes.sum()
+        grown = (remanence_factor(self.material, temperature_C)
+                 / remanence_factor(self.material, self.material.temperature_C))
+        limit = knee(self.material, temperature_C)
+        return np.array([weight[self.along * g < -h].sum()
+                         for g, h in zip(grown, limit, strict=True)])
+
+    def limit_temperature(self, share: float) -> float:
+        """Temperature in °C above which more than a share of the volume is past the knee; infinite
+        if none is.
+        """
+        material = self.material
+        at_reference = -self.along / remanence_factor(material, material.temperature_C)
+        # -along (1 + alpha d) = knee (1 + beta d)
+        rate = (at_reference * material.remanence_coefficient_per_K
+                - knee(material, material.reference_temperature_C)
+                * material.coercivity_coefficient_per_K)
+        spare = knee(material, material.reference_temperature_C) - at_reference
+        with np.errstate(divide="ignore"):
+            limit = np.where(rate > 0, spare / rate, np.where(spare > 0, np.inf, -np.inf))
+        order = np.argsort(limit)
+        passed = np.cumsum(self.cells.volumes[order]) / self.cells.volumes.sum()
+        first = int(np.searchsorted(passed, share + 1e-12))
+        return float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
+
+    def by_block(self) -> list[dict[str, float | int]]:
+        """What a table says of each block that is magnetized."""
+        share_of_coercivity = float(knee(self.material, self.material.temperature_C)
+                                    / self.material.intrinsic_coercivity_A_per_m)
+        rows: list[dict[str, float | int]] = []
+        for number in np.unique(self.cells.block):
+            mine = self.cells.block == number
+            along, volume = self.along[mine], self.cells.volumes[mine]
+            worst = int(np.argmin(along))
+            x, y, z = self.cells.middles[mine][worst].tolist()
+            rows.append({
+                "ring": self.blocks[number].ring, "slot": self.blocks[number].slot,
+                "mean_H_A_per_m": float(np.average(along, weights=volume)),
+                "least_H_A_per_m": float(along[worst]), "x_m": x, "y_m": y, "z_m": z,
+                "margin_A_per_m": float(self.margin[mine].min()),
+                "share_beyond_knee": float(volume[self.margin[mine] < 0].sum() / volume.sum()),
+                "needed_coercivity_A_per_m": max(0.0, -float(along[worst])) / share_of_coercivity,
+            })
+        return rows
+
+
+def remanence_factor(material: Demagnetization, temperature_C: Floats | float) -> Floats:
+    """Remanence over that at the reference temperature."""
+    return np.asarray(1 + material.remanence_coefficient_per_K * (
+        np.asarray(temperature_C) - material.reference_temperature_C))
+
+
+def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
+    """|H| of the knee in A/m; not below 0."""
+    factor = 1 + material.coercivity_coefficient_per_K * (
+        np.asarray(temperature_C) - material.reference_temperature_C)
+    return np.asarray(material.squareness * material.intrinsic_coercivity_A_per_m
+                      * np.maximum(0.0, factor))
+
+
+def demagnetization_map(study: Study, session: Session, across: int = ACROSS) -> DemagnetizationMap:
+    """Compute H in all blocks of the nominal magnet, at the study's temperature.
+
+    Parameters
+    ----------
+    across : int
+        Cells across the thickness of a block; the other sides are cut into cells about as long.
+
+    Raises
+    ------
+    StudyError
+        If the study does not say what its material withstands, or nothing is magnetized.
+    """
+    material = study.demagnetization
+    if material is None:
+        raise StudyError(
+            f"Input `demagnetization` of study {study.name} must say what the material withstands; "
+            "instead it is missing. Add intrinsic_coercivity_A_per_m, remanence_coefficient_per_K "
+            "and coercivity_coefficient_per_K from the data sheet, and temperature_C.")
+    warm = at_temperature(study, material)
+    blocks = blocks_of(warm)
+    magnetized = [number for number, block in enumerate(blocks) if block.remanence]
+    if not magnetized:
+        raise StudyError(f"Input `array` of study {study.name} must leave a block magnetized; "
+                         "instead every magnetization_factor is 0.")
+    cells = cut(blocks, magnetized, across)
+    field = _field_strength(warm, blocks, cells, session)
+    easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
+    return DemagnetizationMap(study, material, blocks, cells,
+                              np.einsum("nc,nc->n", field, easy[cells.block]))
+
+
+def at_temperature(study: Study, material: Demagnetization) -> Study:
+    """The study with the remanence that its blocks have at the material's temperature."""
+    factor = float(remanence_factor(material, material.temperature_C))
+    array = study.array
+    return study.model_copy(update={"array": array.model_copy(update={
+        "exceptions": (*array.exceptions, BlockException(magnetization_factor=factor))})})
+
+
+def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
+    """Cut blocks, chosen by number, into cells."""
+    parts = [_cut_one(blocks[number], across) for number in numbers]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _, _ in parts)])
+    return Cells(
+        np.vstack([vertices for vertices, _, _, _ in parts]),
+        np.vstack([corners + start for (_, corners, _, _), start in zip(
+            parts, starts[:-1], strict=True)]),
+        np.repeat(numbers, [len(volumes) for _, _, _, volumes in parts]),
+        np.vstack([middles for _, _, middles, _ in parts]),
+        np.concatenate([volumes for _, _, _, volumes in parts]))
+
+
+def _cut_one(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Floats]:
+    half = np.array([0.5])
+    (inner,), (outer,) = places_in(block.outline, np.array([0.0, 1.0]), half)
+    size = float(np.hypot(*(outer - inner))) / across
+    start, stop = places_in(block.outline, half, np.array([0.0, 1.0]))[0]
+    wide = _count(float(np.hypot(*(stop - start))), size)
+    infinite = np.isinf(block.z_max)
+    high = 0 if infinite else _count(block.z_max - block.z_min, size)
+    z = np.zeros(1) if infinite else np.linspace(block.z_min, block.z_max, high + 1)
+
+    def lattice(depth: Floats, width: Floats, height: Floats) -> Floats:
+        flat = places_in(block.outline, depth, width).reshape(-1, 2)
+        places = np.column_stack([np.tile(flat, (len(height), 1)), np.repeat(height, len(flat))])
+        return places if block.in_place else block.from_place(places)
+
+    vertices = lattice(np.linspace(0, 1, across + 1), np.linspace(0, 1, wide + 1), z)
+    middles = lattice((np.arange(across) + 0.5) / across, (np.arange(wide) + 0.5) / wide,
+                      z if infinite else (z[1:] + z[:-1]) / 2)
+    number = np.arange(len(vertices)).reshape(len(z), across + 1, wide + 1)
+    face = np.stack([number[:, :-1, :-1], number[:, 1:, :-1], number[:, 1:, 1:],
+                     number[:, :-1, 1:]], axis=-1)
+    corners = (face if infinite else np.concatenate([face[:-1], face[1:]], axis=-1))
+    corners = corners.reshape(-1, corners.shape[-1])
+    one, two, three, four = vertices[corners[:, :4]].swapaxes(0, 1)
+    area = np.linalg.norm(np.cross(three - one, four - two), axis=1) / 2
+    return vertices, corners, middles, area if infinite else area * (z[1] - z[0])
+
+
+def _count(length: float, size: float) -> int:
+    return max(1, round(length / size))
+
+
+def _field_strength(
+    study: Study, blocks: Sequence[MagnetBlock], cells: Cells, session: Session
+) -> Floats:
+    """H (cells, 3) in A/m."""
+    points = cells.middles
+    field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
+    if not is_vacuum(study):
+        reacting = study.model_copy(update={"solver": study.solver.model_copy(
+            update={"method": "reaction"})})
+        formulation = CROSS_SECTION if study.dimension == 2 else SCALAR_POTENTIAL
+        if is_nonlinear(study):
+            field += solve_tangent(reacting, points, (), session, formulation, anywhere=True)[0]
+        else:
+            field += solve_sources(reacting, points, (), session, formulation, anywhere=True)[0]
+        if study.dimension == 2:
+            # so far mu_0 H_vacuum + (mu_0 mu_r H + B_r) - (mu_0 H_vacuum + B_r); the scalar
+            # potential gives mu_0 H itself
+            tensors = np.array([block.recoil_tensor for block in blocks])[cells.block]
+            field = np.linalg.solve(tensors, field[..., None])[..., 0]
+    return (field + external_field(study, points)) / MU_0
+
+
+def write_vtu(found: DemagnetizationMap, path: Path) -> None:
+    """Write the cells with H along the magnetization, the margin and ring and slot, as VTU."""
+    cells = found.cells
+    kind = "quad" if cells.corners.shape[1] == 4 else "hexahedron"
+    ring, slot = (np.array([getattr(block, name) for block in found.blocks])[cells.block]
+                  for name in ("ring", "slot"))
+    mesh = meshio.Mesh(cells.vertices, [(kind, cells.corners)], cell_data={
+        "H_along_A_per_m": [found.along], "margin_A_per_m": [found.margin],
+        "ring": [ring], "slot": [slot]})
+    with atomic(path) as temporary:
+        meshio.write(temporary, mesh, file_format="vtu")
+
+

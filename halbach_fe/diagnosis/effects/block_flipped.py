@@ -1,0 +1,16 @@
+"""A block that is upside down."""
+
+from __future__ import annotations
+
+from halbach_fe.diagnosis.effects.block_missing import BlockMissingEffect
+
+
+class BlockFlippedEffect(BlockMissingEffect):
+    """One block magnetized the other way."""
+
+    name = "block_flipped"
+    title = "block mounted upside down"
+    factor = -1.0
+
+
+EFFECTS = (BlockFlippedEffect(),)

@@ -1,0 +1,47 @@
+"""A block that is not there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    blocks_at,
+    each_block,
+    with_exceptions,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.model import Study
+
+
+class BlockMissingEffect(Effect):
+    """One block missing."""
+
+    name = "block_missing"
+    title = "missing block"
+    kind = "field"
+    parameters = (Parameter("there", "1", 1.0),)
+    certain = True
+    discrete = True
+    factor = 0.0  # of the block's magnetization
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_block(study)
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        (block,) = blocks_at(scene, place)
+        return (self.factor - 1) * scene.known_field(block)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, slot=place.slot, magnetization_factor=self.factor)])
+
+
+EFFECTS = (BlockMissingEffect(),)

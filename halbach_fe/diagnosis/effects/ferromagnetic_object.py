@@ -1,0 +1,57 @@
+"""A piece of iron near by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import array_half_length
+from halbach_fe.solver.external_field import dipole_field
+from halbach_fe.study.magnet import PointDipole
+from halbach_fe.study.model import Study
+
+BEYOND_M = (0.03, 0.08, 0.15, 0.25)
+"""Distances from the magnet's ends."""
+
+
+class FerromagneticObjectEffect(Effect):
+    """A small magnetized object, as a point dipole."""
+
+    name = "ferromagnetic_object"
+    title = "ferromagnetic object near the bore"
+    kind = "field"
+    parameters = (
+        Parameter("x", "A m2", 3.0), Parameter("y", "A m2", 3.0), Parameter("z", "A m2", 3.0),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        if study.dimension == 2:
+            return []
+        array, half = study.array, array_half_length(study)
+        radii = [array.inner_radius_m, array.outer_radius_m, 1.4 * array.outer_radius_m]
+        heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
+        ends = [(r, z) for r in radii for z in heights]
+        outside = [(1.2 * array.outer_radius_m, z) for z in np.linspace(-half, half, 7)]
+        angles = 2 * np.pi * np.arange(12) / 12
+        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
+        return axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
+                       for r, z in ends + outside for a in angles]
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        position = np.array(place.at_m)
+        return np.array([dipole_field(position, moment, scene.points) for moment in np.eye(3)])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        x, y, z = map(float, values)
+        dipole = PointDipole(position_m=place.at_m, moment_A_m2=(x, y, z))
+        return study.model_copy(update={"external": study.external.model_copy(update={
+            "dipoles": (*study.external.dipoles, dipole)})})
+
+
+EFFECTS = (FerromagneticObjectEffect(),)

@@ -1,0 +1,39 @@
+"""A bore that is wider or narrower."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    changed,
+    with_array,
+    with_remanence,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.model import Study
+
+
+class InnerRadiusEffect(Effect):
+    """Inner radius of all blocks."""
+
+    name = "inner_radius"
+    title = "inner radius of the blocks"
+    kind = "field"
+    parameters = (Parameter("difference", "m", 3e-4),)
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        step = 1e-4
+        return (changed(scene, self.apply(scene.study, place, [step])) / step)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        study = with_remanence(study)
+        return with_array(study, inner_radius_m=study.array.inner_radius_m + float(values[0]))
+
+
+EFFECTS = (InnerRadiusEffect(),)

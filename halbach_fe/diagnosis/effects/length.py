@@ -1,0 +1,45 @@
+"""A magnet that is longer or shorter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    changed,
+    with_array,
+    with_remanence,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.model import Study
+
+
+class LengthEffect(Effect):
+    """Length of the magnet, by that of its rings."""
+
+    name = "length"
+    title = "length of the magnet"
+    kind = "field"
+    parameters = (Parameter("difference", "m", 1e-3),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return [Place()] if study.dimension == 3 else []
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        step = 1e-3
+        return (changed(scene, self.apply(scene.study, place, [step])) / step)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        study = with_remanence(study)
+        length = study.array.ring_length_m
+        assert length is not None  # of a magnet in 3D
+        return with_array(study, ring_length_m=length + float(values[0]) / study.array.rings)
+
+
+EFFECTS = (LengthEffect(),)

@@ -1,0 +1,69 @@
+"""Another magnet near by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import array_half_length
+from halbach_fe.solver.external_field import neighbour_field
+from halbach_fe.study.magnet import Neighbour
+from halbach_fe.study.model import Study
+
+GAPS_M = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
+"""Between the magnets."""
+
+STEP_M = 1e-4
+"""For the derivative."""
+
+
+class NeighbourMagnetEffect(Effect):
+    """A magnet like this one on the same axis; the place says on which side and about how far away,
+    from which its distance and strength are refined.
+    """
+
+    name = "neighbour_magnet"
+    title = "neighbouring magnet"
+    kind = "field"
+    parameters = (Parameter("strength", "1", 1.0),)
+    refinements = (Parameter("stronger", "1", 0.5), Parameter("farther", "m", 0.05))
+    only = True
+    discrete = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        if study.dimension == 2:
+            return []
+        length = 2 * array_half_length(study)
+        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return neighbour_field(scene.study, Neighbour(z_m=place.at_m[0]), scene.points,
+                               order=4)[None]
+
+    def refine(self, scene: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.refine`."""
+        stronger, farther = values[1:]
+        here, beyond = (neighbour_field(scene.study, Neighbour(z_m=_middle(place, one)),
+                                        scene.points) for one in (farther, farther + STEP_M))
+        return np.array([here, (1 + stronger) * (beyond - here) / STEP_M])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        stronger, farther = values[1:] or (0.0, 0.0)
+        neighbour = Neighbour(z_m=_middle(place, farther), factor=1 + float(stronger))
+        return study.model_copy(update={"external": study.external.model_copy(update={
+            "neighbours": (*study.external.neighbours, neighbour)})})
+
+
+def _middle(place: Place, farther: float) -> float:
+    """Of the neighbour, in m along the axis."""
+    return float(place.at_m[0] + np.sign(place.at_m[0]) * farther)
+
+
+EFFECTS = (NeighbourMagnetEffect(),)

@@ -1,0 +1,36 @@
+"""A sensor with a quadratic term."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place, added, along
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.types import COMPONENTS
+
+
+class QuadraticNonlinearityEffect(InstrumentEffect):
+    """One axis shows more by the square of what it sees."""
+
+    title = "quadratic non-linearity of a sensor"
+    parameters = (Parameter("coefficient", "1/T", 3e-3),)
+
+    def __init__(self, axis: str) -> None:
+        self.axis = axis
+        self.name = f"quadratic_nonlinearity_{axis}"  # type: ignore[misc]
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return np.asarray(scene.field**2 * along(self.axis, 1.0))[None]
+
+    def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
+        """See `InstrumentEffect.change`."""
+        return {"quadratic_per_T": added(instrument.quadratic_per_T, along(self.axis, values[0]))}
+
+
+EFFECTS = tuple(QuadraticNonlinearityEffect(axis) for axis in COMPONENTS)

@@ -1,0 +1,25 @@
+"""Blocks whose recoil permeability differs across the easy axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.diagnosis.effects.base import Place, with_array
+from halbach_fe.diagnosis.effects.recoil_permeability import RecoilPermeabilityEffect
+from halbach_fe.study.model import Study
+
+
+class RecoilPermeabilityAcrossEffect(RecoilPermeabilityEffect):
+    """Of all blocks, across their easy axes."""
+
+    name = "recoil_permeability_across"
+    title = "recoil permeability of the blocks across the easy axis"
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        array = study.array
+        there = array.recoil_permeability_across or array.recoil_permeability
+        return with_array(study, recoil_permeability_across=there + float(values[0]))
+
+
+EFFECTS = (RecoilPermeabilityAcrossEffect(),)

@@ -1,0 +1,46 @@
+"""A ring that is off the axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    blocks_at,
+    each_ring,
+    with_exceptions,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.model import Study
+
+
+class RingShiftedEffect(Effect):
+    """Displacement of one ring across the axis."""
+
+    name = "ring_shifted"
+    title = "displacement of a ring across the axis"
+    kind = "field"
+    parameters = (Parameter("x", "m", 3e-4), Parameter("y", "m", 3e-4),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return each_ring(study)
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return np.array([sum(scene.moved(number, axis) for number in blocks_at(scene, place))
+                         for axis in np.eye(3)[:2]])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        return with_exceptions(study, [BlockException(
+            ring=place.ring, shift_m=(float(values[0]), float(values[1]), 0.0))])
+
+
+EFFECTS = (RingShiftedEffect(),)

@@ -1,0 +1,33 @@
+"""A line of measurement, or a whole map, elsewhere than it says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place, added
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.measurement import Instrument
+
+
+class WrongLineEffect(InstrumentEffect):
+    """The displacement of `mapper_translation`, but no small one."""
+
+    name = "wrong_line"
+    title = "wrong line of measurement"
+    parameters = (
+        Parameter("x", "m", 2e-2), Parameter("y", "m", 2e-2), Parameter("z", "m", 2e-2))
+
+    def signature(self, scene: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return np.asarray(np.moveaxis(scene.gradient, 2, 0))
+
+    def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
+        """See `InstrumentEffect.change`."""
+        return {"translation_m": added(instrument.translation_m, values)}
+
+
+EFFECTS = (WrongLineEffect(),)

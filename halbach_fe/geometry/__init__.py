@@ -1,0 +1,1 @@
+"""The magnet that a study describes, as shapes in space."""

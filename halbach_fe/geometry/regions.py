@@ -1,0 +1,75 @@
+"""The region file: which physical tag of the mesh is which part of the magnet.
+
+Geometry writes it beside the mesh; the solve reads it and refuses a mesh that does not match.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from halbach_fe.core.errors import MeshError
+
+AIR_TAG = 1
+IRON_TAG = 2
+OUTER_BOUNDARY_TAG = 10
+AXIS_TAG = 11
+FIRST_BLOCK_TAG = 1001
+
+Tag = Annotated[int, Field(ge=1, lt=2**31)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,100}$")]
+"""It goes into GetDP's files."""
+
+
+class BlockRegion(BaseModel):
+    """The physical tag of one block."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: Name
+    ring: int
+    slot: int
+    tag: Tag
+
+
+class Regions(BaseModel):
+    """Names and tags of every physical group of a mesh."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    study: Name
+    dimension: Literal[2, 3]
+    air: Tag
+    iron: Tag | None
+    outer_boundary: Tag
+    axis: Tag | None = None
+    blocks: tuple[BlockRegion, ...]
+
+    @property
+    def volume_tags(self) -> tuple[int, ...]:
+        """Tags of every region that is solved in (surfaces in 2D)."""
+        iron = () if self.iron is None else (self.iron,)
+        return (self.air, *iron, *(block.tag for block in self.blocks))
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Tag to name."""
+        names = {self.air: "air", self.outer_boundary: "outer boundary"}
+        if self.iron is not None:
+            names[self.iron] = "iron ring"
+        return names | {block.tag: f"block {block.name}" for block in self.blocks}
+
+    def write(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> Regions:
+        """Read what `write` wrote; raise MeshError for anything else."""
+        try:
+            return cls.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, ValidationError) as error:
+            raise MeshError(
+                f"Input region file {path} must be one written beside a mesh; instead reading it "
+                f"failed with '{str(error).splitlines()[0]}'. Mesh the study again."
+            ) from None

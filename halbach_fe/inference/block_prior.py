@@ -1,0 +1,393 @@
+"""The prior from moments of single blocks, measured before the magnet was assembled.
+
+A block alone demagnetizes itself. With H = -N M in it, the mean over its volume V,
+``B = mu_0 mu H + B_r`` gives ``m/V = (1 + (mu - 1) N)^-1 B_r / mu_0``, so that the model's
+parameter is ``M = B_r / (mu_0 mu) = mu^-1 (1 + (mu - 1) N) m / V``, mu and N being tensors. That
+the block is then magnetized uniformly is a mistake of second order in mu - 1: for a lone sector of
+the FASER dipole M comes out too large by 7e-5 at mu = 1.05 and 2e-3 at 1.3 (NGSolve, order 4),
+where leaving out N would be wrong by 1.5e-2 and 8e-2.
+
+Deviations from the nominal magnetization are taken along it, across it in the plane of the ring,
+and along z. Where every block's place is known, its own measurement is its prior. Where it is not,
+the blocks of one type are samples of a normal distribution.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import blocks_of, facing_angle_deg, position_angle_deg
+from halbach_fe.geometry.mounting import as_meant, mountings
+from halbach_fe.geometry.symmetry import rotation_about_z
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.solver.vacuum_field import demagnetizing_tensors
+from halbach_fe.stats.gaussian import Gaussian, mounted
+from halbach_fe.stats.small_samples import (
+    anderson_darling,
+    holm,
+    measured_prior,
+    predictive_covariance,
+)
+from halbach_fe.study.magnet import Array
+from halbach_fe.study.model import Study
+
+DIRECTIONS = ("along", "across", "z")
+"""Axes of deviations: along the nominal magnetization, across it in the ring's plane, and z."""
+
+MIN_SAMPLES = 3
+NOT_NORMAL = 0.05
+"""Adjusted p-value below which samples are called not normal: one healthy table in twenty."""
+
+FAR = 0.5
+"""Deviation over the nominal magnetization that no good block has: 50 %, or 29 degrees. It stands
+for another unit, other axes, or another type."""
+
+
+@dataclass(frozen=True)
+class TypeSamples:
+    """The measured blocks of one type.
+
+    Attributes
+    ----------
+    label : str
+    deviations : ndarray, shape (n, d)
+        From the nominal magnetization and relative to it, along `DIRECTIONS`; across it they are
+        angles in rad.
+    intensity : float or None
+        Of the shrinkage, if the covariance is that of the samples.
+    p : ndarray, shape (d,)
+        Anderson and Darling's p-values, adjusted for all types and directions; NaN if not tested.
+    """
+
+    label: str
+    deviations: Floats
+    intensity: float | None
+    p: Floats
+
+    @property
+    def normal(self) -> bool:
+        """Whether no direction is unlikely to be normal; true too where nothing was tested."""
+        return not (self.p < NOT_NORMAL).any()
+
+
+@dataclass(frozen=True)
+class MeasuredPrior:
+    """What a table of blocks tells about a study's magnetizations.
+
+    Attributes
+    ----------
+    gaussian : Gaussian
+        Of the parameters, block by block, in A/m.
+    nominal : ndarray, shape (parameters,), in A/m
+    placed : bool
+        Whether it is each block's own measurement, instead of that of its type.
+    types : tuple of TypeSamples
+    """
+
+    gaussian: Gaussian
+    nominal: Floats
+    placed: bool
+    types: tuple[TypeSamples, ...]
+
+    @property
+    def count(self) -> int:
+        """Measured blocks."""
+        return sum(len(one.deviations) for one in self.types)
+
+
+def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
+    """Turn a table of measured blocks into the prior of a study.
+
+    Raises
+    ------
+    MeasurementError
+        If the table does not fit the study.
+    StudyError
+        If the blocks of a type are not alike in the study.
+
+    Warns
+    -----
+    HalbachWarning
+        If a type's samples stand for its blocks, but do not look normal.
+    """
+    meant = _prior_as_meant(as_meant(study), table)
+    size = study.dimension
+    moves = mountings(study)
+    sources = np.array([source for source, _ in moves])
+    turns = np.array([matrix for _, matrix in moves])[:, :size, :size]
+    mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
+    nominal = np.concatenate([block.magnetization[:size] for block in blocks_of(study)])
+    return replace(meant, nominal=nominal, gaussian=Gaussian(
+        (turns @ mean).ravel(), mounted(meant.gaussian.root, turns, sources)))
+
+
+def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
+    """The same of a magnet whose blocks were mounted as meant."""
+    blocks, size = blocks_of(study), study.dimension
+    slots = types_of(study)
+    _check_types(study, table, slots)
+    _check_complete(study, table)
+    index = _block_of_rows(study, table, slots)
+    conversion = _conversions(study, table, blocks, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    frames = np.array([_frame(block) for block in blocks])
+    deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
+    _check_near(table, deviations)
+    deviations, frames = deviations[:, :size], frames[:, :size, :size]
+    members = {label: deviations[np.array(table.type) == label] for label in slots}
+    placed = bool(table.ring.any())
+    intensities: dict[str, float | None] = dict.fromkeys(slots)
+    mean, own = np.zeros((len(blocks), size)), np.zeros((len(blocks), size, size))
+    shared = [np.zeros((len(blocks), size, 0))]
+    if placed:
+        rows = np.flatnonzero(table.ring)
+        mean[index[rows]] = measured[rows, :size]
+        roots = table.sigma[rows, None, None] * conversion[rows]
+        own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
+    else:
+        _check_alike(study, slots, position_angle_deg,
+                     "Give ring and slot of every measured block.")
+        slot_of = np.array([block.slot for block in blocks])
+        for label, samples in members.items():
+            _check_samples(table, label, samples)
+            covariance, intensities[label] = predictive_covariance(samples)
+            frame = np.where(np.isin(slot_of, slots[label])[:, None, None], frames, 0.0)
+            mean += frame @ (np.eye(size)[0] + samples.mean(axis=0))
+            own += frame @ covariance @ frame.transpose(0, 2, 1)
+            shared.append(frame @ np.linalg.cholesky(covariance / len(samples)))  # of the mean
+    gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
+                              np.radians(study.prior.mounting_sd_deg), study.prior.common_mode_sd)
+    types = _tested(members, intensities)
+    odd = [one.label for one in types if not one.normal]
+    if odd and not placed:
+        warnings.warn(
+            f"The measured blocks of type {', '.join(odd)} do not look normally distributed "
+            f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior takes them so: give "
+            "ring and slot of every block.", HalbachWarning, stacklevel=2)
+    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
+    return MeasuredPrior(gaussian, nominal, placed, types)
+
+
+def loose_blocks(study: Study, table: BlockTable) -> tuple[Floats, Floats]:
+    """What a table tells of blocks that are not mounted yet, wherever in their type's slots.
+
+    Returns
+    -------
+    mean : ndarray, shape (rows, d), in A/m
+        Along the axes of the block's faces: x radially outward, y azimuthal, z, but of cuboids
+        that follow their magnetization x along that. A row without a place has its moment as
+        mounted in the first slot of its type.
+    root : ndarray, shape (rows, d, d), in A/m
+        Of the covariance of each, the calibration of the coil not included.
+
+    Raises
+    ------
+    MeasurementError
+        If the table does not fit the study.
+    StudyError
+        If the blocks of a type are not alike in the study.
+    """
+    study = as_meant(study)
+    blocks, slots, size = blocks_of(study), types_of(study), study.dimension
+    _check_types(study, table, slots)
+    _check_alike(study, slots, facing_angle_deg, "Make them types of their own.")
+    index = _block_of_rows(study, table, slots)
+    conversion = _conversions(study, table, blocks, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    frames = np.array([_frame(block) for block in blocks])[index]
+    _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
+    own = np.array([rotation_about_z(-np.radians(facing_angle_deg(study.array, blocks[i].slot)))
+                    for i in index])
+    roots = own @ conversion * table.sigma[:, None, None]
+    return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
+
+
+def as_mounted(study: Study, table: BlockTable, places: Ints) -> Floats:
+    """Moments (rows, 3) in A m^2 in the own axes of slots (rows,), from 0, ring by ring, that are
+    not those of the table: blocks keep their faces where a slot has them.
+    """
+    array, index = study.array, _block_of_rows(study, table, types_of(study))
+
+    def aside(place: int) -> float:
+        slot = place % array.blocks_per_ring + 1
+        return facing_angle_deg(array, slot) - position_angle_deg(array, slot)
+
+    turns = np.array([rotation_about_z(np.radians(aside(new) - aside(old)))
+                      for new, old in zip(places.tolist(), index.tolist(), strict=True)])
+    return np.einsum("nij,nj->ni", turns, table.moment)
+
+
+def _tested(
+    members: dict[str, Floats], intensities: dict[str, float | None]
+) -> tuple[TypeSamples, ...]:
+    """The samples of every type with their tests of normality."""
+    p = holm(np.array([anderson_darling(column)[1] for samples in members.values()
+                       for column in samples.T])).reshape(len(members), -1)
+    return tuple(TypeSamples(label, samples, intensities[label], row)
+                 for (label, samples), row in zip(members.items(), p, strict=True))
+
+
+def types_of(study: Study) -> dict[str, tuple[int, ...]]:
+    """Slots of every type of block, by its label."""
+    return study.prior.types or {
+        str(slot): (slot,) for slot in range(1, study.array.blocks_per_ring + 1)}
+
+
+def _frame(block: MagnetBlock) -> Floats:
+    """`DIRECTIONS` of a block as columns (3, 3), as long as its nominal magnetization in A/m."""
+    x, y, _ = block.easy_axis
+    axes = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+    return axes * float(np.linalg.norm(block.magnetization))
+
+
+def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
+    """``mu^-1 (1 + (mu - 1) N)`` from axes turned about z to the array's, (3, 3)."""
+    mu = block.recoil_tensor
+    inside = np.eye(3) + (mu - np.eye(3)) @ tensor
+    return np.asarray(np.linalg.solve(mu, inside) @ rotation_about_z(np.radians(angle_deg)))
+
+
+def _conversions(
+    study: Study, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
+) -> Floats:
+    """From measured moments in A m^2 to M in A/m along the array's axes, (rows, 3, 3)."""
+    real = []
+    for row, number in enumerate(index):
+        block, volume = blocks[number], table.volume[row]
+        if study.dimension == 2:
+            length = study.array.ring_length_m or volume / block.area
+            if np.isnan(length):
+                raise MeasurementError(must_be(
+                    f"volume_m3 of block {table.serial[row]}", table.source,
+                    "given for a 2D study without array.ring_length_m", "an empty cell"))
+            block = replace(block, z_min=-length / 2, z_max=length / 2)
+        if not np.isnan(volume) and not 0.5 < volume / block.volume < 2:
+            raise MeasurementError(must_be(
+                f"volume_m3 of block {table.serial[row]}", table.source,
+                f"near the study's, {block.volume:.4g} m^3", f"{volume:g}",
+                "Check units, radii and ring length."))
+        real.append(block)
+    volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
+    tensors = demagnetizing_tensors(real)
+    return np.array([
+        _of_block(block, tensor, position_angle_deg(study.array, block.slot)) / volume
+        for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
+
+
+def _at_reference_temperature(study: Study, table: BlockTable) -> Floats:
+    """Moments (rows, 3) in A m^2 at the study's reference temperature, or as they are."""
+    coefficient = study.prior.temperature_coefficient_per_K
+    reference = study.prior.reference_temperature_C
+    if coefficient is None or reference is None:  # the study has both or neither
+        return table.moment
+    for serial, temperature in zip(table.serial, table.temperature, strict=True):
+        if np.isnan(temperature):
+            raise MeasurementError(must_be(
+                f"temperature_C of block {serial}", table.source,
+                "given, since the study has a temperature coefficient", "an empty cell"))
+    factor = 1 + coefficient * (table.temperature - reference)
+    return np.asarray(table.moment / factor[:, None])
+
+
+def _check_types(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
+    """Types and places must be those of the study."""
+    array = study.array
+    for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
+        if label not in slots:
+            raise MeasurementError(must_be(
+                f"type of block {serial}", table.source,
+                f"one of the study's: {', '.join(slots)}", f"'{label}'",
+                "Name the slots of each type in the study's prior.types."))
+        if ring > array.rings or slot > array.blocks_per_ring:
+            raise MeasurementError(must_be(
+                f"place of block {serial}", table.source,
+                f"within {array.rings} rings of {array.blocks_per_ring} blocks",
+                f"ring {ring}, slot {slot}"))
+        if slot and slot not in slots[label]:
+            raise MeasurementError(must_be(
+                f"type of block {serial}", table.source, f"that of its slot {slot}",
+                f"'{label}', which belongs to slot {', '.join(map(str, slots[label]))}"))
+
+
+def _check_complete(study: Study, table: BlockTable) -> None:
+    """If some blocks have a place, all must be there."""
+    array = study.array
+    wanted = {(ring, slot) for ring in range(1, array.rings + 1)
+              for slot in range(1, array.blocks_per_ring + 1)}
+    missing = sorted(wanted - set(table.places))
+    if table.ring.any() and missing:
+        raise MeasurementError(must_be(
+            "places", table.source, "given for every block of the magnet, or for none",
+            f"none for ring {missing[0][0]}, slot {missing[0][1]} ({len(missing)} such places)"))
+
+
+def _block_of_rows(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
+    """Which of the study's blocks each row is, or, without a place, the first of its type."""
+    return np.array([
+        max(ring - 1, 0) * study.array.blocks_per_ring + (slot or slots[label][0]) - 1
+        for label, (ring, slot) in zip(table.type, table.places, strict=True)])
+
+
+def _check_near(table: BlockTable, deviations: Floats) -> None:
+    """Refuse a block that is nothing like the study's."""
+    ratios = np.linalg.norm(deviations + np.eye(3)[0], axis=1)
+    far = np.flatnonzero(np.linalg.norm(deviations, axis=1) > FAR)
+    if not len(far):
+        return
+    row = int(far[0])
+    ratio = ratios[row]
+    angle = np.degrees(np.arccos(np.clip((deviations[row, 0] + 1) / ratio, -1, 1)))
+    hint = ("Are the moments in the block's own axes as mounted (x radially outward), and is that "
+            "its type?")
+    if not 0.03 < np.median(ratios) < 30:
+        hint = "Are moments and volumes in A m^2 and m^3?"
+    raise MeasurementError(must_be(
+        f"moment of block {table.serial[row]}", table.source,
+        f"within {100 * FAR:g} % of the study's nominal one",
+        f"{ratio:.3g} times as large, {angle:.3g} degrees away ({len(far)} such blocks)", hint))
+
+
+def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
+    """Samples of a type must be enough, and tell how much they differ."""
+    if len(deviations) < MIN_SAMPLES:
+        raise MeasurementError(must_be(
+            f"blocks of type {label}", table.source,
+            f"at least {MIN_SAMPLES} where places are not given", str(len(deviations)),
+            "Give ring and slot of every block, or join types in the study's prior.types."))
+    constant = np.ptp(deviations, axis=0) == 0
+    if constant.any():
+        name = DIRECTIONS[int(np.argmax(constant))]
+        raise MeasurementError(must_be(
+            f"blocks of type {label}", table.source, "different in every direction",
+            f"the same moment {name} in all", "Was that component measured?"))
+
+
+def _check_alike(
+    study: Study, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float], hint: str
+) -> None:
+    """Blocks of one type must be the same block, as seen from their own axes, which are turned by
+    ``axes`` of their slot: a moment must mean the same deviation from the nominal magnetization.
+    """
+    blocks = blocks_of(study)
+    finite = [replace(block, z_min=0.0, z_max=1.0) if study.dimension == 2 else block
+              for block in blocks]
+    tensors = demagnetizing_tensors(finite)
+    seen = np.array([
+        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(study.array, block.slot)))
+        / block.volume for block, tensor in zip(finite, tensors, strict=True)])
+    for label, own in slots.items():
+        first, *others = [number for number, block in enumerate(blocks) if block.slot in own]
+        for number in others:
+            if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():
+                raise StudyError(must_be(
+                    f"`prior.types.{label}`", f"study {study.name}",
+                    "blocks that are alike from their own axes",
+                    f"{blocks[first].name} and {blocks[number].name}, of another magnetization, "
+                    "permeability or shape", hint))

@@ -1,0 +1,157 @@
+"""Files of an inference: posterior.h5, prediction.csv, summary.json."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+import xarray as xr
+
+from halbach_fe.core import untrusted
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.files import write_text
+from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.result import InferenceResult
+from halbach_fe.stats import linear_gaussian
+from halbach_fe.stats.gaussian import Gaussian, Root, beside, entries
+from halbach_fe.study.model import Study
+
+WRITTEN_COVARIANCE = 2000
+"""Parameters, at most, whose covariance is written too: 32 MB."""
+
+
+def write_inference(update: InferenceResult, folder: Path) -> None:
+    """Write posterior.h5, prediction.csv and summary.json."""
+    parameters = list(update.response.parameters)
+    labels = {"reading": list(update.observation.labels)}
+    magnetization = xr.Dataset(
+        {name: ("parameter", values, {"units": "A/m"})
+         for name, values in (
+             ("nominal", update.response.nominal),
+             ("prior_mean", update.prior.mean), ("prior_sd", update.prior.sd),
+             ("posterior_mean", update.posterior.mean), ("posterior_sd", update.posterior.sd))},
+        coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
+    known = {"prior": update.prior, "posterior": update.posterior}
+    for name, one in known.items():
+        magnetization.update(_stored_root(name, one, update.prior))
+        if len(parameters) <= WRITTEN_COVARIANCE:
+            magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
+                                                   {"units": "A2/m2"})
+    write_hdf5(magnetization, folder / "posterior.h5")
+    x, y, z = update.observation.positions.T
+    columns = {
+        "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
+        "region": np.array(update.regions), "held_out": update.held_out.astype(int),
+        "part": np.array(update.parts), "measured_T": update.readings, "sigma_T": update.noise.sd,
+        "solver_error_T": update.response.error,
+        "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
+        "posterior_mean_T": update.prediction_posterior.mean,
+        "posterior_sd_T": update.prediction_posterior.sd,
+        "standardized_residual_prior": update.standardized(update.prediction_prior),
+        "standardized_residual": update.standardized(update.prediction_posterior)}
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+    write_text(folder / "prediction.csv", table.getvalue())
+    text = json.dumps(inference_summary(update), indent=1, allow_nan=False)
+    write_text(folder / "summary.json", text + "\n")
+
+
+def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
+    """Prior and posterior of the magnetizations in A/m, by these names, from a posterior.h5.
+
+    Raises
+    ------
+    MeasurementError
+        If it is none, or not of this study's magnet.
+    """
+    nominal = np.concatenate([block.magnetization[:study.dimension] for block in blocks_of(study)])
+    found: dict[str, Gaussian] = {}
+    try:
+        data = untrusted.read_dataset(path)
+        own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
+        for name in ("prior", "posterior"):
+            found[name] = Gaussian(untrusted.finite_array(data[f"{name}_mean"], own.shape),
+                                   _read_root(data, name, found.get("prior"), len(own)))
+    except (OSError, KeyError, ValueError, TypeError):
+        raise MeasurementError(must_be(
+            "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
+            "none that can be read")) from None
+    if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
+        raise MeasurementError(must_be(
+            "--posterior", str(path), f"that of the magnet of study {study.name}",
+            "that of another nominal magnet", "Use the study that was inferred."))
+    return found
+
+
+def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
+    """Variables of the root of a distribution's covariance: its rows as a sparse matrix, or what
+    the readings left of the prior's, see `Root`.
+    """
+    if isinstance(one.root, Root) and one is not prior and one.root.outer is entries(prior.root):
+        return {f"{name}_directions": (("coordinate", "direction"), one.root.directions),
+                f"{name}_left": ("direction", one.root.left)}
+    rows = sparse.csr_array(entries(one.root))
+    return {f"{name}_root": (f"{name}_entry", rows.data, {"units": "A/m"}),
+            f"{name}_root_column": (f"{name}_entry", rows.indices),
+            f"{name}_root_row_start": (f"{name}_row", rows.indptr, {"columns": rows.shape[1]})}
+
+
+def _read_root(
+    data: xr.Dataset, name: str, prior: Gaussian | None, size: int
+) -> Floats | Root:
+    """The root with ``size`` rows; KeyError, ValueError or TypeError if what is stored is none."""
+    if f"{name}_left" in data and prior is not None:
+        left = data[f"{name}_left"]
+        return Root(entries(prior.root), untrusted.finite_array(
+            data[f"{name}_directions"], (prior.root.shape[1], len(left))),
+            untrusted.finite_array(left, left.shape))
+    start, values = data[f"{name}_root_row_start"], data[f"{name}_root"]
+    rows = sparse.csr_array(
+        (untrusted.finite_array(values, values.shape), _whole(data[f"{name}_root_column"]),
+         _whole(start)),
+        shape=(size, int(start.attrs["columns"])))
+    rows.check_format()  # scipy would follow indices anywhere
+    return beside(rows)
+
+
+def _whole(data: xr.DataArray) -> Ints:
+    values = untrusted.finite_array(data, data.shape)
+    if (np.abs(values) > np.iinfo(np.int32).max).any() or (values % 1 != 0).any():
+        raise ValueError("it must be whole numbers")
+    return values.astype(np.int64)
+
+
+def inference_summary(update: InferenceResult) -> dict[str, object]:
+    """What a script wants to know of an update."""
+    shift = update.posterior.mean - update.prior.mean
+    return {
+        "study": update.study.name,
+        "readings": len(update.readings),
+        "held_out": int(update.held_out.sum()),
+        "parameters": len(update.response.parameters),
+        "posterior": update.kind,
+        "measured_blocks": update.measured_blocks,
+        "superposition_error": update.response.superposition_error,
+        "largest_solver_error_T": float(update.response.error.max()),
+        "largest_solver_error_over_noise": float((update.response.error / update.noise.sd).max()),
+        "prior_conflict": update.prior_conflict,
+        "prior_conflict_limit": update.conflict_limit,
+        "parameters_learnt": update.parameters_learnt,
+        "log_evidence": update.log_evidence,
+        "information_left_out": update.left_out,
+        "contraction_by_block": linear_gaussian.contraction(
+            update.prior, update.posterior, update.study.dimension).round(6).tolist(),
+        "largest_shift_A_per_m": float(np.abs(shift).max()),
+        "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
+        "scores": [asdict(score) for score in update.scores],
+    }

@@ -1,0 +1,180 @@
+"""Moments of single blocks, measured before the magnet was assembled, and their CSV file.
+
+A row is one block on its own in a Helmholtz coil. Its moment is given in the block's own axes as
+mounted: x radially outward through the block's middle, z along the magnet's axis, y azimuthally
+(z cross x). Where ring and slot are known, they count from 1 as everywhere; where they are not,
+``type`` says which blocks of the magnet it is a sample of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.files import atomic, file_bytes
+from halbach_fe.measurement.tables import check_columns, csv_table, finite, write_csv
+
+MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
+REQUIRED_COLUMNS = ("serial", "type", *MOMENT_COLUMNS, "sigma_A_m2")
+COLUMNS = (*REQUIRED_COLUMNS[:2], "ring", "slot", *REQUIRED_COLUMNS[2:], "volume_m3",
+           "temperature_C")
+
+MAX_PLACE = 100_000
+"""Ring or slot."""
+MAX_MOMENT = 1e12
+"""In A m^2; a larger one is no number of a magnet, and its square none of this machine."""
+
+
+@dataclass(frozen=True)
+class BlockTable:
+    """Measured blocks; all arrays have one row per block.
+
+    Attributes
+    ----------
+    serial, type : tuple of str
+    ring, slot : ndarray of int, shape (n,)
+        From 1; both 0 where the block's place in the magnet is not known.
+    moment : ndarray, shape (n, 3), in A m^2
+        In the block's own axes as mounted.
+    sigma : ndarray, shape (n,), in A m^2
+        Standard deviation of each component, independent from block to block.
+    volume : ndarray, shape (n,), in m^3
+    temperature : ndarray, shape (n,), in degrees Celsius
+        NaN where they are not known.
+    attributes : mapping
+        Provenance, free text by key.
+    source : str
+        What error messages call the table.
+    """
+
+    serial: tuple[str, ...]
+    type: tuple[str, ...]
+    ring: Ints
+    slot: Ints
+    moment: Floats
+    sigma: Floats
+    volume: Floats
+    temperature: Floats
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    source: str = "block table"
+
+    def __len__(self) -> int:
+        return len(self.serial)
+
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Ring and slot of every block, (0, 0) where they are not known."""
+        return list(zip(self.ring.tolist(), self.slot.tolist(), strict=True))
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+def read_blocks(path: str | Path) -> BlockTable:
+    """Read and validate a table of measured blocks.
+
+    The header names the columns of `COLUMNS` in any order; ring, slot, volume and temperature may
+    be missing or have empty cells. ``# key: value`` lines are attributes.
+
+    Raises
+    ------
+    MeasurementError
+        With one sentence that names the file, the line and what to do.
+    """
+    path = Path(path)
+    where = f"block table {path}"
+    attributes, header, rows = csv_table(file_bytes(path, where), where)
+    check_columns(header, COLUMNS, where)
+    missing = [name for name in REQUIRED_COLUMNS if name not in header]
+    if missing:
+        raise MeasurementError(must_be("header", where, f"complete with {', '.join(missing)}",
+                                       ",".join(header)))
+    lines = [(number, dict(zip(header, cells, strict=True))) for number, cells in rows]
+
+    def numbers(name: str, empty: float | None = None) -> Floats:
+        return np.array([
+            empty if empty is not None and not row.get(name)
+            else finite(row[name], f"{name} in line {number}", where) for number, row in lines])
+
+    def texts(name: str) -> tuple[str, ...]:
+        for number, row in lines:
+            if not row[name] or row[name].startswith("#"):  # which begins a comment
+                raise MeasurementError(must_be(f"{name} in line {number}", where,
+                                               "given, and not begin with #",
+                                               f"'{row[name]}'" if row[name] else "an empty cell"))
+        return tuple(row[name] for _, row in lines)
+
+    return BlockTable(
+        texts("serial"), texts("type"), _whole(numbers("ring", 0.0), "ring", lines, where),
+        _whole(numbers("slot", 0.0), "slot", lines, where),
+        np.column_stack([numbers(name) for name in MOMENT_COLUMNS]), numbers("sigma_A_m2"),
+        numbers("volume_m3", np.nan), numbers("temperature_C", np.nan), attributes, where)
+
+
+def write_blocks(table: BlockTable, path: Path) -> None:
+    """Write a table as `read_blocks` reads it, whole or not at all; raise OutputError."""
+    columns = {
+        "serial": table.serial, "type": table.type, "ring": [n or "" for n in table.ring.tolist()],
+        "slot": [n or "" for n in table.slot.tolist()],
+        **dict(zip(MOMENT_COLUMNS, table.moment.T, strict=True)), "sigma_A_m2": table.sigma,
+        "volume_m3": table.volume, "temperature_C": table.temperature}
+    with atomic(path) as temporary:
+        write_csv(columns, table.attributes, temporary)
+
+
+def _whole(
+    values: Floats, name: str, lines: Sequence[tuple[int, Mapping[str, str]]], where: str
+) -> Ints:
+    """Counts from 1; 0 for an empty cell."""
+    for value, (number, row) in zip(values, lines, strict=True):
+        if row.get(name) and not (1 <= value <= MAX_PLACE and value == int(value)):
+            raise MeasurementError(must_be(f"{name} in line {number}", where,
+                                           f"a whole number from 1 to {MAX_PLACE}", row[name]))
+    return values.astype(int)
+
+
+def _check(table: BlockTable) -> None:
+    """Refuse what cannot be measured blocks."""
+    if not len(table):
+        raise MeasurementError(must_be("content", table.source, "at least one block", "none"))
+
+    def refuse(number: int, what: str, expected: str, received: object, hint: str = "") -> None:
+        raise MeasurementError(must_be(f"{what} of block {table.serial[number]}", table.source,
+                                       expected, received, hint))
+
+    given = np.abs(np.column_stack([table.moment, table.sigma]))
+    for number in np.flatnonzero(~(given <= MAX_MOMENT).all(axis=1)).tolist():
+        if not np.isfinite(given[number]).all():
+            refuse(number, "moment and sigma", "finite numbers", "an infinite or missing one")
+        refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2",
+               f"{given[number].max():g}")
+    size = np.linalg.norm(table.moment, axis=1)
+    for number in range(len(table)):
+        if not table.sigma[number] > 0:
+            refuse(number, "sigma_A_m2", "positive", f"{table.sigma[number]:g}")
+        if table.sigma[number] >= size[number]:
+            refuse(number, "sigma_A_m2", f"below the moment of {size[number]:g} A m^2",
+                   f"{table.sigma[number]:g}", "Are both in A m^2?")
+        if table.volume[number] <= 0:  # NaN: not known
+            refuse(number, "volume_m3", "positive", f"{table.volume[number]:g}",
+                   "Leave it empty where it is not known.")
+        if np.isinf(table.volume[number]) or np.isinf(table.temperature[number]):
+            refuse(number, "volume and temperature", "finite numbers", "an infinite one")
+        if (table.ring[number] > 0) != (table.slot[number] > 0):
+            refuse(number, "place", "ring and slot together", "one of them alone",
+                   "Leave both empty where the place is not known.")
+    serials: set[str] = set()
+    blocks: dict[tuple[int, int], str] = {}
+    for number, (serial, place) in enumerate(zip(table.serial, table.places, strict=True)):
+        if serial in serials:
+            refuse(number, "serial", "that of one block", "the same again", "Remove a row.")
+        if place[0] and place in blocks:
+            refuse(number, "place", "that of one block",
+                   f"ring {place[0]}, slot {place[1]}, where block {blocks[place]} is")
+        serials.add(serial)
+        blocks[place] = serial

@@ -1,0 +1,272 @@
+"""Field maps: B at labelled points, measured or computed, and their files.
+
+A map is an `xarray.Dataset` with
+
+* ``B_T`` (point, component): flux density in T, NaN where a component was not measured;
+* coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m and ``component`` = x, y, z;
+* optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
+* attributes: provenance, free text by key.
+
+HDF5 and CSV hold all of it and read back equal. VTU, for ParaView, has no place for scans and
+attributes; the rest reads back equal too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import meshio
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from halbach_fe.core import untrusted
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, OutputError, must_be
+from halbach_fe.core.files import _write_bytes, atomic, file_bytes
+from halbach_fe.core.hdf5 import _hdf5
+from halbach_fe.measurement.tables import (
+    _check_printable,
+    check_columns,
+    csv_table,
+    finite,
+    write_csv,
+)
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M
+
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
+SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
+OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
+MAX_FIELD_T = 10.0
+"""No permanent magnet comes near; a larger number is one in mT or G."""
+
+
+def field_map(
+    points: Floats, flux_density: Floats, sigma: Floats | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> xr.Dataset:
+    """Make a map from points (n, 3) in m and B (n, 3) in T, and sigma (n, 3) in T if known."""
+    data = xr.Dataset(
+        {"B_T": (("point", "component"), np.array(flux_density, float))},
+        coords={"component": list(COMPONENTS)} | {
+            name: ("point", np.array(points[:, i], float), {"units": "m"})
+            for i, name in enumerate(POSITION_COLUMNS)},
+        attrs=dict(attributes or {}))
+    data["B_T"].attrs["units"] = "T"
+    if sigma is not None:
+        data["sigma_T"] = (("point", "component"), np.array(sigma, float), {"units": "T"})
+    return data
+
+
+def points_of(data: xr.Dataset) -> Floats:
+    """Positions (n, 3) of a map in m."""
+    return np.column_stack([data[name].values for name in POSITION_COLUMNS])
+
+
+def write_map(data: xr.Dataset, path: Path) -> None:
+    """Write a map; the suffix decides: .h5, .csv or .vtu. The file appears whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        Unknown suffix, or a file that cannot be written.
+    """
+    writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
+        ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
+    if path.suffix not in writers:
+        raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
+                                  f"'{path.suffix}'"))
+    with atomic(path) as temporary:
+        writers[path.suffix](data, temporary)
+
+
+def read_map(path: str | Path) -> xr.Dataset:
+    """Read and validate a map from CSV, HDF5 (.h5, .hdf5, .nc) or VTU.
+
+    CSV: ``# key: value`` comments are attributes; the header names the columns x_m, y_m, z_m and
+    some of Bx_T, By_T, Bz_T in any order, optionally sigma_T or sigma_Bx_T ..., time_s, scan. An
+    empty field is a component that was not measured.
+
+    Raises
+    ------
+    MeasurementError
+        With one sentence that names the file, the line and what to do.
+    """
+    path = Path(path)
+    raw = file_bytes(path, f"map {path}")
+    if path.suffix in (".h5", ".hdf5", ".nc"):
+        data = _read_hdf5(path)
+    else:
+        data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
+    check_readings(data, path)
+    data.encoding["source"] = str(path)
+    return data
+
+
+def _write_csv(data: xr.Dataset, path: Path) -> None:
+    columns: dict[str, NDArray[np.generic]] = {name: data[name].values
+                                               for name in POSITION_COLUMNS}
+    columns |= {name: data["B_T"].values[:, i] for i, name in enumerate(FIELD_COLUMNS)}
+    if "sigma_T" in data:
+        columns |= {name: data["sigma_T"].values[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
+    columns |= {name: data[name].values for name in ("time_s", "scan") if name in data}
+    write_csv(columns, data.attrs, path)
+
+
+def _write_vtu(data: xr.Dataset, path: Path) -> None:
+    points = points_of(data)
+    cells = [("vertex", np.arange(len(points))[:, None])]
+    values = {name: data[name].values for name in ("B_T", "sigma_T", "time_s") if name in data}
+    meshio.write(path, meshio.Mesh(points, cells, point_data=values), file_format="vtu")
+
+
+def _read_hdf5(path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    try:
+        data = untrusted.read_dataset(path)
+    except (OSError, ValueError) as error:
+        raise MeasurementError(must_be("content", where, "a whole HDF5 file",
+                                       f"'{error}'")) from None
+    for name in ("B_T", *POSITION_COLUMNS):
+        if name not in data.variables:
+            raise MeasurementError(must_be("variable", where, f"`{name}`", "a file without it"))
+    if data["B_T"].dims != ("point", "component") or list(
+            data.get("component", xr.DataArray([])).values) != list(COMPONENTS):
+        raise MeasurementError(must_be("`B_T`", where, "labelled (point, component = x, y, z)",
+                                       f"dimensions {data['B_T'].dims}"))
+    if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
+        data["sigma_T"] = data["sigma_T"].broadcast_like(data["B_T"]).transpose(
+            "point", "component")
+    by_point: tuple[str, ...] = ("point",)
+    expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), by_point)
+    expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
+    for name, dims in expected.items():
+        if name not in data.variables:
+            continue
+        numeric = name == "scan" or np.issubdtype(data[name].dtype, np.floating) or (
+            np.issubdtype(data[name].dtype, np.integer))
+        if name == "scan" and data[name].dtype.kind in "OST":
+            data[name] = data[name].astype(str)
+        if data[name].dims != dims or not numeric:
+            raise MeasurementError(must_be(f"`{name}`", where, f"numbers labelled {dims}",
+                                           f"{data[name].dtype} labelled {data[name].dims}"))
+    return data
+
+
+def _read_vtu(path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    try:
+        mesh = untrusted.read_mesh(path)
+        data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
+        if "time_s" in mesh.point_data:
+            data["time_s"] = ("point", mesh.point_data["time_s"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
+                                       f"'{error}'")) from None
+    return data
+
+
+def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
+    where = f"map {path}"
+    attributes, header, rows = csv_table(raw, where)
+    _check_header(header, where)
+    table: dict[str, list[float]] = {name: [] for name in header}
+    scans: list[str] = []
+    for number, cells in rows:
+        for name, cell in zip(header, cells, strict=True):
+            if name == "scan":
+                scans.append(cell)
+            else:
+                table[name].append(_number(cell, name, number, where))
+    points = np.column_stack([table[name] for name in POSITION_COLUMNS])
+    empty = np.full(len(points), np.nan)
+    data = field_map(points, np.column_stack([table.get(n, empty) for n in FIELD_COLUMNS]),
+                     attributes=attributes)
+    if "sigma_T" in table:
+        data["sigma_T"] = (("point", "component"), np.repeat([table["sigma_T"]], 3, 0).T)
+    elif any(name in table for name in SIGMA_COLUMNS):
+        data["sigma_T"] = (("point", "component"),
+                           np.column_stack([table.get(n, empty) for n in SIGMA_COLUMNS]))
+    if "time_s" in table:
+        data["time_s"] = ("point", table["time_s"])
+    if scans:
+        data["scan"] = ("point", scans)
+    return data
+
+
+def _check_header(header: list[str], where: str) -> None:
+    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS),
+                  where)
+    missing = [name for name in POSITION_COLUMNS if name not in header]
+    if missing or not any(name in header for name in FIELD_COLUMNS):
+        expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T"
+        raise MeasurementError(must_be("header", where, f"complete with {expected}",
+                                       ",".join(header)))
+    if "sigma_T" in header and any(name in header for name in SIGMA_COLUMNS):
+        raise MeasurementError(must_be("header", where, "with sigma_T or sigma_Bx_T ..., not both",
+                                       ",".join(header)))
+
+
+def _number(cell: str, name: str, number: int, where: str) -> float:
+    if not cell and (name in FIELD_COLUMNS or name in SIGMA_COLUMNS):
+        return np.nan
+    return finite(cell, f"{name} in line {number}", where, "Leave a missing component empty.")
+
+
+def check_readings(data: xr.Dataset, path: Path) -> None:
+    """Refuse what cannot be a reading: raise MeasurementError with the first in the map."""
+    where = f"map {path}"
+    if not data.sizes["point"]:
+        raise MeasurementError(must_be("content", where, "at least one reading", "none"))
+    points, values = points_of(data), data["B_T"].values
+    if np.isinf(values).any() or not np.isfinite(points).all():
+        row = int(np.argmax(np.isinf(values).any(axis=1) | ~np.isfinite(points).all(axis=1)))
+        raise MeasurementError(must_be(f"reading {row + 1}", where, "finite numbers",
+                                       "an infinite or missing one"))
+    blank = np.isnan(values).all(axis=1)
+    if blank.any():
+        raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
+                                       "at least one component", "none", "Remove the line."))
+    if "sigma_T" in data:
+        sigma = data["sigma_T"].values[~np.isnan(values)]
+        if not (sigma > 0).all() or not np.isfinite(sigma).all():
+            raise MeasurementError(must_be("sigma", where, "positive for every reading",
+                                           "zero, a negative or a missing one"))
+    if "scan" in data:
+        _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
+    _check_duplicates(data, points, where)
+
+
+def check_magnitudes(data: xr.Dataset) -> None:
+    """Refuse a map in other units than m and T; those of its file are the study's to tell."""
+    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+    farthest = float(np.abs(points_of(data)).max())
+    if farthest > 10 * MAX_LENGTH_M:
+        raise MeasurementError(must_be(
+            "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
+            "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study."))
+    largest = float(np.nanmax(np.abs(data["B_T"].values)))
+    if largest > MAX_FIELD_T:
+        unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
+        raise MeasurementError(must_be(
+            "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
+            f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
+            "study."))
+
+
+def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
+    """The same point twice is an error, unless the file says when or in which scan."""
+    keys = [points]
+    if "time_s" in data:
+        keys.append(data["time_s"].values[:, None])
+    if "scan" in data:
+        keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None].astype(float))
+    unique, first = np.unique(np.hstack(keys), axis=0, return_index=True)
+    if len(unique) < len(points):
+        row = int(np.setdiff1d(np.arange(len(points)), first)[0])
+        x, y, z = points[row]
+        raise MeasurementError(must_be(
+            f"reading {row + 1}", where, "at a point of its own", f"({x:g}, {y:g}, {z:g}) m again",
+            "Remove it, or tell repeated readings apart by time_s or scan."))

@@ -1,0 +1,30 @@
+"""Field maps for BDSIM, three-dimensional (``bdsim3d``).
+
+Keys ``nx> 5``, ``xmin> -2.0`` ..., a line ``! X Y Z Fx Fy Fz``, then rows in cm and T; x changes
+fastest, which is BDSIM's ``loopOrder> xyzt``. Source: BDSIM's manual, Field Map File Formats; its
+loader takes the grid from the keys and the values from their order alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from halbach_fe.measurement.formats.grid import Grid
+from halbach_fe.study.types import COMPONENTS
+
+PER_M = 100.0
+
+
+def lines(grid: Grid) -> Iterator[str]:
+    """Lines of the file."""
+    for name, axis in zip(COMPONENTS, grid.axes, strict=True):
+        yield f"n{name}> {len(axis)}"
+        yield f"{name}min> {PER_M * float(axis[0])!r}"
+        yield f"{name}max> {PER_M * float(axis[-1])!r}"
+    yield "loopOrder> xyzt"
+    yield "! X Y Z Fx Fy Fz"
+    xs, ys, zs = (axis.tolist() for axis in grid.axes)
+    for k, z in enumerate(zs):
+        for j, y in enumerate(ys):
+            for x, field in zip(xs, grid.field[:, j, k].tolist(), strict=True):
+                yield " ".join(repr(value) for value in (PER_M * x, PER_M * y, PER_M * z, *field))

@@ -1,0 +1,190 @@
+"""Static magnetic field meshes of openPMD-beamphysics, in HDF5.
+
+Source: openPMD-standard, EXT_BeamPhysics, External Mesh Fields, and the package
+openpmd-beamphysics where that is silent: `axisLabels` is the order of the axes of the data (older
+files: `gridDataOrder` F, the reverse), and `gridSize`, `gridSpacing`, `gridOriginOffset` and
+`gridLowerBound` are of x, y, z whatever that order. Point i of an axis is at gridOriginOffset +
+(gridLowerBound + i) gridSpacing from the anchor. A component that is not in the file is zero.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+
+from halbach_fe.core import untrusted
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.grid import Grid
+from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.table import ForeignTable
+from halbach_fe.study.types import COMPONENTS
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+TESLA = (0.0, 1.0, -2.0, -1.0, 0.0, 0.0, 0.0)
+"""Powers of m, kg, s, A, K, mol and cd."""
+MAX_POINTS = 10_000_000
+"""A small file can promise any number."""
+PATH = "/ExternalFieldMesh/%T/"
+
+
+def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
+    """Read the one field mesh of a file.
+
+    Raises
+    ------
+    MeasurementError
+        If there is none or more than one, or it is none of a static magnetic field on a
+        rectangular grid.
+    """
+    try:
+        with untrusted.open_hdf5(io.BytesIO(raw)) as file:
+            return _table(_only_mesh(file, where), where)
+    except MeasurementError:
+        raise
+    except Exception as error:  # h5py raises whatever a damaged file makes of it
+        raise MeasurementError(must_be("content", where, "a whole openPMD file",
+                                       f"'{(str(error).splitlines() or [''])[0][:200]}'")) from None
+
+
+def content(grid: Grid) -> bytes:
+    """A file with a grid's field, anchored at the centre of the magnet."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        _describe(file, {"dataType": "openPMD", "openPMD": "2.0.0",
+                         "openPMDextension": "BeamPhysics", "externalFieldPath": PATH})
+        mesh = file.create_group(PATH.replace("%T", "01"))
+        _describe(mesh, {
+            "eleAnchorPt": "center", "gridGeometry": "rectangular", "axisLabels": COMPONENTS,
+            "gridLowerBound": np.zeros(3, int), "gridSize": np.array(grid.shape),
+            "gridSpacing": grid.spacing, "gridOriginOffset": [axis[0] for axis in grid.axes],
+            "harmonic": 0, "fundamentalFrequency": 0.0})
+        for index, name in enumerate(COMPONENTS):
+            data = mesh.create_dataset(f"magneticField/{name}",
+                                       data=grid.field[..., index].astype(complex))
+            _describe(data, {"unitSI": 1.0, "unitDimension": TESLA, "unitSymbol": "T"})
+    return buffer.getvalue()
+
+
+def _describe(node: Any, attributes: Mapping[str, Any]) -> None:
+    """Set attributes; text as bytes, as openpmd-beamphysics and Bmad write it."""
+    for key, value in attributes.items():
+        array = np.asarray(value)
+        node.attrs[key] = array.astype(np.bytes_) if array.dtype.kind == "U" else value
+
+
+def _only_mesh(file: Any, where: str) -> Any:
+    """The group of the one mesh."""
+    if "externalFieldPath" not in file.attrs:
+        raise MeasurementError(must_be("attribute", where, "`externalFieldPath`, of a field mesh "
+                                       "of openPMD-beamphysics", "a file without it"))
+    path = str(_text(file.attrs["externalFieldPath"]))
+    base, wild, _ = path.partition("%T")
+    names = sorted(file[base]) if wild else [""]
+    if len(names) != 1:
+        raise MeasurementError(must_be("content", where, "one field mesh", f"{len(names)}"))
+    return file[base + names[0]]
+
+
+def _table(mesh: Any, where: str) -> ForeignTable:
+    attributes = {key: _text(value) for key, value in mesh.attrs.items()}
+    _check(attributes, where)
+    size = [int(count) for count in _vector(attributes, "gridSize", where)]
+    if min(size) < 1 or np.prod([float(count) for count in size]) > MAX_POINTS:
+        raise MeasurementError(must_be("`gridSize`", where, f"of 1 to {MAX_POINTS} points",
+                                       " x ".join(map(str, size))))
+    origin, spacing, lower = (_vector(attributes, name, where) for name in (
+        "gridOriginOffset", "gridSpacing", "gridLowerBound"))
+    axes = [start + (first + np.arange(count)) * step for start, first, count, step in zip(
+        origin, lower, size, spacing, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    labels = tuple(map(str, np.atleast_1d(attributes["axisLabels"])))
+    scale = float(attributes.get("fieldScale", 1.0))
+    field = np.column_stack([
+        scale * _component(mesh["magneticField"], name, labels, size, where).ravel()
+        for name in COMPONENTS])
+    anchor = str(attributes["eleAnchorPt"])
+    columns = [Name(name, name, "m") for name in COMPONENTS] + [
+        Name(f"B{name}", f"B{name}", "T") for name in COMPONENTS]
+    return ForeignTable(tuple(columns), np.hstack([points, field]), where,
+                        anchor="" if anchor == "center"
+                 else f"the '{anchor[:20]}' of the element, from which it counts,")
+
+
+def _check(attributes: Mapping[str, Any], where: str) -> None:
+    """Refuse what is no static field on a rectangular grid."""
+    needed = ("gridGeometry", "eleAnchorPt", "axisLabels", "gridSize", "gridSpacing",
+              "gridOriginOffset", "gridLowerBound", "harmonic")
+    for name in needed:
+        if name not in attributes:
+            raise MeasurementError(must_be("attribute", where, f"`{name}`", "a mesh without it"))
+    allowed: dict[str, tuple[Any, str]] = {
+        "gridGeometry": ("rectangular", "rectangular"), "harmonic": (0, "0, a static field"),
+        "gridCurvatureRadius": (0, "0, a straight grid"), "RFphase": (0, "0, a static field"),
+        "gridUnitSI": (1, "1, in metres")}
+    for name, (value, expected) in allowed.items():
+        if name in attributes and attributes[name] != value:
+            raise MeasurementError(must_be(f"`{name}`", where, expected,
+                                           f"{str(attributes[name])[:40]}"))
+    labels = sorted(map(str, np.atleast_1d(attributes["axisLabels"])))
+    if labels != list(COMPONENTS):
+        raise MeasurementError(must_be("`axisLabels`", where, "x, y and z in some order",
+                                       ", ".join(labels)[:40]))
+
+
+def _vector(attributes: Mapping[str, Any], name: str, where: str) -> Floats:
+    values = np.atleast_1d(np.asarray(attributes[name], float))
+    if values.shape != (3,) or not (np.abs(values) < 1e12).all():
+        raise MeasurementError(must_be(f"`{name}`", where, "three finite numbers",
+                                       f"{attributes[name]}"[:60]))
+    return values
+
+
+def _component(
+    record: Any, name: str, labels: tuple[str, ...], size: list[int], where: str
+) -> Floats:
+    """A component (nx, ny, nz) in T."""
+    if name not in record:
+        return np.zeros(size)
+    node = record[name]
+    if tuple(node.attrs["unitDimension"]) != TESLA:
+        raise MeasurementError(must_be(f"`unitDimension` of magneticField/{name}", where,
+                                       "that of a flux density",
+                                       str(tuple(node.attrs["unitDimension"]))[:60]))
+    if _text(node.attrs.get("gridDataOrder", "C")) == "F":
+        labels = tuple(reversed(COMPONENTS))
+    order = [COMPONENTS.index(label) for label in labels]
+    expected = tuple(size[axis] for axis in order)
+    constant = isinstance(node, h5py.Group)
+    shape = tuple(int(count) for count in (node.attrs["shape"] if constant else node.shape))
+    if shape != expected:
+        raise MeasurementError(must_be(
+            f"shape of magneticField/{name}", where,
+            f"{expected}, the gridSize along {', '.join(labels)}", f"{shape}"))
+    values = np.full(shape, node.attrs["value"]) if constant else np.asarray(node[()])
+    if values.dtype.kind == "c":
+        if values.imag.any():
+            raise MeasurementError(must_be(f"magneticField/{name}", where, "real, a static field",
+                                           "complex numbers"))
+        values = values.real
+    return np.asarray(values.astype(float) * float(node.attrs["unitSI"])).transpose(
+        np.argsort(order))
+
+
+def _text(value: Any) -> Any:
+    """An attribute with text in place of bytes, and a scalar in place of one number alone."""
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind == "S":
+            value = np.char.decode(value)
+        if value.dtype.kind == "O":
+            value = np.array([_text(one) for one in value.ravel()])
+        if value.size == 1:
+            return value.ravel()[0]
+    return value

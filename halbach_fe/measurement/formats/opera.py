@@ -1,0 +1,82 @@
+"""Tables of Opera, as its TABLE command writes them.
+
+::
+
+     5 461 311 2                  three counts, of a grid along x, y and z, and a flag
+     1 X [METRE]                  a number, a name and a unit for each column
+     ...
+     6 BZ [TESLA]
+     0                            the end of the header; [METRE] here is the unit of all lengths
+     -0.55 -1.1 -0.01 0.5e-4 0.4e-5 -0.2e-2
+
+The first line may be blank; a list of points has its length three times in place of the counts.
+Units may be LENGU and FLUXU, which say nothing, or be missing. Layouts: the table of Geant4's
+example purging_magnet, those that OPAL (tests of SBend3D) and musrSim (its manual) read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement.formats import names
+from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.table import ForeignTable
+from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
+
+COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
+COLUMN = re.compile(r"\s*([1-9]\d?)\s+([A-Za-z][^\s\[]*)\s*(?:\[([^\[\]]*)\])?\s*")
+END = re.compile(r"\s*0\s*(?:\[([^\[\]]*)\])?\s*")
+MAX_HEADER = 200
+
+
+def is_opera(lines: Sequence[Line]) -> bool:
+    """Whether lines begin as such a table does."""
+    first = [line for _, line in lines[:2] if len(line) <= MAX_HEADER]
+    return len(first) == 2 and bool(COUNTS.fullmatch(first[0])) and bool(COLUMN.fullmatch(first[1]))
+
+
+def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
+    """Read such a table; points may come in any order.
+
+    Raises
+    ------
+    MeasurementError
+        If the header is another, or not as many points follow as it says.
+    """
+    lines = lines_of(raw, declared, where)
+    counts = COUNTS.fullmatch(lines[0][1][:MAX_HEADER])
+    if not counts:
+        raise MeasurementError(must_be("first line", where, "the three counts of an Opera table",
+                                       f"'{lines[0][1].strip()[:40]}'"))
+    columns, length_unit, start = _columns(lines, where)
+    values, texts = rows_of(lines[start:], len(columns), None, declared, where)
+    grid = [int(text) for text in counts.groups()[:3]]
+    listed = len(set(grid)) == 1 and len(values) == grid[0]
+    if len(values) != grid[0] * grid[1] * grid[2] and not listed:
+        raise MeasurementError(must_be(
+            "content", where, f"{grid[0]} x {grid[1]} x {grid[2]} points, as its first line says",
+            str(len(values)), "Is the file cut short?"))
+    return ForeignTable(columns, values, where, length_unit=length_unit, texts=texts)
+
+
+def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[Name, ...], str, int]:
+    """Columns, unit of length for all, and the index of the first row."""
+    columns: list[Name] = []
+    for index, (number, line) in enumerate(lines[1:], 1):
+        line = line[:MAX_HEADER]
+        if end := END.fullmatch(line):
+            if not columns:
+                break
+            return tuple(columns), (end[1] or "").strip(), index + 1
+        column = COLUMN.fullmatch(line)
+        if not column or int(column[1]) != len(columns) + 1:
+            raise MeasurementError(must_be(
+                f"line {number}", where, f"column {len(columns) + 1} of the header (number, name, "
+                "[unit]), or its end, 0", f"'{line.strip()[:40]}'"))
+        name = names.parse(column[2])
+        columns.append(Name(name.text, name.quantity, (column[3] or "").strip()))
+    raise MeasurementError(must_be("header", where, "columns and a line 0 after them",
+                                   "none of that"))

@@ -1,0 +1,118 @@
+"""CSV tables, read with one sentence for what is wrong in them."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import parse_number as number_in
+
+
+def csv_table(
+    raw: bytes, where: str
+) -> tuple[dict[str, str], list[str], Iterator[tuple[int, list[str]]]]:
+    """Split CSV into the attributes of its ``# key: value`` comments, its header and its rows,
+    each with its line number.
+
+    Raises
+    ------
+    MeasurementError
+        If it is no text or has no header; from the iterator, which lets the caller judge the
+        header first, if there are no rows or one has another length than the header.
+    """
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise MeasurementError(
+            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
+                    "Save it as UTF-8 text.")) from None
+    attributes: dict[str, str] = {}
+    rows: list[tuple[int, list[str]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        comment = re.match(r"\s*#\s*(?:([^:]+?)\s*:\s*(.*))?", line)
+        if comment:
+            if comment[1]:
+                attributes[comment[1]] = comment[2].strip()
+        elif line.strip():
+            rows.append((number, _cells(line, number, where)))
+    if not rows:
+        raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
+    header = rows[0][1]
+    if len(set(header)) < len(header):
+        raise MeasurementError(must_be("header", where, "without repeated columns",
+                                       ",".join(header)))
+    return attributes, header, _equally_long(len(header), rows[1:], where)
+
+
+def _equally_long(
+    count: int, rows: list[tuple[int, list[str]]], where: str
+) -> Iterator[tuple[int, list[str]]]:
+    if not rows:
+        raise MeasurementError(must_be("content", where, "at least one reading",
+                                       "a header alone"))
+    for number, cells in rows:
+        if len(cells) != count:
+            raise MeasurementError(must_be(f"line {number}", where, f"{count} values",
+                                           str(len(cells)), "Is the file cut short?"))
+        yield number, cells
+
+
+def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> None:
+    """Refuse a header with a column that is not known."""
+    for name in header:
+        if name not in known:
+            raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
+                                           f"column '{name}'", "Rename or remove it."))
+
+
+def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str],
+              path: Path) -> None:
+    """Write columns by name, with attributes as comments; NaN is an empty cell."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for key, value in attributes.items():
+            file.write(f"# {_one_line(key)}: {_one_line(value)}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([_cell(value) for value in row])
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float | np.floating):
+        return "" if np.isnan(value) else repr(float(value))
+    return _one_line(value)
+
+
+def _cells(line: str, number: int, where: str) -> list[str]:
+    try:
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise MeasurementError(must_be(f"line {number}", where, "comma-separated values",
+                                       f"'{error}'")) from None
+    _check_printable(cells, f"line {number}", where)
+    return cells
+
+
+def _check_printable(names: Iterable[str], what: str, where: str) -> None:
+    """Serial numbers, types and scans go to terminals and into other files."""
+    for name in names:
+        if not name.isprintable():
+            raise MeasurementError(must_be(what, where, "without control characters", f"'{name}'"))
+
+
+def finite(cell: str, what: str, where: str, hint: str = "") -> float:
+    """The number in a cell; MeasurementError if it is none, or not finite."""
+    try:
+        return number_in(cell)
+    except ValueError:
+        raise MeasurementError(must_be(what, where, "a finite number", f"'{cell}'",
+                                       hint)) from None

@@ -1,0 +1,1 @@
+"""The response of readings to magnetizations, its error, and what it costs."""

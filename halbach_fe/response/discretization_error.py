@@ -1,0 +1,84 @@
+"""How far the mesh, the boundary or the formulation moves the field: error bars for readings.
+
+All errors are those of the full nominal array, where the errors of blocks add up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius, magnet_half_length
+from halbach_fe.measurement.observation import Observation
+from halbach_fe.solver.field import MESHES, ElementFields, choose_route, finite_element_part
+from halbach_fe.solver.mesh import meridian_size
+from halbach_fe.solver.session import Session
+from halbach_fe.study.model import Study
+
+REFINEMENT = 1.5
+DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
+
+
+def refined(study: Study, factor: float) -> Study:
+    """The study with all elements smaller by a factor."""
+    mesh = study.mesh
+    bore = mesh.bore_size_m or mesh.block_size_m
+    return study.model_copy(update={"mesh": mesh.model_copy(update={
+        "block_size_m": mesh.block_size_m / factor, "bore_size_m": bore / factor,
+        "meridian_size_m": meridian_size(study) / factor,
+        "layers_per_ring": max(1, round(mesh.layers_per_ring * factor)),
+        "growth": 1 + (mesh.growth - 1) / factor})})
+
+
+def farther(study: Study, mesh: str, factor: float) -> Study:
+    """The study with the boundary of a kind of mesh farther by a factor."""
+    end = magnet_half_length(study)
+    update = {"radius_m": factor * boundary_radius(study, mesh)}
+    if study.dimension == 3:
+        update["half_length_m"] = end + factor * (boundary_half_length(study, mesh) - end)
+    return study.model_copy(update={
+        "open_boundary": study.open_boundary.model_copy(update=update)})
+
+
+def dual(study: Study, route: str) -> Study:
+    """The study by the other of two formulations that bracket the truth."""
+    return study.model_copy(update={
+        "solver": study.solver.model_copy(update={"route": DUAL[route]})})
+
+
+def error_bar_session(session: Session) -> Session:
+    """The session with a folder of its own for error bars: the study's run folders are kept."""
+    return replace(session, folder=session.folder / "error-bar")
+
+
+def reading_errors(
+    study: Study, observation: Observation, parts: ElementFields, session: Session
+) -> Floats:
+    """Error bar of every reading, (readings,) in T, by what another discretization says.
+
+    On a 3D mesh that is the dual formulation on the same mesh: the truth lies between them, as far
+    as energies go, and they err in opposite directions at the boundary. Elsewhere, where a second
+    mesh is cheap, it is a coarser one, and a farther boundary.
+
+    Parameters
+    ----------
+    parts : ElementFields
+        The finite-element part of the field at the observation's points.
+    """
+    nominal = parts.nominal
+    if parts.error is not None:
+        return observation.magnitude(parts.error)
+    if not nominal.any():  # nothing is left to finite elements
+        return np.zeros(len(observation))
+    route = choose_route(study, observation.points)
+
+    def change(variant: Study) -> Floats:
+        other = finite_element_part(variant, observation.points, session, columns=False).nominal
+        return observation.magnitude(other - nominal)
+
+    if route in DUAL:
+        return change(dual(study, route))
+    return change(refined(study, 1 / REFINEMENT)) + change(
+        farther(study, MESHES[route], REFINEMENT))

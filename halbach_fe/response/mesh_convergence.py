@@ -1,0 +1,182 @@
+"""How wrong the solved field is: refinement, a farther boundary, and the dual formulation.
+
+Everything is judged on the full nominal array at the study's own positions, where the errors of
+blocks add up, in units of the largest field there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.observation import fourier_analysis
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.reading_noise import noise_regions
+from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
+from halbach_fe.solver.field import MESHES, choose_route, is_vacuum, solve_nominal
+from halbach_fe.solver.mesh import meridian_size
+from halbach_fe.solver.session import Session
+from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.study.measurement import FourierCoefficients
+from halbach_fe.study.model import Study
+
+HARMONICS = 8
+
+EXACT = "exact field"
+
+FLATTEST, STEEPEST = 0.5, 4.0
+"""Orders of convergence that are believed."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Largest difference of two solves over the largest field.
+
+    Attributes
+    ----------
+    what : str
+    pointwise : float
+        Of B at the points.
+    fourier : float or None
+        Of the Fourier coefficients of B_r, where the study's positions are circles.
+    by_region : dict
+        Pointwise, by noise region.
+    """
+
+    what: str
+    pointwise: float
+    fourier: float | None
+    by_region: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What `verify` found.
+
+    Attributes
+    ----------
+    route : str
+    differences : tuple of Difference
+        Coarser to study, study to finer, nearer to farther boundary, the dual route if any, and
+        the exact field if there is one (method ``direct``, no permeability, no iron).
+    order : float
+        Observed order of convergence in the element size, between 0.5 and 4.
+    error_pointwise, error_fourier : float
+        Relative to the largest field: the difference to the exact field if there is one, otherwise
+        estimated for the study's own mesh as the remaining series of refinements, plus what the
+        boundary changes.
+    main_field_T : float
+    element_size_m : float
+        Of the study's own mesh, at the magnet.
+    points : ndarray, shape (n, 3), in m
+    field : ndarray, shape (n, 3), in T
+        On the study's own mesh.
+    changes : ndarray, shape (differences, n), in T
+        |change of B| at every point.
+    """
+
+    route: str
+    differences: tuple[Difference, ...]
+    order: float
+    error_pointwise: float
+    error_fourier: float | None
+    main_field_T: float
+    element_size_m: float
+    points: Floats
+    field: Floats
+    changes: Floats
+
+    def plain(self) -> dict[str, object]:
+        """For scripts, without what is given by point."""
+        return {key: value for key, value in asdict(self).items()
+                if not isinstance(value, np.ndarray)}
+
+
+def verify(
+    study: Study, session: Session, say: Callable[[str], None] = lambda _: None
+) -> Verification:
+    """Solve the study on three meshes, with a farther boundary, and by the dual route if any.
+
+    ``say`` is told what is solved next.
+    """
+    points = points_from(study.observation.positions)
+    route = choose_route(study, points)
+
+    def solve(what: str, variant: Study) -> Floats:
+        say(what)
+        return solve_nominal(variant, points, session)
+
+    base = solve("the study's mesh", study)
+    coarse = solve("a coarser mesh", refined(study, 1 / REFINEMENT))
+    fine = solve("a finer mesh", refined(study, REFINEMENT))
+    far = solve("a farther boundary", farther(study, MESHES[route], REFINEMENT))
+    compare = _Comparison(study, points, base)
+    pairs = {"coarser mesh to the study's": (coarse, base),
+             "the study's mesh to a finer": (base, fine), "boundary farther away": (base, far)}
+    if route in DUAL:
+        pairs[f"dual route, {DUAL[route]}"] = (
+            base, solve(f"the dual route, {DUAL[route]}", dual(study, route)))
+    if study.solver.method == "direct" and is_vacuum(study):
+        pairs[EXACT] = base, field_of(blocks_of(study), points)
+    steps = [compare(what, *pair) for what, pair in pairs.items()]
+    order = observed_order(steps[0].pointwise, steps[1].pointwise)
+    if EXACT in pairs:
+        error, fourier = steps[-1].pointwise, steps[-1].fourier
+    else:
+        series = 1 / (1 - REFINEMENT**-order)
+        error = series * steps[1].pointwise + steps[2].pointwise
+        fourier = (None if steps[1].fourier is None or steps[2].fourier is None
+                   else series * steps[1].fourier + steps[2].fourier)
+    return Verification(
+        route=route, differences=tuple(steps), order=order, error_pointwise=error,
+        error_fourier=fourier, main_field_T=compare.scale,
+        element_size_m=(meridian_size(study) if route == "azimuthal_modes"
+                        else study.mesh.block_size_m),
+        points=points, field=base, changes=np.array(
+            [np.linalg.norm(one - other, axis=1) for one, other in pairs.values()]))
+
+
+def observed_order(first: float, second: float) -> float:
+    """Order of convergence from two successive changes, kept between 0.5 and 4.
+
+    The lower limit makes the estimate of a solve that does not converge large (5.4 times the last
+    change) but finite; the upper one keeps a lucky pair from looking exact.
+    """
+    if first <= 0 or second <= 0:
+        return STEEPEST if second <= 0 else FLATTEST
+    return float(np.clip(np.log(first / second) / np.log(REFINEMENT), FLATTEST, STEEPEST))
+
+
+class _Comparison:
+    """Differences of fields at a study's points."""
+
+    def __init__(self, study: Study, points: Floats, field: Floats) -> None:
+        self.scale = float(np.linalg.norm(field, axis=1).max())
+        self._circles = None
+        positions = study.observation.positions
+        if positions.kind == "circles" and positions.angles > 2:
+            wanted = getattr(study.observation, "harmonics", HARMONICS)
+            self._circles, *_ = fourier_analysis(points, FourierCoefficients(
+                quantity="fourier_coefficients", positions=positions,
+                harmonics=min(wanted, (positions.angles - 1) // 2)))
+        self._regions = {"all": np.ones(len(points), bool)}
+        if study.noise is not None and study.noise.regions:
+            names = getattr(study.observation, "components", ("",))
+            index = noise_regions(study.noise, np.repeat(points[:, 2], len(names)),
+                                  names * len(points)).reshape(len(points), -1)
+            regions = np.array([region.name for region in study.noise.regions])[index]
+            self._regions = {name: (regions == name).any(axis=1) for name in np.unique(regions)}
+
+    def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
+        change = np.linalg.norm(one - two, axis=1) / self.scale
+        fourier = (None if self._circles is None
+                   else float(np.abs(self._circles @ (one - two).ravel()).max() / self.scale))
+        return Difference(
+            what=what, pointwise=float(change.max()), fourier=fourier,
+            by_region={name: float(change[mask].max()) for name, mask in self._regions.items()
+                       if mask.any()})
+

@@ -1,0 +1,480 @@
+"""Multipoles of a magnet as linear functions of its block magnetizations.
+
+``B_y + i B_x = sum_n C_n ((x + i y) / R)^(n - 1)`` at the reference radius R, n = 1 the dipole,
+with ``C_n = B_n + i A_n``: normal and skew (the European convention; S. Russenschuck, Field
+Computation for Accelerator Magnets, 2010, ch. 6). On the circle that is ``B_r = sum A_n cos(n phi)
++ B_n sin(n phi)``, the Fourier coefficients that a study observes. Unwanted multipoles are in units
+of 1e-4 of the main one, ``c_n = 1e4 C_n / |C_N|``, along axes turned about z such that the nominal
+magnet's main multipole is normal: ``C_n exp(-i n arg(C_N) / N)``.
+
+In two dimensions there is one circle. In three the field is integrated along z over the magnet and
+far beyond its ends, which makes it a solution of the two-dimensional Laplace equation again; or,
+at one z, the coefficients of B_r there are given as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.geometry.domain import magnet_half_length, magnet_radius
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.observation import Observation, fourier_analysis, observe, together
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
+
+Complexes = NDArray[np.complex128]
+
+UNITS = 1e4
+"""Multipoles are given in 1e-4 of the main one."""
+
+DEFAULT_RADIUS = 2 / 3
+"""Reference radius over the blocks' inner radius, as is usual."""
+
+DEFAULT_ORDERS = tuple(range(1, 11))
+
+SUM_ERROR = 1e-8
+"""What equally spaced angles, or z, may add of one multipole to another, relative to the field at
+the blocks. Harmonics of order k fall as (R / r)^k from the blocks' radius r inwards, and a sum over
+steps h along z of a field whose sources are d away errs by exp(-2 pi d / h)."""
+
+BEYOND_ENDS = 4.5
+"""How far sums along z go beyond the magnet, over its outer radius. A block's field falls as 1/z^3,
+which leaves some 1e-3 of a block's own integral of order 1 to the field of point dipoles beyond.
+Higher orders fall faster: for two rings of 80 mm with errors of 2 %, 0.01 units remain. It is half
+of the way to where 3D meshes end."""
+
+NOTHING_THERE = 1e-6
+"""Main multipole below which a magnet has none, relative to what its blocks could do together."""
+
+
+@dataclass(frozen=True)
+class MultipoleReference:
+    """Where multipoles are taken, and which.
+
+    Attributes
+    ----------
+    radius_m : float or None
+        Default: that of the study's own circles if it has one, else `DEFAULT_RADIUS` of the bore.
+    orders : tuple of int
+        Unwanted ones; the main one, if it is there, does not count.
+    z_m : float or None
+        In three dimensions: of one circle, in place of the integral along z.
+    """
+
+    radius_m: float | None = None
+    orders: tuple[int, ...] = DEFAULT_ORDERS
+    z_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Multipoles:
+    """Multipoles of a magnet, as far as they are known.
+
+    Attributes
+    ----------
+    orders : tuple of int
+        Unwanted ones, k of them.
+    main : float
+        |C_N| in T, or T m if integrated along z; ``main_sd`` its standard deviation.
+    roll : float
+        Angle in rad by which the main multipole is turned about z from the nominal one.
+    mean : ndarray, shape (2 k,)
+        b_n of all orders, then a_n, in units of 1e-4 of the main one.
+    root : ndarray, shape (2 k, q)
+        Root of their covariance.
+    error : ndarray, shape (2 k,)
+        The solver's own, of the nominal magnet, not in ``root``.
+    """
+
+    orders: tuple[int, ...]
+    main: float
+    main_sd: float
+    roll: float
+    roll_sd: float
+    mean: Floats
+    root: Floats
+    error: Floats
+
+    @property
+    def covariance(self) -> Floats:
+        """Shape (2 k, 2 k)."""
+        return self.root @ self.root.T
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviations (2 k,), the solver's error included."""
+        return np.sqrt(np.einsum("ij,ij->i", self.root, self.root) + self.error**2)
+
+    @property
+    def sizes(self) -> Floats:
+        """|c_n| (k,) of the mean."""
+        return np.hypot(*self.mean.reshape(2, -1))
+
+    @property
+    def expected_square(self) -> float:
+        """Expected sum of all |c_n|^2, without the solver's error."""
+        return float(self.mean @ self.mean + np.sum(self.root**2))
+
+    def sizes_of(self, normals: Floats) -> Floats:
+        """|c_n| (count, k) of samples, made of standard normal numbers (count, 2 k)."""
+        values, vectors = np.linalg.eigh(self.covariance + np.diag(self.error**2))
+        drawn = self.mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        return np.hypot(*drawn.reshape(len(drawn), 2, -1).swapaxes(0, 1))
+
+    def table(self) -> list[dict[str, float]]:
+        """One row per order, as plain numbers."""
+        size = len(self.orders)
+        return [{"n": order, "b": float(self.mean[i]), "b_sd": float(self.sd[i]),
+                 "a": float(self.mean[size + i]), "a_sd": float(self.sd[size + i]),
+                 "size": float(self.sizes[i])} for i, order in enumerate(self.orders)]
+
+
+@dataclass(frozen=True)
+class MultipoleModel:
+    """Multipoles ``C = offset + matrix p`` in T (integrated: T m), the main one first.
+
+    Attributes
+    ----------
+    orders : tuple of int
+        Unwanted ones.
+    main : int
+        The magnet's own order N.
+    radius : float, in m
+    z : float or None
+        In m, of one circle in three dimensions.
+    integrated : bool
+    matrix : ndarray of complex, shape (1 + k, parameters)
+        Along axes in which the nominal main multipole is normal.
+    offset : ndarray of complex, shape (1 + k,)
+    error : ndarray, shape (1 + k,)
+        Of the solver, of the modulus.
+    nominal : ndarray, shape (parameters,), in A/m
+    turn : float
+        Angle of those axes in rad.
+    """
+
+    orders: tuple[int, ...]
+    main: int
+    radius: float
+    z: float | None
+    integrated: bool
+    matrix: Complexes
+    offset: Complexes
+    error: Floats
+    nominal: Floats
+    turn: float
+
+    @property
+    def unit(self) -> str:
+        """Of the main multipole."""
+        return "T m" if self.integrated else "T"
+
+    @cached_property
+    def nominal_main(self) -> float:
+        """|C_N| of the nominal magnet."""
+        return float(abs((self.offset + self.matrix @ self.nominal)[0]))
+
+    def scaled(self, main: float) -> Floats:
+        """The matrix (2 k, parameters) of b_n, a_n for a given |C_N|."""
+        return UNITS / main * np.vstack([self.matrix[1:].real, self.matrix[1:].imag])
+
+    def of(self, parameters: Gaussian) -> Multipoles:
+        """Multipoles of magnetizations in A/m."""
+        return self.known(self.offset + self.matrix @ parameters.mean,
+                          self.matrix @ parameters.root)
+
+    def known(self, mean: Complexes, root: Complexes) -> Multipoles:
+        """Multipoles of a mean (1 + k,) and a root (1 + k, q) of C, linearized about that mean."""
+        strength = float(abs(mean[0]))
+        along = (np.conj(mean[0]) * root[0]).real / strength  # of |C_N|
+        across = (np.conj(mean[0]) * root[0]).imag / strength**2
+        relative = mean[1:] / strength
+        own = (root[1:] - np.outer(relative, along)) / strength
+        return Multipoles(
+            self.orders, strength, float(np.linalg.norm(along)),
+            # C_N exp(i N theta) is that of axes turned by theta
+            float(-np.angle(mean[0])) / self.main, float(np.linalg.norm(across)) / self.main,
+            UNITS * np.concatenate([relative.real, relative.imag]),
+            UNITS * np.vstack([own.real, own.imag]),
+            UNITS * np.tile(self.error[1:] / strength, 2))
+
+    def units(self, coefficients: Complexes) -> Floats:
+        """b_n, a_n (..., 2 k) of coefficients C (..., 1 + k), without linearizing."""
+        relative = UNITS * coefficients[..., 1:] / np.abs(coefficients[..., :1])
+        return np.concatenate([relative.real, relative.imag], axis=-1)
+
+
+def multipole_model(study: Study, reference: MultipoleReference,
+                    session: Session) -> MultipoleModel:
+    """Build the matrix from block magnetizations to multipoles, as `response_matrix` does for
+    readings.
+
+    Raises
+    ------
+    StudyError
+        If the reference is none for this study, or the nominal magnet has no main multipole.
+    """
+    return multipole_models(study, (reference,), session)[0]
+
+
+def multipole_models(
+    study: Study, references: Sequence[MultipoleReference], session: Session
+) -> list[MultipoleModel]:
+    """`multipole_model` of several references, solved for together."""
+    main = study.array.multipole_order
+    wanted, observations = [], []
+    for one in references:
+        orders = tuple(sorted(set(one.orders) - {main}))
+        if not orders:
+            raise StudyError(must_be("--orders", f"study {study.name}",
+                                     "those of unwanted multipoles", "the main one only"))
+        if study.dimension == 2 and one.z_m is not None:
+            raise StudyError(must_be("--at-z-m", f"study {study.name}", "left out, since it is 2D",
+                                     f"{one.z_m:g}"))
+        wanted.append((orders, _radius(study, one), one.z_m))
+        observations.append(_observation(study, wanted[-1][1], max(*orders, main), one.z_m))
+    bare = study.model_copy(update={"instrument": Instrument()})
+    model = response_matrix(bare, reduce(together, observations), session)
+    found, first = [], 0
+    for (orders, radius, z), observation in zip(wanted, observations, strict=True):
+        part = slice(first, first + len(observation))
+        first = part.stop
+        integrated = study.dimension == 3 and z is None
+        matrix = _complexes(model.matrix[part])
+        if integrated:
+            matrix[0] += beyond(study, _reach(study))
+        index = np.array([main, *orders]) - 1
+        turn = _turn(study, matrix[main - 1], model)
+        phases = np.exp(-1j * turn * (index + 1))
+        found.append(MultipoleModel(
+            orders, main, radius, z, integrated, phases[:, None] * matrix[index],
+            phases * _complexes(model.offset[part])[index], model.error[part][index],
+            model.nominal, -turn))
+    return found
+
+
+def circle_models(
+    study: Study, observation: Observation, model: Response
+) -> list[MultipoleModel]:
+    """Multipoles on the circles that a study reads, without another solve: all orders that the
+    readings tell, the main one too, in units of the main one on the circle of that radius that is
+    nearest to the middle; none if there are no full circles, or an instrument between.
+
+    They are Fourier coefficients of B_r at the study's own angles: of m angles, order n has what
+    there is of order m - n too. `multipole_models` takes as many angles as are needed.
+    """
+    main, found = study.array.multipole_order, []
+    circles = _read_circles(study, observation)
+    for radius in sorted({radius for radius, _, _ in circles}):
+        own = sorted((z, analysis) for one, z, analysis in circles if one == radius)
+        _, middle = min(own, key=lambda pair: abs(pair[0]))
+        orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
+        if main not in orders:
+            continue
+        reference, fixed = (_complexes(_seen(middle, one))[main - 1:main]
+                            for one in (model.matrix, model.offset))
+        try:
+            turn = _turn(study, reference[0], model)
+        except StudyError:
+            continue
+        order = np.array([main, *orders])
+        phases = np.exp(-1j * turn * order)
+        for z, analysis in own:
+            matrix, offset = (_complexes(_seen(analysis, one))[:len(orders)]
+                              for one in (model.matrix, model.offset))
+            found.append(MultipoleModel(
+                orders, main, radius, z if study.dimension == 3 else None, False,
+                phases[:, None] * np.vstack([reference, matrix]),
+                phases * np.concatenate([fixed, offset]),
+                _circle_error(analysis, model.error)[order - 1], model.nominal, -turn))
+    return found
+
+
+def solved_circles(
+    study: Study, points: Floats, flux_density: Floats, errors: Floats
+) -> list[tuple[MultipoleModel, Multipoles]]:
+    """Multipoles of a solved field B (n, 3) in T on the study's circles, with the solver's errors
+    (readings,) in T of the study's readings.
+    """
+    observed = study.observation
+    if observed.quantity == "flux_density":
+        errors = np.repeat(errors.reshape(len(points), -1)[:, 0], len(COMPONENTS))
+        observed = observed.model_copy(update={"components": COMPONENTS})
+    bare = study.model_copy(update={"instrument": Instrument(), "observation": observed})
+    observation = observe(bare, points, np.ones_like(points, bool))
+    readings = observation.apply(flux_density)
+    # one parameter, the strength of the whole magnet
+    whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
+    exact = Gaussian(np.ones(1), np.zeros((1, 1)))
+    return [(one, one.of(exact)) for one in circle_models(bare, observation, whole)]
+
+
+def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:
+    """An analysis (k, readings) of values (readings, ...), of which it needs few."""
+    used = np.unique(analysis.indices)
+    return np.asarray(analysis[:, used] @ values[used])
+
+
+def _complexes(values: Floats) -> Complexes:
+    """C_n = B_n + i A_n of A_1 ... A_K, B_1 ... B_K."""
+    half = len(values) // 2
+    return values[half:] + 1j * values[:half]
+
+
+def _turn(study: Study, row: Complexes, model: Response) -> float:
+    """Angle of the nominal main multipole, whose row of the matrix is (parameters,)."""
+    own = row @ model.nominal
+    scale = np.abs(row).sum() * np.abs(model.nominal).max()
+    if not abs(own) > NOTHING_THERE * scale:
+        raise StudyError(must_be(
+            "`array`", f"study {study.name}",
+            f"that of a magnet with a multipole of order {study.array.multipole_order}",
+            "one without", "Check multipole_order and its exceptions."))
+    return float(np.angle(own)) / study.array.multipole_order
+
+
+def _read_circles(
+    study: Study, observation: Observation
+) -> list[tuple[float, float, sparse.csr_array]]:
+    """Radius and z in m of each circle, and the matrix (2 K, readings) of A_1 ... B_K there."""
+    positions, labels = observation.positions, np.array(observation.labels)
+    settings, size = study.observation.positions, len(labels)
+    plain = (observation.operator.shape == observation.analysis.shape
+             and (observation.operator != observation.analysis).nnz == 0)
+    if not isinstance(settings, CirclePositions) or not plain:
+        return []
+    pick = sparse.eye_array(size, format="csr")
+    if study.observation.quantity == "fourier_coefficients":
+        rows = np.array([label[1:].isdigit() for label in observation.labels])
+        circles = dict.fromkeys((float(x), float(z)) for x, _, z in positions[rows])
+        return [(radius, z, pick[np.flatnonzero(
+            rows & (positions[:, 0] == radius) & (positions[:, 2] == z))]) for radius, z in circles]
+    x, y = (np.flatnonzero(labels == name) for name in ("Bx", "By"))
+    harmonics = min(len(DEFAULT_ORDERS), (settings.angles - 1) // 2)
+    if len(x) != len(y) or harmonics < 1 or (positions[x] != positions[y]).any():
+        return []
+    try:
+        analysis, _, where = fourier_analysis(positions[x], FourierCoefficients(
+            quantity="fourier_coefficients", harmonics=harmonics, positions=settings))
+    except MeasurementError:  # these are no full circles
+        return []
+    matrix = sparse.csr_array(analysis[:, 0::3] @ pick[x] + analysis[:, 1::3] @ pick[y])
+    return [(float(where[first, 0]), float(where[first, 2]), matrix[first:first + 2 * harmonics])
+            for first in range(0, len(where), 2 * harmonics)]
+
+
+def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
+    """Error bars (K,) of |C_n| on a circle: those of the coefficients, or by Parseval's theorem
+    the largest that errors of its points allow.
+    """
+    if np.all(np.diff(analysis.indptr) == 1):
+        return np.asarray(analysis @ errors)[:analysis.shape[0] // 2]
+    own = errors[np.unique(analysis.indices)]
+    return np.full(analysis.shape[0] // 2, np.sqrt(2 * np.mean(own**2)))
+
+
+def beyond(study: Study, reach: float) -> Complexes:
+    """Integral of B_y + i B_x on the axis, beyond |z| = reach in m, per A/m of every block as a
+    point dipole in vacuum: (parameters,) in T m.
+
+    ``B = mu_0 / 4 pi (3 (m R) R / R^5 - m / R^3)``, integrated along z by hand.
+    """
+    found = []
+    for block in blocks_of(study):
+        middle, total = block.middle, np.zeros((2, 3))
+        aside = -middle[:2]
+        square = float(aside @ aside)
+        for side in (1.0, -1.0):  # the lower end is the upper one of the mirrored magnet
+            z = reach - side * middle[2]
+            distance = np.hypot(z, np.sqrt(square))
+            third = (1 - z / distance) / square
+            fifth = (2 - z * (2 * z**2 + 3 * square) / distance**3) / (3 * square**2)
+            total[:, :2] += 3 * fifth * np.outer(aside, aside) - third * np.eye(2)
+            total[:, 2] += side * aside / distance**3
+        total *= MU_0 * block.volume / (4 * np.pi)
+        found.append(total[1] + 1j * total[0])
+    return np.concatenate(found)
+
+
+def _reach(study: Study) -> float:
+    """Where sums along z end, in m from the middle."""
+    return magnet_half_length(study) + BEYOND_ENDS * magnet_radius(study)
+
+
+def _radius(study: Study, reference: MultipoleReference) -> float:
+    positions = study.observation.positions
+    bore = study.array.inner_radius_m
+    radius = reference.radius_m
+    if radius is None:
+        own = positions.radius_m if isinstance(positions, CirclePositions) else ()
+        radius = own[0] if len(own) == 1 else DEFAULT_RADIUS * bore
+    if not 0 < radius < bore:
+        raise StudyError(must_be("--reference-radius-m", f"study {study.name}",
+                                 f"between 0 and the blocks' inner radius of {bore:g} m",
+                                 f"{radius:g}", "Was it meant in millimetres?"))
+    return radius
+
+
+def _observation(study: Study, radius: float, highest: int, z: float | None) -> Observation:
+    """Fourier coefficients of B_r, of one circle or integrated along z."""
+    bore = study.array.inner_radius_m
+    angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
+    limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
+    if study.dimension == 3 and z is None:
+        end = _reach(study)
+        step = 2 * np.pi * (bore - radius) / -np.log(SUM_ERROR)
+        limits = (-end, end, int(np.ceil(2 * end / step)) + 1)
+    settings = FourierCoefficients(
+        quantity="fourier_coefficients", harmonics=highest, positions=CirclePositions(
+            kind="circles", radius_m=(radius,), angles=angles, z_min_m=limits[0],
+            z_max_m=limits[1], count=limits[2]))
+    points = points_from(settings.positions)
+    matrix, labels, positions = fourier_analysis(points, settings)
+    step = (limits[1] - limits[0]) / (limits[2] - 1) if limits[2] > 1 else 1.0
+    weights = np.full(limits[2], step)
+    if limits[2] > 1:
+        weights[[0, -1]] /= 2
+    total = sparse.csr_array(sparse.kron(weights[None], sparse.eye_array(2 * highest)) @ matrix)
+    return Observation(points, total, total, points, labels[:2 * highest],
+                       positions[:2 * highest])
+
+
+def text_table(**columns: Multipoles) -> list[dict[str, str]]:
+    """Rows of text, ``b_n ± sd`` and ``a_n ± sd`` in units, of magnets by name."""
+    names, known = list(columns), list(columns.values())
+    first = known[0]
+    rows = []
+    for i, order in enumerate(first.orders):
+        row = {"n": str(order)}
+        for letter, number in (("b", i), ("a", len(first.orders) + i)):
+            row |= {f"{letter}_n {name}": f"{one.mean[number]:+.2f} ± {one.sd[number]:.2f}"
+                    for name, one in zip(names, known, strict=True)}
+        rows.append(row)
+    return rows
+
+
+def met(sizes: Floats, limit: float) -> float:
+    """Share of samples (count, k) of |c_n| none of which is above a limit in units."""
+    return float(np.mean((sizes <= limit).all(axis=1)))
+
+
+def plain(known: Multipoles, unit: str) -> dict[str, object]:
+    """For scripts."""
+    name = unit.replace(" ", "_")
+    return {f"main_{name}": known.main, f"main_sd_{name}": known.main_sd, "roll_rad": known.roll,
+            "roll_sd_rad": known.roll_sd, "rms_units": float(np.sqrt(
+                known.expected_square / len(known.orders))), "multipoles": known.table()}

@@ -1,0 +1,214 @@
+"""The non-linear model of a magnet: magnetizations in A/m to readings in T, tens of thousands of
+times.
+
+GetDP assembles the problem with the iron as vacuum, and solves it for every block; the rest is
+condensed to the iron's unknowns (`halbach_fe.solver.condensed_newton`). What comes out is compared
+with GetDP's own Newton method for a sample of magnetizations, always.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import GetDPError, StudyError
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.matrix import Response, parameter_names, response_matrix
+from halbach_fe.solver.condensed_newton import Condensed, condense
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.field import check_points, choose_route, finite_element_part, formulation_of
+from halbach_fe.solver.interpolation import locate, quadrature
+from halbach_fe.solver.magnetostatics import assemble, solve_samples
+from halbach_fe.solver.session import Session
+from halbach_fe.solver.vacuum_field import unit_fields
+from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study, curve_of
+
+AGREEMENT_T = 1e-8
+"""How well readings must agree with GetDP's Newton method. Its residual of 1e-10 is some 1e-10 T,
+the condensed solve is asked for 1e-9 T; a wrong sign or Gauss point shows at 1e-4 T."""
+
+VERIFIED_SAMPLES = 3
+IRON_MATRIX_TOLERANCE = 1e-9
+"""GetDP's Gauss points have 12 digits."""
+
+
+@dataclass(frozen=True)
+class NonlinearModel:
+    """Magnetizations p in A/m to readings in T.
+
+    Attributes
+    ----------
+    condensed : Condensed
+    offset : ndarray, shape (readings,), in T
+        Fields that are not the magnet's.
+    parameters : tuple of str
+        As of `halbach_fe.response.matrix.Response`.
+    nominal : ndarray, shape (parameters,), in A/m
+    error : ndarray, shape (readings,), in T
+        Error bar of the finite elements, for the nominal array.
+    agreement_T : float
+        Largest difference to GetDP's Newton method at any reading of the verified samples.
+    """
+
+    condensed: Condensed
+    offset: Floats
+    parameters: tuple[str, ...]
+    nominal: Floats
+    error: Floats
+    agreement_T: float
+
+    def __call__(self, magnetizations: Floats, tolerance_T: float = 1e-9) -> Floats:
+        """Readings (..., readings) in T of magnetizations (..., parameters) in A/m.
+
+        ``tolerance_T`` is how far from convergence they may be; a tenth of the noise is plenty.
+        """
+        flat = magnetizations.reshape(-1, len(self.parameters))
+        found = [self.condensed.solve(row, tolerance_T)[0] for row in flat]
+        return self.offset + np.array(found).reshape(*magnetizations.shape[:-1], -1)
+
+    def jacobian(self, magnetization: Floats) -> Floats:
+        """dq/dp (readings, parameters) in T m/A at a magnetization (parameters,) in A/m."""
+        return self.condensed.jacobian(magnetization)
+
+
+def nonlinear_model(
+    study: Study, observation: Observation, session: Session, generator: np.random.Generator,
+    prior: Gaussian | None = None,
+) -> NonlinearModel:
+    """Build the model of a study whose iron ring has an H(B) curve, and verify it.
+
+    ``generator`` draws the magnetizations, from the study's prior or another, at which it is
+    compared with GetDP's own Newton method.
+
+    Raises
+    ------
+    GetDPError
+        If it does not agree with GetDP.
+    """
+    if curve_of(study) is None:
+        raise StudyError(f"Input `iron_ring.curve` of study {study.name} must be given for a "
+                         "non-linear model; instead it is missing. Use the response matrix.")
+    check_points(study, observation.points)
+    base = _with_vacuum_for_iron(study, choose_route(study, observation.points))
+    linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))
+    condensed = condense_to_iron(study, observation, session, linear)
+    error = _error(study, observation, session)
+    model = NonlinearModel(condensed, linear.offset, parameter_names(study), linear.nominal, error,
+                           np.nan)
+    prior = prior or nominal_prior(
+        linear.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
+        study.prior.common_mode_sd)
+    samples = prior.sample(VERIFIED_SAMPLES, generator)
+    return replace(model,
+                   agreement_T=compare_with_newton(model, study, observation, session, samples))
+
+
+def condense_to_iron(
+    study: Study, observation: Observation, session: Session, linear: Response
+) -> Condensed:
+    """Condense a study to its iron; ``linear`` are the readings with vacuum in its place."""
+    curve = curve_of(study)
+    assert curve is not None  # the caller's
+    route = choose_route(study, observation.points)
+    formulation = formulation_of(study, route)
+    assembly = assemble(_with_vacuum_for_iron(study, route), session, formulation)
+    mesh, unknowns, size = assembly.mesh, assembly.unknowns, study.dimension
+    gauss, weights = quadrature(mesh, np.flatnonzero(mesh.in_iron))
+    gradient = sparse.csr_array(
+        sparse.vstack(formulation.flux_density(mesh, gauss, unknowns)[:size]))
+    iron = np.unique(gradient.indices)
+    gradient = gradient[:, iron]
+    points = observation.points if size == 3 else observation.points * [1, 1, 0]
+    fields = formulation.flux_density(mesh, locate(mesh, points), unknowns)
+    outputs = sparse.csr_array(sum(
+        observation.operator[:, axis::3] @ operator for axis, operator in enumerate(fields)))
+    stiffness, surface, readings = condense(assembly.matrix, iron, outputs)
+    law = getattr(curve, formulation.law)
+    _check_iron(assembly.matrix[iron][:, iron], gradient, weights, law.limit, surface)
+    potential = np.hstack([
+        assembly.solutions[1 + size * number:1 + size * (number + 1), iron].T
+        @ (MU_0 * block.recoil_tensor[:size, :size])
+        for number, block in enumerate(blocks_of(study))])
+    return Condensed(law, gradient, weights, stiffness, potential, linear.whole, surface,
+                     readings, linear.nominal)
+
+
+def newton_readings(
+    study: Study, observation: Observation, session: Session, magnetizations: Floats,
+    cold: bool = False,
+) -> Floats:
+    """Readings (k, readings) in T of magnetizations (k, parameters) in A/m by GetDP's Newton."""
+    size = study.dimension
+    samples = np.zeros((len(magnetizations), len(blocks_of(study)), 3))
+    samples[..., :size] = magnetizations.reshape(len(magnetizations), -1, size)
+    route = choose_route(study, observation.points)
+    fields = solve_samples(study, observation.points, samples, session,
+                           formulation_of(study, route), cold=cold)
+    if study.solver.method == "reaction":
+        remanence = [samples[:, number] @ (MU_0 * block.recoil_tensor)
+                     for number, block in enumerate(blocks_of(study))]
+        units = unit_fields(blocks_of(study), observation.points)
+        for unit, vectors in zip(units, remanence, strict=True):
+            fields = fields + np.einsum("nck,sk->snc", unit, vectors)
+    return observation.apply(fields + external_field(study, observation.points))
+
+
+def compare_with_newton(
+    model: NonlinearModel, study: Study, observation: Observation, session: Session,
+    magnetizations: Floats, cold: bool = False,
+) -> float:
+    """Largest difference in T between the model and GetDP's Newton method at any reading.
+
+    Raises
+    ------
+    GetDPError
+        If it is larger than AGREEMENT_T.
+    """
+    folder = replace(session, folder=session.folder / "verified", progress=None)
+    theirs = newton_readings(study, observation, folder, magnetizations, cold)
+    difference = float(np.abs(model(magnetizations) - theirs).max())
+    if not difference <= AGREEMENT_T:
+        raise GetDPError(
+            f"The condensed model of study {study.name} is {difference:.1e} T from GetDP's own "
+            f"Newton method, where {AGREEMENT_T:.0e} T is allowed. Please report this with the "
+            "study.")
+    return difference
+
+
+def _with_vacuum_for_iron(study: Study, route: str) -> Study:
+    """The study with nothing in the iron's place, on the same mesh, every block by itself."""
+    assert study.iron_ring is not None  # a curve is the iron's
+    ring = study.iron_ring.model_copy(update={"curve": None, "relative_permeability": 1.0})
+    solver = {"symmetry": False} | ({} if study.dimension == 2 else {"route": route})
+    return study.model_copy(update={
+        "iron_ring": ring, "solver": study.solver.model_copy(update=solver)})
+
+
+def _error(study: Study, observation: Observation, session: Session) -> Floats:
+    parts = finite_element_part(study, observation.points, replace(
+        session, folder=session.folder / "nominal"), columns=False)
+    return reading_errors(study, observation, parts, error_bar_session(session))
+
+
+def _check_iron(
+    theirs: sparse.csr_array, gradient: sparse.csr_array, weights: Floats, vacuum: float,
+    surface: Ints,
+) -> None:
+    """Inside the iron GetDP's matrix must be the one of these Gauss points."""
+    size = gradient.shape[0] // len(weights)
+    ours = vacuum * (gradient.T @ (sparse.diags_array(np.tile(weights, size)) @ gradient))
+    inside = np.setdiff1d(np.arange(ours.shape[0]), surface)
+    if not len(inside):
+        return  # one layer of elements: the verification has to do
+    difference = abs(ours - theirs).tocsr()[inside].max() / abs(theirs).max()
+    if not difference <= IRON_MATRIX_TOLERANCE:
+        raise GetDPError(
+            f"GetDP's matrix in the iron is {difference:.1e} from the one built here: this GetDP "
+            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")

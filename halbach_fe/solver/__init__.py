@@ -1,0 +1,1 @@
+"""Magnetostatics: from a magnet to B at points, exactly in vacuum and by finite elements."""

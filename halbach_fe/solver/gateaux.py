@@ -1,0 +1,45 @@
+"""How the field answers a change of one block: the Gateaux derivative, anywhere in the plane."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.solver.field import choose_route, formulation_of
+from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
+from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study, is_nonlinear
+
+
+def gateaux_derivative(study: Study, block: int, points: Floats, session: Session) -> Floats:
+    """Derivative of B along the nominal magnetization of a block, iron at its operating point.
+
+    Parameters
+    ----------
+    block : int
+        Number of the block, from 0.
+    points : ndarray, shape (n, 3), in m
+        Anywhere inside the boundary, magnet and iron included.
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T m/A
+    """
+    blocks = blocks_of(study)
+    if not 0 <= block < len(blocks):
+        raise StudyError(f"Input block of study {study.name} must be one of its {len(blocks)}; "
+                         f"instead received {block + 1}.")
+    # the field in materials has no exact form, and the scalar potential gives H there
+    direct = study.model_copy(update={
+        "solver": study.solver.model_copy(update={"method": "direct", "route": "auto"})})
+    formulation = formulation_of(direct, choose_route(direct, points))
+    if is_nonlinear(study):
+        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
+    size, one = study.dimension, blocks[block]
+    remanence = MU_0 * one.recoil_tensor @ np.array(one.easy_axis)  # of 1 A/m
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

@@ -1,0 +1,371 @@
+"""Finite-element solves: from a study and its mesh to B at points, source by source."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib import metadata, resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from halbach_fe import pro
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import PointsOutsideError
+from halbach_fe.core.files import make_folder
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.solver import getdp as runner
+from halbach_fe.solver.dofs import Unknowns, read_matrix, read_saved, read_solutions, read_unknowns
+from halbach_fe.solver.formulations import Formulation
+from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.interpolation import (
+    Located,
+    apply_operator,
+    compare_printed,
+    locate,
+    probes_of,
+)
+from halbach_fe.solver.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
+from halbach_fe.solver.runs import MATRIX_FILE, Task, run_tasks, variant_name, write_history
+from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study, curve_of
+
+NOMINAL_SOURCE = 0
+FLUX_DENSITY_FILE = "flux_density.txt"
+NEWTON_FILE = "newton_flux_density.txt"
+SOLUTIONS_FILE = "solutions.bin"
+
+NEWTON_TOLERANCE = 1e-10
+"""Residual of Newton's method relative to the right-hand side: the last step, quadratic, ends far
+below; rounding leaves 1e-14 or so."""
+
+PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro", "solve_newton.pro")
+
+
+def solve_sources(
+    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    formulation: Formulation, anywhere: bool = False,
+) -> Floats:
+    """Finite-element part of the field of the nominal array and of single blocks, iron being
+    linear.
+
+    For the method ``direct`` that is B itself. For ``reaction`` it is the difference of two
+    solves on one mesh, real materials minus vacuum, to be added to the exact field in vacuum;
+    the discretization error of the sources' own field, by far the largest, cancels.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    blocks : sequence of int
+        Numbers, from 0, of the blocks to solve for with 1 T along each axis.
+    anywhere : bool
+        Whether points may lie in magnet and iron.
+
+    Returns
+    -------
+    ndarray, shape (1 + D len(blocks), n, 3), in T
+        The nominal array, then block by block, axis by axis.
+    """
+    case = _case(study, points, blocks, session, formulation, anywhere)
+    return _difference(study, session, lambda vacuum, parts: _source_tasks(case, vacuum, parts))
+
+
+def solve_tangent(
+    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    formulation: Formulation, anywhere: bool = False,
+) -> tuple[Floats, Floats]:
+    """Finite-element part of the field of a magnet with non-linear iron, and its derivative.
+
+    With ``anywhere`` points may lie in magnet and iron.
+
+    Returns
+    -------
+    field : ndarray, shape (n, 3), in T
+        Of the nominal array, by Newton's method.
+    derivative : ndarray, shape (1 + D len(blocks), n, 3), in T
+        There, along the nominal magnetization, then per tesla of each block along each axis: the
+        Gateaux problem, with the differential reluctivity dH/dB.
+    """
+    case = _case(study, points, blocks, session, formulation, anywhere)
+
+    def tasks(vacuum: bool, parts: int) -> list[Task]:
+        return _source_tasks(case, vacuum, 1) if vacuum else [
+            _newton_task(case, nominal_samples(study), False, NEWTON_TOLERANCE, gateaux=True)]
+
+    real, *vacuum = _run_variants(study, session, tasks)
+    if vacuum:  # of the nominal array, for the field, and for the derivative along it
+        real = real - vacuum[0][[0, *range(len(vacuum[0]))]]
+    return real[0], real[1:]
+
+
+def solve_samples(
+    study: Study, points: Floats, samples: Floats, session: Session, formulation: Formulation,
+    cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
+) -> Floats:
+    """Finite-element part of the field for samples of magnetization, by Newton's method.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    samples : ndarray, shape (k, blocks, 3), in A/m
+    cold : bool
+        Whether every sample starts from zero, not from the one before.
+    tolerance : float
+        Of the residual, relative to the right-hand side.
+
+    Returns
+    -------
+    ndarray, shape (k, n, 3), in T
+
+    Raises
+    ------
+    NotConvergedError
+        With the residuals of the sample that failed.
+    """
+    case = _case(study, points, (), session, formulation)
+    return _difference(study, session, lambda vacuum, parts: [
+        _newton_task(case, samples, vacuum, tolerance, cold=cold)])
+
+
+def nominal_samples(study: Study) -> Floats:
+    """The nominal magnetization as the only sample, (1, blocks, 3) in A/m."""
+    return np.array([[block.magnetization for block in blocks_of(study)]])
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A linear problem as GetDP assembled it, and its solutions.
+
+    Attributes
+    ----------
+    matrix : sparse array, shape (unknowns, unknowns)
+    solutions : ndarray, shape (1 + D blocks, unknowns)
+        Of the nominal array, and of all blocks per tesla along each axis.
+    """
+
+    mesh: VerifiedMesh
+    unknowns: Unknowns
+    matrix: sparse.csr_array
+    solutions: Floats
+
+
+def assemble(study: Study, session: Session, formulation: Formulation) -> Assembly:
+    """Have GetDP assemble and solve a study with linear iron, for all its blocks."""
+    place = np.zeros((1, 3))  # any in air: GetDP prints there what is compared
+    blocks = range(len(blocks_of(study)))
+    case = _case(study, place, blocks, session, formulation)
+    last = study.dimension * len(blocks)
+    kept: dict[str, Any] = {}
+
+    def keep_matrix(folder: Path, unknowns: Unknowns, _: NDArray[np.floating]) -> None:
+        kept["unknowns"] = unknowns
+        kept["matrix"] = read_matrix(folder / MATRIX_FILE, unknowns.count)
+
+    def keep_solutions(_: Path, __: Unknowns, solutions: NDArray[np.floating]) -> None:
+        kept["solutions"] = np.array(solutions, float)
+
+    # PETSc writes the matrix at every solve, so one run for it and one for the solutions
+    alone = replace(_source_task(case, False, (0, 0), "-matrix", keep_matrix), matrix=True)
+    run_tasks([alone, _source_task(case, False, (0, last), "", keep_solutions)], session)
+    return Assembly(case.mesh, **kept)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What the runs of a study on one mesh have in common."""
+
+    study: Study
+    mesh: VerifiedMesh
+    located: Located
+    blocks: Sequence[int]
+    formulation: Formulation
+    time_limit_s: float
+
+
+def _case(
+    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    formulation: Formulation, anywhere: bool = False,
+) -> _Case:
+    if study.dimension == 2:
+        points = points * [1, 1, 0]  # the mesh's plane stands for every other
+    mesh = verify_mesh(build_mesh(study, make_folder(session.folder)))
+    check_inside(study.name, mesh.radius, mesh.half_length, points)
+    return _Case(study, mesh, locate(mesh, points, anywhere), blocks, formulation,
+                 session.time_limit_s)
+
+
+def _difference(
+    study: Study, session: Session, tasks: Callable[[bool, int], list[Task]]
+) -> Floats:
+    """B by the study's method: of real materials, or that minus vacuum."""
+    real, *vacuum = _run_variants(study, session, tasks)
+    return real - vacuum[0] if vacuum else real
+
+
+def _run_variants(
+    study: Study, session: Session, tasks: Callable[[bool, int], list[Task]]
+) -> list[Floats]:
+    """Run the tasks of each variant that the study's method needs, real materials first.
+
+    ``tasks`` makes those of real materials (False) or vacuum (True), in about so many parts.
+    """
+    variants = [False] if study.solver.method == "direct" else [False, True]
+    made = [tasks(vacuum, max(1, session.jobs // len(variants))) for vacuum in variants]
+    results = run_tasks([task for part in made for task in part], session)
+    limits = np.cumsum([0, *(len(part) for part in made)])
+    return [np.concatenate(results[a:b]) for a, b in pairwise(limits)]
+
+
+def render(template: str, *, study: Study, **data: object) -> str:
+    """The generated part of a problem, as GetDP text."""
+    source = resources.files(pro).joinpath(template).read_text("utf-8")
+    environment = jinja2.Environment(
+        variable_start_string="<<", variable_end_string=">>", block_start_string="<%",
+        block_end_string="%>", comment_start_string="<#", comment_end_string="#>",
+        trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
+        autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
+    return environment.from_string(source).render(
+        study=study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=blocks_of(study),
+        iron_permeability=study.iron_ring.relative_permeability if study.iron_ring else 1.0,
+        **data)
+
+
+def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:
+    """The nominal array and all sources of a linear problem, in up to so many runs."""
+    last = case.study.dimension * len(case.blocks)
+    limits = np.linspace(0, last + 1, min(last + 1, parts) + 1).astype(int)
+    return [_source_task(case, vacuum, (int(a), int(b) - 1), f"-{number}" if number else "")
+            for number, (a, b) in enumerate(pairwise(limits))]
+
+
+def _source_task(
+    case: _Case, vacuum: bool, sources: tuple[int, int], suffix: str,
+    keep: Callable[[Path, Unknowns, NDArray[np.floating]], None] | None = None,
+) -> Task:
+    """The nominal array and sources of a linear problem; ``keep`` sees all solutions."""
+    count = sources[1] - sources[0] + 1
+    probes, places = probes_of(case.mesh, case.located)
+
+    def read(folder: Path) -> Floats:
+        unknowns = _unknowns(case, folder)
+        solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, count)
+        printed = _fields(case, unknowns, probes, solutions[:1])[0]
+        compare_printed(printed, folder / FLUX_DENSITY_FILE, places)
+        result = _fields(case, unknowns, case.located, solutions)
+        if keep is not None:
+            keep(folder, unknowns, solutions)
+        return result
+
+    return Task(
+        name=f"getdp-{variant_name(vacuum)}{suffix}",
+        stage=lambda folder: fill_run_folder(case.study, case.mesh, places, folder,
+                                             case.formulation,
+                                   case.blocks, sources, vacuum, case.time_limit_s),
+        read=read, solves=count)
+
+
+def _newton_task(
+    case: _Case, samples: Floats, vacuum: bool, tolerance: float, cold: bool = False,
+    gateaux: bool = False,
+) -> Task:
+    """Newton's method for samples (k, blocks, 3) in A/m; its fields, then derivatives if wanted."""
+    columns = 1 + case.study.dimension * len(case.blocks) if gateaux else 0
+    probes, places = probes_of(case.mesh, case.located)
+
+    def fill(folder: Path) -> Job:
+        job = fill_run_folder(case.study, case.mesh, places, folder, case.formulation, case.blocks,
+                    (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
+        outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
+        unknowns = case.formulation.unknowns(case.mesh.inner)
+        if not gateaux and unknowns > case.formulation.factorized_for_newton:
+            job = replace(job, options=runner.NEWTON_STEPS, linear_residual=runner.NEWTON_RESIDUAL)
+        return replace(
+            job, resolution="Newton", solves=max(columns, 1),
+            outputs=(*outputs, _saved(case)), solutions=SOLUTIONS_FILE if gateaux else None,
+            numbers={**job.numbers, "TOLERANCE": tolerance, "COLD": cold, "GATEAUX": gateaux})
+
+    def read(folder: Path) -> Floats:
+        steps = write_history(folder)
+        unknowns = _unknowns(case, folder)
+        saved = read_saved(folder / _saved(case), unknowns.count, len(samples))
+        compare_printed(_fields(case, unknowns, probes, saved[:1])[0], folder / NEWTON_FILE, places)
+        fields = _fields(case, unknowns, case.located, saved)
+        if not gateaux:
+            return fields
+        derivatives = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, columns, steps)
+        compare_printed(_fields(case, unknowns, probes, derivatives[:1])[0],
+                        folder / FLUX_DENSITY_FILE, places)
+        fields = np.concatenate([fields, _fields(case, unknowns, case.located, derivatives)])
+        return fields
+
+    return Task(f"getdp-{variant_name(vacuum)}", fill, read, len(samples) + columns)
+
+
+def _saved(case: _Case) -> str:
+    """The file that GetDP's SaveSolution writes."""
+    return f"{Path(case.formulation.problem).stem}.res"
+
+
+def _unknowns(case: _Case, folder: Path) -> Unknowns:
+    return read_unknowns(folder / f"{Path(case.formulation.problem).stem}.pre", case.mesh.cell_type)
+
+
+def _fields(
+    case: _Case, unknowns: Unknowns, located: Located, solutions: NDArray[np.floating]
+) -> Floats:
+    operators = case.formulation.flux_density(case.mesh, located, unknowns)
+    return np.stack([apply_operator(operator, solutions) for operator in operators], axis=2)
+
+
+def fill_run_folder(
+    study: Study, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
+    blocks: Sequence[int] = (), sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE),
+    vacuum: bool = False, time_limit_s: float = 3600.0, samples: Floats | None = None,
+) -> Job:
+    """Fill a run folder with everything that GetDP needs, and return the job to run there.
+
+    ``places`` (n, 3) in m are where GetDP prints the first source's field; ``sources`` are the
+    first and last to solve for, 0 being the whole array, the others the axes of ``blocks``.
+    ``samples`` (k, blocks, 3) in A/m are magnetizations of the whole array; default the nominal.
+    """
+    for name in (formulation.problem, *PROBLEM_INCLUDES):
+        text = resources.files(pro).joinpath(name).read_bytes()
+        (folder / name).write_bytes(text)
+    ranks = np.zeros(len(mesh.regions.blocks), int)
+    ranks[list(blocks)] = np.arange(1, len(blocks) + 1)
+    (folder / "case.pro").write_text(
+        render("case.pro.j2", study=study, regions=mesh.regions, points=places.tolist(),
+               ranks=ranks.tolist(), curve=curve_of(study),
+               samples=(nominal_samples(study) if samples is None else samples).tolist()),
+        encoding="utf-8")
+    shutil.copyfile(mesh.path, folder / MESH_NAME)
+    unknowns = formulation.unknowns(mesh.inner)
+    direct = unknowns <= formulation.factorized
+    return Job(
+        problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
+        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]}
+        | dict(formulation.numbers),
+        outputs=(FLUX_DENSITY_FILE,), solutions=SOLUTIONS_FILE,
+        unknowns=unknowns, solves=sources[1] - sources[0] + 1,
+        options=runner.DIRECT_SOLVER if direct else runner.CONJUGATE_GRADIENTS,
+        time_limit_s=time_limit_s)
+
+
+def check_inside(name: str, radius_m: float, half_length_m: float, points: Floats) -> None:
+    """Refuse points (n, 3) outside the mesh of a study, where GetDP would print zeros."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    outside = (radius > radius_m) | (np.abs(points[:, 2]) > half_length_m)
+    if outside.any():
+        x, y, z = points[np.argmax(outside)]
+        raise PointsOutsideError(
+            f"Input `observation.positions` of study {name} must lie within the meshed region "
+            f"(radius {radius_m:g} m, half length {half_length_m:g} m); instead {outside.sum()} "
+            f"points lie outside, the first at ({x:g}, {y:g}, {z:g}) m. Check the units of the "
+            "points, or enlarge `open_boundary`.")

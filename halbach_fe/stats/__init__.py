@@ -1,0 +1,1 @@
+"""Statistics on plain arrays: Gaussian updates, noise, sampling and its convergence."""

@@ -1,0 +1,339 @@
+"""Magnetization curves H(B) of iron: read, checked, and turned into the law that is solved with.
+
+A curve is isotropic, without hysteresis, and odd in B. Whatever it comes from, a table or a closed
+form, it ends as two laws, ``H = nu(B^2) B`` for the vector potential and ``B = mu_0 mu_r(g^2) H``,
+``g = mu_0 H``, for the scalar one: a coefficient between points by Akima's method (J. ACM 17 (1970)
+589), which GetDP has too, so that both programs solve with the same numbers. Beyond the last point
+the polarization ``J = B - mu_0 H`` stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from importlib.resources.abc import Traversable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import parse_number as number_in
+
+MU_0 = 4e-7 * math.pi
+"""Vacuum permeability in T m/A; the pre-2019 value, 1.3e-10 relative from the measured one."""
+
+COLUMNS = ("H_A_per_m", "B_T")
+MIN_POINTS = 4
+MAX_POINTS = 10_000
+MAX_FLUX_DENSITY = 10.0  # T; steels are measured up to some 2.5 T, more is another unit
+MAX_POLARIZATION = 2.6  # T; the largest there is, iron with cobalt, has 2.45 T
+MAX_RELATIVE_PERMEABILITY = ((0.0, 2e6), (1.5, 2e5))
+"""From a flux density in T on. The purest iron reaches 1e6, but from 1.5 T on even
+grain-oriented steel has less than some 1e5."""
+
+MIN_RELATIVE_PERMEABILITY = 1.5  # what is below is no iron
+MAX_FALL = 0.02  # of the polarization, relative to the largest B
+MIN_STEP = 1e-6  # of B, relative to the largest: closer points have no slope between them
+
+SUBDIVISION = 16
+"""Intervals of a law between two points of the table. Akima's cubics then keep to the table's
+monotone ones, and the two laws to one another, within 1e-3, and 3e-3 where points are as far apart
+as those of AISI 1010 beyond 1.7 T. The error falls about with the square of this."""
+
+LEAST_START = 0.5
+"""dH/dB at the origin is at least this part of H / B at the table's first point."""
+
+_CLOSED_FORM_POINTS = 800
+_WIDEST_FIELD = 1e7  # A/m; closed forms are followed up to there
+
+
+
+@dataclass(frozen=True)
+class ConstitutiveLaw:
+    """y = c(|x|^2) x, with the coefficient c given at points and tending to a limit.
+
+    Attributes
+    ----------
+    squares : ndarray, shape (n,), ascending from 0
+        |x|^2 in T^2.
+    values : ndarray, shape (n,)
+        The coefficient there.
+    limit : float
+        dy/dx beyond the last point.
+    """
+
+    squares: Floats
+    values: Floats
+    limit: float
+
+    @property
+    def excess(self) -> float:
+        """c |x| - limit |x|, constant beyond the last point."""
+        return float((self.values[-1] - self.limit) * np.sqrt(self.squares[-1]))
+
+    @cached_property
+    def _spline(self) -> CubicHermiteSpline:
+        return CubicHermiteSpline(self.squares, self.values,
+                                  _akima_slopes(self.squares, self.values))
+
+    @cached_property
+    def _derivative(self) -> CubicHermiteSpline:
+        return self._spline.derivative()
+
+    def coefficient(self, square: Floats) -> Floats:
+        """c at squares (...,)."""
+        inside = self._spline(np.minimum(square, self.squares[-1]))
+        if square.max(initial=0) <= self.squares[-1]:
+            return inside
+        beyond = self.limit + self.excess / np.sqrt(np.maximum(square, self.squares[-1]))
+        return np.where(square <= self.squares[-1], inside, beyond)
+
+    def slope(self, square: Floats) -> Floats:
+        """dc / d|x|^2 at squares (...,)."""
+        inside = self._derivative(np.minimum(square, self.squares[-1]))
+        if square.max(initial=0) <= self.squares[-1]:
+            return inside
+        outside = np.maximum(square, self.squares[-1])
+        beyond = -self.excess / 2 / outside / np.sqrt(outside)  # its cube may be no number
+        return np.where(square <= self.squares[-1], inside, beyond)
+
+    def differential(self, square: Floats) -> Floats:
+        """dy/dx along x: the coefficient plus 2 |x|^2 times its slope."""
+        return self.coefficient(square) + 2 * (square * self.slope(square))
+
+
+def _akima_slopes(x: Floats, y: Floats) -> Floats:
+    """Slopes of Akima's method as GetDP has them (scipy tells straight pieces by another limit)."""
+    secant = np.diff(y) / np.diff(x)
+    m = np.concatenate([[0, 0], secant, [0, 0]])
+    m[1], m[-2] = 2 * m[2] - m[3], 2 * m[-3] - m[-4]
+    m[0], m[-1] = 2 * m[1] - m[2], 2 * m[-2] - m[-3]
+    right, left = np.abs(m[3:] - m[2:-1]), np.abs(m[1:-2] - m[:-3])
+    total = right + left
+    straight = total <= 1e-30
+    weighted = (right * m[1:-2] + left * m[2:-1]) / np.where(straight, 1, total)
+    return np.where(straight, (m[1:-2] + m[2:-1]) / 2, weighted)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Points of a magnetization curve, the origin first, close enough for both laws.
+
+    Attributes
+    ----------
+    H : ndarray, shape (n,), in A/m
+    B : ndarray, shape (n,), in T
+    initial : float
+        Relative permeability at the origin.
+    """
+
+    H: Floats
+    B: Floats
+    initial: float
+
+    @cached_property
+    def reluctivity(self) -> ConstitutiveLaw:
+        """H = nu(B^2) B, nu in m/H."""
+        values = np.concatenate([[1 / (MU_0 * self.initial)], self.H[1:] / self.B[1:]])
+        return ConstitutiveLaw(self.B**2, values, 1 / MU_0)
+
+    @cached_property
+    def permeability(self) -> ConstitutiveLaw:
+        """B = mu_r(g^2) g with g = mu_0 H in T."""
+        values = np.concatenate([[self.initial], self.B[1:] / (MU_0 * self.H[1:])])
+        return ConstitutiveLaw((MU_0 * self.H) ** 2, values, 1.0)
+
+
+def table_curve(field: Floats, flux_density: Floats) -> Curve:
+    """The curve through a table of H in A/m and B in T, monotone between its points.
+
+    Raises
+    ------
+    ValueError
+        With what is wrong with the table, see `check_table`.
+    """
+    field, flux_density = check_table(field, flux_density)
+    slopes = PchipInterpolator(flux_density, field).derivative()(flux_density)
+    # where H turns up steeply behind the first point it would start flat: no reluctivity at all
+    slopes[0] = max(slopes[0], LEAST_START * field[1] / flux_density[1])
+    smooth = CubicHermiteSpline(flux_density, field, slopes)  # monotone, its derivative continuous
+    steps = np.arange(SUBDIVISION) / SUBDIVISION
+    inner = flux_density[:-1, None] + np.diff(flux_density)[:, None] * steps
+    nodes = np.append(inner.ravel(), flux_density[-1])
+    return _checked(Curve(smooth(nodes), nodes, 1 / (MU_0 * float(slopes[0]))))
+
+
+def froehlich_kennelly(initial: float, saturation: float) -> Curve:
+    """B = mu_0 H + J_s H / (H + h), h chosen for the initial relative permeability.
+
+    Parameters
+    ----------
+    initial : float
+        Relative permeability at the origin.
+    saturation : float
+        Polarization J_s in T. The form is A. E. Kennelly's, Trans. AIEE 8 (1891) 485, on
+        O. Froehlich's; with mu_0 H added so that the slope tends to mu_0.
+    """
+    half = saturation / (MU_0 * (initial - 1))
+    field = np.concatenate([[0.0], np.geomspace(half * 1e-4, _WIDEST_FIELD, _CLOSED_FORM_POINTS)])
+    return _checked(Curve(field, MU_0 * field + saturation * field / (half + field), initial))
+
+
+def brauer(k1: float, k2: float, k3: float) -> Curve:
+    """H = (k1 exp(k2 B^2) + k3) B: J. R. Brauer, IEEE Trans. Magn. 11 (1975) 81.
+
+    It is followed up to where dH/dB reaches 1/mu_0, beyond which it is no material's.
+
+    Raises
+    ------
+    ValueError
+        If it starts above that or below iron's, or reaches it at no iron's polarization.
+    """
+    def differential(b: float) -> float:
+        exponent = k2 * b**2
+        # what overflows is far above vacuum's
+        return math.inf if exponent > 500 else k1 * math.exp(exponent) * (1 + 2 * exponent) + k3
+
+    least = 1 / (MU_0 * MAX_RELATIVE_PERMEABILITY[0][1])
+    most = 1 / (MU_0 * MIN_RELATIVE_PERMEABILITY)
+    if not least <= k1 + k3 <= most:
+        raise ValueError(f"k1 + k3 must be a reluctivity of {least:.3g} to {most:.3g} m/H, that of "
+                         f"iron; instead it is {k1 + k3:.3g}; are the units m/H?")
+    low, high = 0.0, MAX_FLUX_DENSITY
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if differential(middle) * MU_0 < 1 else (low, middle)
+    b = np.linspace(0, low, _CLOSED_FORM_POINTS)
+    h = (k1 * np.exp(k2 * b**2) + k3) * b
+    polarization = float((b - MU_0 * h).max())
+    if polarization > MAX_POLARIZATION:
+        raise ValueError(f"the polarization B - mu_0 H goes up to {polarization:.3g} T, which no "
+                         "iron has; give a larger k2")
+    return _checked(Curve(h, b, 1 / (MU_0 * (k1 + k3))))
+
+
+def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
+    """Return a table of H in A/m and B in T with its origin, or say what is wrong with it.
+
+    Raises
+    ------
+    ValueError
+        Named: lengths that differ, too few points, values that are not finite, negative, exchanged,
+        of another unit, or not rising. H in Oe, 1/80 of that in A/m, is iron too unless the table
+        goes far into saturation.
+    """
+    h, b = np.asarray(field, float), np.asarray(flux_density, float)
+    if h.shape != b.shape or h.ndim != 1:
+        raise ValueError(f"H and B must be lists of equal length, but H has {h.size} values and B "
+                         f"has {b.size}; give a B for every H")
+    _check_points(~(np.isfinite(h) & np.isfinite(b)), h, b, "is not finite; give numbers")
+    _check_points((h < 0) | (b < 0), h, b, "is negative; give the first quadrant only")
+    if len(h) and h[0] == 0 and b[0] == 0:
+        h, b = h[1:], b[1:]
+    if len(h) < MIN_POINTS or len(h) > MAX_POINTS:
+        raise ValueError(f"a curve needs {MIN_POINTS} to {MAX_POINTS} points besides the origin, "
+                         f"not {len(h)}; give {'more' if len(h) < MIN_POINTS else 'fewer'}")
+    for name, values, least in (("H", h, 0.0), ("B", b, MIN_STEP * b[-1])):
+        steps = np.diff(values, prepend=0.0)
+        if (steps <= least).any():
+            worst = int(np.argmax(steps <= least))
+            before = f"{values[worst - 1]:g} before" if worst else "the origin"
+            raise ValueError(f"{name} must rise from point to point, but {name} = "
+                             f"{values[worst]:g}, point {worst + 1} after the origin, is not "
+                             f"clearly above {before}; sort the points, and give one "
+                             "branch only")
+    _check_units(h, b)
+    return np.append(0.0, h), np.append(0.0, b)
+
+
+def _check_points(bad: NDArray[np.bool_], h: Floats, b: Floats, what: str) -> None:
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise ValueError(f"point {first + 1} (H = {h[first]:g}, B = {b[first]:g}) {what}")
+
+
+def _check_units(h: Floats, b: Floats) -> None:
+    """A wrong unit, or H for B, makes a material that does not exist."""
+    if b[-1] > MAX_FLUX_DENSITY:
+        if h[-1] < MAX_FLUX_DENSITY:
+            raise ValueError(f"H and B look exchanged: B goes up to {b[-1]:g} T, and H only to "
+                             f"{h[-1]:g} A/m; exchange them")
+        raise ValueError(f"B goes up to {b[-1]:g}, which no iron has in tesla; is it in mT or "
+                         "gauss? Give T")
+    with np.errstate(over="ignore", divide="ignore"):
+        permeability = b / (MU_0 * h)
+    for least, most in MAX_RELATIVE_PERMEABILITY:
+        too_high = (b >= least) & (permeability > most)
+        if too_high.any():
+            first = int(np.argmax(too_high))
+            raise ValueError(f"B / (mu_0 H) is {permeability[first]:.3g} at {b[first]:g} T, which "
+                             "no iron has; is H in kA/m or Oe? Give A/m")
+    if permeability.max() < MIN_RELATIVE_PERMEABILITY:
+        raise ValueError(f"B / (mu_0 H) goes up to {permeability.max():.3g} only, and in iron far "
+                         "higher; is B in another unit than T, or H in another than A/m?")
+    # the polarization neither falls nor exceeds that of iron; a fall allows for rounded tables
+    polarization = b - MU_0 * h
+    fall = float((np.maximum.accumulate(np.append(0.0, polarization))[1:] - polarization).max())
+    if fall > MAX_FALL * b[-1]:
+        raise ValueError(f"the polarization B - mu_0 H falls by {fall:.3g} T, and in iron it "
+                         "rises; is H in another unit than A/m, or the polarization given for B?")
+    if polarization.max() > MAX_POLARIZATION:
+        raise ValueError(f"the polarization B - mu_0 H goes up to {polarization.max():.3g} T, which"
+                         " no iron has; is H in kA/m or Oe? Give A/m")
+
+
+def _checked(curve: Curve) -> Curve:
+    """Refuse a curve along which H or B does not rise everywhere."""
+    for name, unit, scale, law in (("B", "T", 1.0, curve.reluctivity),
+                                   ("H", "A/m", MU_0, curve.permeability)):
+        root = np.sqrt(law.squares)
+        fine = np.linspace(root[:-1], root[1:], 7, axis=1).ravel() ** 2
+        differential = law.differential(fine)
+        if not differential.min() > 0:
+            where = float(np.sqrt(fine[np.argmin(differential)]))
+            raise ValueError(f"the curve must rise between the points too, and does not near "
+                             f"{name} = {where / scale:.4g} {unit}; give more points there")
+    return curve
+
+
+def steels() -> dict[str, Traversable]:
+    """The curves that come with halbach-fe, by name."""
+    folder = resources.files("halbach_fe.study") / "steels"
+    return {path.name.removesuffix(".csv"): path
+            for path in sorted(folder.iterdir(), key=lambda path: path.name)
+            if path.name.endswith(".csv")}
+
+
+def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """H in A/m and B in T of a CSV file with the header ``H_A_per_m,B_T``; ``#`` starts a comment.
+
+    What is in it is not quoted: a study can name any file.
+
+    Raises
+    ------
+    ValueError
+        Named: no text, nothing in it, the header, or a line that is not two numbers.
+    OSError
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin with a mark
+    except UnicodeDecodeError:
+        raise ValueError("it must be UTF-8 text; save it as such") from None
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)
+             if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise ValueError(f"it is empty; give the line {','.join(COLUMNS)}, and a line a point")
+    header = [name.strip() for name in lines[0][1].split(",")]
+    if sorted(header) != sorted(COLUMNS):
+        raise ValueError(f"its header must be {','.join(COLUMNS)}")
+    columns: dict[str, list[float]] = {name: [] for name in header}
+    for number, line in lines[1:]:
+        try:
+            for name, value in zip(header, line.split(","), strict=True):
+                columns[name].append(number_in(value.strip()))
+        except ValueError:
+            raise ValueError(f"line {number} must hold two numbers and a comma between") from None
+    return tuple(columns[COLUMNS[0]]), tuple(columns[COLUMNS[1]])

@@ -1,0 +1,225 @@
+"""Keys of a study that describe the measurement: where, with which instrument, how noisy."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import (
+    Field,
+    model_validator,
+)
+
+from halbach_fe.study.types import (
+    COMPONENTS,
+    MAX_POINTS,
+    Axes,
+    Component,
+    Coordinate,
+    Displacement,
+    FluxDensityVector,
+    Fraction,
+    Fractions,
+    GridCount,
+    Length,
+    Line,
+    Offset,
+    Point,
+    PositionSd,
+    RadiusScale,
+    StudyModel,
+    Unit,
+    one_or_list,
+)
+
+
+class Instrument(StudyModel):
+    """How the mapper's readings differ from B where it says it was; taken out of the map before
+    anything else is done with it.
+
+    First what is written in the map is put right. Its coordinates and its sigma and B count in
+    ``length_unit_m`` and ``flux_density_unit_T`` (0.001 if they are in mm and mT). Its columns x,
+    y, z are along ``position_axes`` of the magnet, and Bx, By, Bz along ``field_axes``: with
+    ``field_axes = ["y", "-x", "z"]`` the column of Bx holds By, and that of By -Bx.
+
+    The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
+    by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), and off the axis
+    at the angle phi ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi``, stretches z by
+    ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m`` at the far end (largest z of
+    the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a
+    rotation vector) about the origin and moves by ``translation_m``.
+    The sensor of component i is ``sensor_position_m[i]`` from there. With B' the field in the
+    turned axes, the reading of component i is
+    ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
+    + cubic_i B'_i^3 + offset_i + drift_i t``, j and k being the other two, and t running from 0 to
+    1 over the map (its time_s, or its order). ``crosstalk`` is by name: ``zx`` is what the z sensor
+    sees of x.
+    """
+
+    length_unit_m: Unit = 1.0
+    flux_density_unit_T: Unit = 1.0
+    position_axes: Axes = ("x", "y", "z")
+    field_axes: Axes = ("x", "y", "z")
+    translation_m: Displacement = (0.0, 0.0, 0.0)
+    rotation_rad: Fractions = (0.0, 0.0, 0.0)
+    z_scale: Fraction = 0.0
+    radius_scale: RadiusScale = 0.0
+    radius_offset_m: Offset = 0.0
+    eccentricity_m: tuple[Offset, Offset] = (0.0, 0.0)
+    arm_sag_m: Offset = 0.0
+    sensor_position_m: tuple[Displacement, Displacement, Displacement] = (
+        (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    gain: Fractions = (0.0, 0.0, 0.0)
+    crosstalk: dict[Literal["xy", "xz", "yx", "yz", "zx", "zy"], Fraction] = {}  # noqa: RUF012
+    planar_hall_per_T: Fractions = (0.0, 0.0, 0.0)
+    quadratic_per_T: Fractions = (0.0, 0.0, 0.0)
+    cubic_per_T2: Fractions = (0.0, 0.0, 0.0)
+    offset_T: FluxDensityVector = (0.0, 0.0, 0.0)
+    drift_T: FluxDensityVector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Instrument:
+        for name in ("position_axes", "field_axes"):
+            axes = getattr(self, name)
+            if {axis[-1] for axis in axes} != set(COMPONENTS):
+                raise ValueError(f"{name} must name x, y and z once each, but is {list(axes)}")
+        return self
+
+
+class LinePositions(StudyModel):
+    """``count`` equally spaced points from ``start_m`` to ``end_m``, both included."""
+
+    kind: Literal["line"]
+    start_m: Point
+    end_m: Point
+    count: Annotated[int, Field(ge=1, le=MAX_POINTS)]
+
+
+class CirclePositions(StudyModel):
+    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z, of one
+    radius or of each of several.
+    """
+
+    kind: Literal["circles"]
+    radius_m: Annotated[tuple[Length, ...], Field(min_length=1), one_or_list(Length)]
+    angles: Annotated[int, Field(ge=1, le=10_000)]
+    z_min_m: Coordinate = 0.0
+    z_max_m: Coordinate = 0.0
+    count: Annotated[int, Field(ge=1, le=100_000)] = 1
+
+    @model_validator(mode="after")
+    def _consistent(self) -> CirclePositions:
+        if self.z_max_m < self.z_min_m or (self.count > 1) != (self.z_max_m > self.z_min_m):
+            raise ValueError(
+                f"{self.count} circles between z_min_m = {self.z_min_m} and "
+                f"z_max_m = {self.z_max_m} make no sense; one circle needs equal limits, "
+                "several need z_min_m < z_max_m"
+            )
+        if len(set(self.radius_m)) < len(self.radius_m):
+            raise ValueError(f"radius_m must name each radius once, but is {self.radius_m}")
+        return self
+
+
+class GridPositions(StudyModel):
+    """A regular grid of ``count`` points along x, y and z, from ``start_m`` to ``end_m``, both
+    included; one point along an axis needs equal limits. z changes fastest, x slowest.
+    """
+
+    kind: Literal["grid"]
+    start_m: Point
+    end_m: Point
+    count: tuple[GridCount, GridCount, GridCount]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> GridPositions:
+        for axis, start, end, count in zip(COMPONENTS, self.start_m, self.end_m, self.count,
+                                           strict=True):
+            if end < start or (count > 1) != (end > start):
+                raise ValueError(
+                    f"{count} points from {axis} = {start} to {end} make no sense; one point "
+                    "needs equal limits, several need start_m < end_m")
+        if math.prod(self.count) > MAX_POINTS:
+            raise ValueError(f"a grid may have {MAX_POINTS} points, not {math.prod(self.count)}")
+        return self
+
+
+class PointPositions(StudyModel):
+    """A list of points."""
+
+    kind: Literal["points"]
+    points_m: Annotated[tuple[Point, ...], Field(min_length=1)]
+
+
+Positions = Annotated[
+    LinePositions | CirclePositions | GridPositions | PointPositions, Field(discriminator="kind")
+]
+
+
+class FluxDensity(StudyModel):
+    """Observe components of B at points, in tesla."""
+
+    quantity: Literal["flux_density"]
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
+    positions: Positions
+
+
+class FourierCoefficients(StudyModel):
+    """Observe A_1..A_K, B_1..B_K of B_r on circles: B_r = sum A_k cos(k phi) + B_k sin(k phi)."""
+
+    quantity: Literal["fourier_coefficients"]
+    harmonics: Annotated[int, Field(ge=1, le=1000)]
+    positions: CirclePositions
+
+    @model_validator(mode="after")
+    def _resolved(self) -> FourierCoefficients:
+        if self.positions.angles <= 2 * self.harmonics:
+            raise ValueError(
+                f"{self.harmonics} harmonics need more than {2 * self.harmonics} angles on the "
+                f"circle, not {self.positions.angles}"
+            )
+        return self
+
+
+ObservationSettings = Annotated[FluxDensity | FourierCoefficients, Field(discriminator="quantity")]
+
+
+class NoiseRegion(StudyModel):
+    """A z window with one standard deviation per reading, of all components or of some.
+
+    The first region that fits a reading is used. A limit that is left out is none. Regions of one
+    name are one region in reports.
+    """
+
+    name: Annotated[Line, Field(min_length=1, max_length=100)]
+    z_min_m: Coordinate | None = None
+    z_max_m: Coordinate | None = None
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
+    sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> NoiseRegion:
+        if self.z_min_m is not None and self.z_max_m is not None and self.z_min_m >= self.z_max_m:
+            raise ValueError(f"z_min_m ({self.z_min_m}) must be below z_max_m ({self.z_max_m})")
+        return self
+
+
+class NoiseSettings(StudyModel):
+    """Measurement noise by region, which a map that carries its own sigma overrides, and what the
+    positions add to either.
+
+    ``position_sd_m`` is how far each point may be from where the map has it, along x, y and z
+    (one value: the same along each). It moves a reading by the local gradient of the nominal
+    field, all components of a point together: much in the fringe, little in the homogeneous field.
+    """
+
+    regions: tuple[NoiseRegion, ...] = ()
+    position_sd_m: Annotated[tuple[PositionSd, ...], one_or_list(PositionSd)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> NoiseSettings:
+        if not self.regions and self.position_sd_m is None:
+            raise ValueError("give regions, position_sd_m, or both")
+        if self.position_sd_m is not None and len(self.position_sd_m) not in (1, 3):
+            raise ValueError(f"position_sd_m must be one value or three, for x, y and z, not "
+                             f"{len(self.position_sd_m)}")
+        return self

@@ -1,0 +1,103 @@
+"""The study file: one TOML document that says everything about a magnet and its measurement.
+
+Keys carry their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors. The models are
+frozen: a study is a value, and everything downstream is a function of it.
+
+The convention for magnetization, used everywhere in halbach-fe, is that of
+``nu(|B|) B = H + M``. In a block of recoil permeability mu_r therefore
+``M = B_r / (mu_0 mu_r)``, with B_r the remanence: M is neither ``B_r / mu_0`` nor the
+magnetization at the working point.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import (
+    Field,
+    model_validator,
+)
+
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.study import materials
+from halbach_fe.study.inference import Inference, Plan, Prior
+from halbach_fe.study.magnet import Array, Demagnetization, External, IronRing
+from halbach_fe.study.materials import Curve
+from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
+from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
+from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
+
+FIELD_KEYS = {"dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"}
+"""All that a solved field depends on."""
+
+
+class Study(StudyModel):
+    """A magnet, how it is discretized, how it is measured, and what is known beforehand."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
+    description: Lines = ""
+    dimension: Literal[2, 3] = 3
+    array: Array
+    iron_ring: IronRing | None = None
+    external: External = External()
+    instrument: Instrument = Instrument()
+    mesh: MeshSettings
+    open_boundary: OpenBoundary = OpenBoundary()
+    solver: SolverSettings = SolverSettings()
+    observation: ObservationSettings
+    noise: NoiseSettings | None = None
+    prior: Prior = Prior()
+    inference: Inference = Inference()
+    plan: Plan = Plan()
+    demagnetization: Demagnetization | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Study:
+        if self.dimension == 3 and self.array.ring_length_m is None:
+            raise ValueError("a 3D study needs array.ring_length_m")
+        if self.dimension == 2 and self.array.rings != 1:
+            raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
+        by_component = {
+            "noise.regions": any(set(one.components) != set(COMPONENTS) for one in regions),
+            "inference.held_out": bool(held_out and held_out.components)}
+        for key, named in by_component.items():
+            if named and self.observation.quantity == "fourier_coefficients":
+                raise ValueError(f"{key} may name components of flux_density only; Fourier "
+                                 "coefficients have none")
+        slots = sorted(slot for one in self.prior.types.values() for slot in one)
+        if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
+            raise ValueError(f"prior.types must name every slot from 1 to "
+                             f"{self.array.blocks_per_ring} once, but names {slots}")
+        for name, size in self.mesh:
+            if name.endswith("size_m") and size is not None and size > self.array.outer_radius_m:
+                raise ValueError(f"mesh.{name} ({size}) must not be larger than the array "
+                                 f"({self.array.outer_radius_m}); is it in millimetres?")
+        return self
+
+
+def is_nonlinear(study: Study) -> bool:
+    """Tell whether the field is no linear function of the magnetizations."""
+    return study.iron_ring is not None and study.iron_ring.curve is not None
+
+
+def curve_of(study: Study) -> Curve | None:
+    """The iron ring's magnetization curve, if it has one."""
+    curve = study.iron_ring and study.iron_ring.curve
+    if not curve:
+        return None
+    if curve.kind == "brauer":
+        return materials.brauer(curve.k1_m_per_H, curve.k2_per_T2, curve.k3_m_per_H)
+    if curve.kind == "froehlich_kennelly":
+        return materials.froehlich_kennelly(curve.initial_relative_permeability,
+                                            curve.saturation_polarization_T)
+    if curve.kind == "steel":
+        table = materials.read_table(materials.steels()[curve.name])
+    elif curve.file is None:
+        table = curve.H_A_per_m, curve.B_T
+    else:  # no file, no folder that the path would start from
+        raise StudyError(must_be("`iron_ring.curve.file`", f"study {study.name}",
+                                 "read together with the study's own file", f"'{curve.file}'",
+                                 "Use read_study, or give H_A_per_m and B_T."))
+    return materials.table_curve(np.array(table[0]), np.array(table[1]))

@@ -1,0 +1,189 @@
+"""Reading a study file; every refusal is one sentence that names file, key and remedy."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import (
+    BaseModel,
+    ValidationError,
+)
+
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.study import materials
+from halbach_fe.study.magnet import TableCurve
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import MIN_LENGTH_M
+
+MAX_EXPLAINED = 1e9  # by a wrong unit
+
+
+def read_study(path: str | Path) -> Study:
+    """Read and validate a study file.
+
+    Raises
+    ------
+    StudyError
+        With one sentence that names the file, the key, what was expected and what to do.
+    """
+    path = Path(path)
+    where = f"study file {path}"
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StudyError(
+            must_be("path", where, "a readable file", f"'{reason}'", "Check the path.")
+        ) from None
+    if not raw.strip():
+        raise StudyError(
+            must_be("content", where, "a TOML document", "an empty file",
+                    "Start from one of the files under studies/.")
+        )
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise StudyError(
+            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
+                    "Save it as UTF-8 text.")
+        ) from None
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise StudyError(must_be("syntax", where, "TOML of a few levels", "hundreds of them")
+                         ) from None
+    except ValueError as error:  # of TOML, or of an integer with thousands of digits
+        raise StudyError(
+            must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
+        ) from None
+    return _with_table(parse_study(document, where), path.parent, where)
+
+
+def parse_study(document: dict[str, Any], where: str = "study") -> Study:
+    """Validate a study given as nested dictionaries; raise StudyError as `read_study` does."""
+    try:
+        return Study.model_validate(document)
+    except ValidationError as error:
+        raise StudyError(_sentence(error, where)) from None
+
+
+def _with_table(study: Study, folder: Path, where: str) -> Study:
+    """The study with the numbers of its H(B) file in place of the file's name."""
+    ring = study.iron_ring
+    if ring is None or ring.curve is None or ring.curve.kind != "table" or not ring.curve.file:
+        return study
+    path = folder / ring.curve.file
+    try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ValueError("it must be a file")  # a device may have no end
+        field, flux_density = materials.read_table(path)
+        table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
+    except OSError as error:
+        raise StudyError(must_be("`iron_ring.curve.file`", where, "a readable file",
+                                 f"{str(path)!r} ({error.strerror})",
+                                 "Give its path from the study's folder.")) from None
+    except ValueError as error:
+        reason = (error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+                  if isinstance(error, ValidationError) else error)
+        raise StudyError(must_be("`iron_ring.curve.file`", where, "a table of H(B)",
+                                 f"{str(path)!r}, which cannot be used: {reason}")) from None
+    return study.model_copy(update={"iron_ring": ring.model_copy(update={"curve": table})})
+
+
+def _sentence(error: ValidationError, where: str) -> str:
+    """Turn the first of pydantic's complaints into our sentence, and count the others."""
+    errors = error.errors(include_url=False)
+    # An unknown key is the likeliest cause of the others (a misspelt key is also a missing one).
+    errors.sort(key=lambda e: e["type"] != "extra_forbidden")
+    first = errors[0]
+    key, model = _locate(first["loc"])
+    received, kind = first.get("input"), first["type"]
+    hint = ""
+    if kind == "extra_forbidden":
+        expected = "a known key"
+        name = str(first["loc"][-1])
+        near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
+        hint = (f"Did you mean `{near[0]}`?" if near
+                else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
+        received = f"`{name}`"
+    elif kind == "missing":
+        expected, received = "given", "nothing"
+        hint = "Add the key."
+    elif kind == "value_error":
+        expected = "consistent"
+        received = first["msg"].removeprefix("Value error, ")
+        sentence = f"Input `{key or 'the whole'}` of {where} must be {expected}: {received}."
+        return sentence + _more(errors)
+    else:
+        expected = first["msg"].removeprefix("Input should be ").lower()
+        if isinstance(received, int | float) and not isinstance(received, bool):
+            hint = _unit_hint(key, received)
+        elif isinstance(received, dict | list):
+            received = "a table" if isinstance(received, dict) else "a list"
+        else:
+            received = repr(received)
+    return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
+
+
+def _more(errors: list[Any]) -> str:
+    return f" ({len(errors) - 1} more in this file.)" if len(errors) > 1 else ""
+
+
+def _unit_hint(key: str, value: float) -> str:
+    """Guess a unit that is wrong by a factor of 1000."""
+    if not abs(value) < MAX_EXPLAINED:
+        return "Correct the value."
+    wrong = {"_m": "millimetres", "_T": "millitesla"}
+    key = key.partition("[")[0] if key.endswith("]") else key
+    for suffix, unit in wrong.items():
+        if key.endswith(suffix) and abs(value) > 1:
+            return f"Was it meant in {unit}? Then write {value / 1000:g}."
+    if key.endswith("_m") and 0 < abs(value) < MIN_LENGTH_M:
+        return f"Was it meant in kilometres? Then write {value * 1000:g}."
+    return "Correct the value."
+
+
+def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
+    """Return the dotted key of a pydantic location, and the model that holds its last part.
+
+    pydantic puts the tag of a discriminated union into the location; a user never wrote it.
+    """
+    models: list[type[BaseModel]] = [Study]
+    owner: type[BaseModel] | None = Study
+    parts: list[str] = []
+    for part in location:
+        if isinstance(part, int):
+            parts[-1] += f"[{part}]"
+            continue
+        tagged = [m for m in models if len(models) > 1 and part in _tags(m)]
+        if tagged:
+            models = owner_models = tagged
+            owner = owner_models[0]
+            continue
+        owner = models[0] if models else None
+        parts.append(part)
+        field = owner.model_fields.get(part) if owner else None
+        models = _models_in(field.annotation) if field else []
+    return ".".join(parts), owner
+
+
+def _tags(model: type[BaseModel]) -> set[str]:
+    return {
+        str(value)
+        for field in model.model_fields.values()
+        if get_origin(field.annotation) is Literal
+        for value in get_args(field.annotation)
+    }
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """All models mentioned in an annotation, in order."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if get_origin(annotation) in (Union, types.UnionType, Annotated, tuple):
+        return [model for arg in get_args(annotation) for model in _models_in(arg)]
+    return []

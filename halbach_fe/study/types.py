@@ -1,0 +1,98 @@
+"""Types of single keys of a study, with the limits that catch a wrong unit."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self, Union
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+)
+
+MAX_LENGTH_M = 10.0
+MIN_LENGTH_M = 1e-4
+MAX_POINTS = 1_000_000
+
+# The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
+Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
+Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
+Coordinate = Annotated[
+    float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M, allow_inf_nan=False)]
+Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]
+RecoilPermeability = Annotated[float, Field(ge=1.0, le=2.0)]
+Angle = Annotated[float, Field(ge=-720.0, le=720.0, allow_inf_nan=False)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Offset = Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)]
+Displacement = tuple[Offset, Offset, Offset]
+Rotation = tuple[Angle, Angle, Angle]
+Moment = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False)]
+Fractions = tuple[Fraction, Fraction, Fraction]
+RadiusScale = Annotated[float, Field(ge=-0.9, le=2.0, allow_inf_nan=False)]
+Unit = Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)]
+SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Axes = tuple[SignedAxis, SignedAxis, SignedAxis]
+FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
+GridCount = Annotated[int, Field(ge=1, le=10_000)]
+PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
+Temperature = Annotated[float, Field(ge=-273.15, le=500.0, allow_inf_nan=False)]
+Component = Literal["x", "y", "z"]
+COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+def one_or_list(kind: Any) -> BeforeValidator:
+    """Let a single value stand for a list of one."""
+    return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
+                           json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("control characters are not allowed here")
+    return text
+
+
+def _lines(text: str) -> str:
+    for line in text.split("\n"):
+        _one_line(line.replace("\t", " "))
+    return text
+
+
+Line = Annotated[str, AfterValidator(_one_line)]
+"""Text that is shown on terminals, in pages, in tables."""
+Lines = Annotated[str, AfterValidator(_lines)]
+
+
+class StudyModel(BaseModel):
+    """A table of a study file: unknown keys are errors, and values do not change.
+
+    Examples
+    --------
+    >>> from halbach_fe.study.solver import MeshSettings
+    >>> MeshSettings(block_size_m=0.01).with_(growth=1.6).growth
+    1.6
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def with_(self, **changes: Any) -> Self:
+        """The same table with other values of some keys, validated like one that was read.
+
+        ``mesh__growth`` changes the key ``growth`` of the table ``mesh``.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If the result is no valid table.
+        """
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        for key, value in changes.items():
+            name, nested, rest = key.partition("__")
+            if name not in values:
+                raise TypeError(f"{type(self).__name__} has no key {name}")
+            values[name] = values[name].with_(**{rest: value}) if nested else value
+        return type(self).model_validate(values)

@@ -1,0 +1,96 @@
+"""The blocks of one magnet, drawn from the study's prior, and what a coil says of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.study.model import Study
+from halbach_fe.synthetic.bodies import Body, TrueMagnet, vector
+from halbach_fe.synthetic.helmholtz_coil import moments
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A magnet with the errors of its blocks.
+
+    Attributes
+    ----------
+    single : Magnet
+        Every block as it is before it is mounted.
+    mounted : Magnet
+    common : float
+        What all magnetizations have in common, relative to the nominal.
+    """
+
+    single: TrueMagnet
+    mounted: TrueMagnet
+    common: float
+
+
+def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> Drawn:
+    """Draw the magnetizations of all blocks from the study's prior."""
+    prior = study.prior
+    common = float(prior.common_mode_sd * generator.standard_normal())
+    single, mounted = [], []
+    for body in nominal.bodies:
+        deviation = generator.standard_normal(3) * [
+            prior.magnitude_sd, *2 * [np.radians(prior.direction_sd_deg)]]
+        turn = np.radians(prior.mounting_sd_deg) * generator.standard_normal(3)
+        if study.dimension == 2:
+            deviation[2] = turn[0] = turn[1] = 0.0
+        one = _deviating(body, deviation + np.array([common, 0.0, 0.0]))
+        single.append(one)
+        mounted.append(one.with_magnetization(
+            Rotation.from_rotvec(turn).apply(one.magnetization)))
+    return Drawn(replace(nominal, bodies=tuple(single)), replace(nominal, bodies=tuple(mounted)),
+                 common)
+
+
+def _deviating(body: Body, deviation: Floats) -> Body:
+    """The body with M changed along it, across it in the ring's plane, and along z, by fractions
+    (3,) of it.
+    """
+    nominal = body.magnetization
+    axes = np.array([nominal, np.cross([0, 0, 1], nominal), np.linalg.norm(nominal) * np.eye(3)[2]])
+    return body.with_magnetization(nominal + deviation @ axes)
+
+
+def coil_table(
+    study: Study, nominal: TrueMagnet, single: TrueMagnet, coil_sd: float,
+    generator: np.random.Generator
+) -> tuple[BlockTable, float]:
+    """Moments of the single blocks in a Helmholtz coil, and by how much the coil reads too low.
+
+    ``coil_sd`` is the noise of every component relative to the nominal moment; the calibration is
+    off by the study's ``prior.common_mode_sd``, the same for all blocks.
+    """
+    length = study.array.ring_length_m or study.array.outer_radius_m
+    true = moments(single.bodies, length)
+    sigma = coil_sd * np.linalg.norm(moments(nominal.bodies, length), axis=1)
+    calibration = float(study.prior.common_mode_sd * generator.standard_normal())
+    measured = true / (1 + calibration) + sigma[:, None] * generator.standard_normal(true.shape)
+    digits = 10 - int(np.log10(np.abs(measured).max()))  # no two solves agree to the last one
+    label = {slot: name for name, slots in study.prior.types.items() for slot in slots}
+    reference = study.prior.reference_temperature_C
+    bodies = nominal.bodies
+    shapes = [replace(body.shape, length=min(length, body.shape.length)) for body in bodies]
+    return BlockTable(
+        serial=tuple(f"B{number:04d}" for number in range(1, len(bodies) + 1)),
+        type=tuple(label.get(body.slot, str(body.slot)) for body in bodies),
+        ring=np.array([body.ring for body in bodies]),
+        slot=np.array([body.slot for body in bodies]),
+        moment=measured.round(digits), sigma=sigma.round(digits),
+        volume=np.array([shape.volume for shape in shapes]),
+        temperature=np.full(len(bodies), np.nan if reference is None else reference)), calibration
+
+
+def magnetizations(magnet: TrueMagnet) -> list[dict[str, object]]:
+    """M of every block as plain data."""
+    return [{"ring": body.ring, "slot": body.slot,
+             "magnetization_A_per_m": list(vector(body.magnetization.round(6)))}
+            for body in magnet.bodies]

@@ -1,0 +1,416 @@
+"""Effects on the magnet: geometry, magnetization, materials, surroundings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.synthetic.bodies import (
+    Body,
+    Copy,
+    FroehlichLaw,
+    Part,
+    PrismBody,
+    SectorBody,
+    SoftSphere,
+    TrueMagnet,
+    Tube,
+    vector,
+)
+from halbach_fe.synthetic.hidden_effects.kinds import (
+    HiddenEffect,
+    HiddenParameter,
+    Site,
+    draw_direction,
+    draw_length,
+    draw_number,
+    draw_place,
+    log_uniform,
+    signed_log_uniform,
+)
+
+BLOCK = (HiddenParameter("ring"), HiddenParameter("slot"))
+SMCO = -3.5e-4
+"""Temperature coefficient of the remanence of Sm2Co17 in 1/K."""
+
+CORNER = (0.1, 0.2)
+"""The part of a block's thickness, from inside, and of its half width, from the sides, that its
+inner corners are."""
+
+Change = Callable[[Body], Body]
+
+
+def _bodies(magnet: TrueMagnet, change: Change,
+            chosen: Callable[[Body], bool] = bool) -> TrueMagnet:
+    """The magnet with some of its bodies changed."""
+    return replace(magnet, bodies=tuple(
+        change(body) if chosen(body) else body for body in magnet.bodies))
+
+
+def _at(ring: float, slot: float) -> Callable[[Body], bool]:
+    return lambda body: (body.ring, body.slot) == (ring, slot)
+
+
+def _of_ring(ring: float) -> Callable[[Body], bool]:
+    return lambda body: body.ring == ring
+
+
+def _moved(body: Body, shift: tuple[float, ...]) -> Body:
+    return replace(body, displacement=vector(np.add(body.displacement, shift)))
+
+
+def _moved_along_its_axes(body: Body, shift: tuple[float, ...]) -> Body:
+    return _moved(body, vector(Rotation.from_euler("z", body.angle).apply(shift)))
+
+
+def _scaled(body: Body, factor: float) -> Body:
+    return replace(body, remanence=vector(np.array(body.remanence) * factor))
+
+
+# --- materials ---------------------------------------------------------------------------------
+
+
+def iron_ring(
+    magnet: TrueMagnet, site: Site, inner: float, outer: float, permeability: float,
+    saturation: float
+) -> TrueMagnet:
+    """An iron tube as long as the magnet, of a constant permeability if it has no saturation."""
+    if outer <= inner or permeability == 1:
+        return magnet
+    law = FroehlichLaw(permeability, saturation) if saturation else permeability
+    return replace(magnet, iron=Tube(inner, outer, site.half_length, law))
+
+
+def _draw_iron(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    corner = site.outer / np.cos(np.pi / site.slots)  # of trapezoids
+    inner = corner + site.scale * log_uniform(generator, 0.002, 0.02)
+    return (inner, inner + site.scale * log_uniform(generator, 0.003, 0.02),
+            log_uniform(generator, 200, 3000), float(generator.uniform(1.6, 2.2)))
+
+
+def recoil_permeability(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
+    """All blocks have it in all directions, and the same remanence."""
+    return _bodies(magnet, lambda body: replace(body, along=body.along + more,
+                                                across=body.across + more))
+
+
+def recoil_permeability_across(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
+    """All blocks have it across their easy axes, and the same remanence."""
+    return _bodies(magnet, lambda body: replace(body, across=body.across + more))
+
+
+def _draw_recoil(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    least = 1 - site.permeability  # no magnet has less than 1
+    return (
+        max((signed_log_uniform if least < -0.01 else log_uniform)(generator, 0.01, 0.06), least),)
+
+
+# --- geometry ----------------------------------------------------------------------------------
+
+
+def block_displaced(magnet: TrueMagnet, site: Site, ring: float, slot: float, radial: float,
+                    azimuthal: float, z: float) -> TrueMagnet:
+    """One block displaced along its own axes."""
+    return _bodies(magnet, lambda body: _moved_along_its_axes(body, (radial, azimuthal, z)),
+                   _at(ring, slot))
+
+
+def block_turned(magnet: TrueMagnet, site: Site, ring: float, slot: float, radial: float,
+                 azimuthal: float, z: float) -> TrueMagnet:
+    """One block turned about its middle, by a rotation vector along its own axes."""
+    def turned(body: Body) -> Body:
+        turn = Rotation.from_rotvec(
+            Rotation.from_euler("z", body.angle).apply([radial, azimuthal, z]))
+        return replace(body, rotation=vector(
+            (turn * Rotation.from_rotvec(body.rotation)).as_rotvec()))
+
+    return _bodies(magnet, turned, _at(ring, slot))
+
+
+def radial_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
+    """All blocks moved outwards."""
+    return _bodies(magnet, lambda body: _moved_along_its_axes(body, (distance, 0.0, 0.0)))
+
+
+def azimuthal_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
+    """All blocks thinner by it, half on each side; their places stay. Sectors lose an angle, that
+    of the distance at their mean radius.
+    """
+    def thinner(body: Body) -> Body:
+        shape = body.shape
+        if isinstance(shape, SectorBody):
+            less: SectorBody | PrismBody = replace(
+                shape, half_angle=shape.half_angle - distance / 2 / shape.middle)
+        else:
+            less = replace(shape, inner_width=shape.inner_width - distance,
+                           outer_width=shape.outer_width - distance)
+        return replace(body, shape=less, room=body.room or shape)
+
+    return _bodies(magnet, thinner)
+
+
+def ring_gap(magnet: TrueMagnet, site: Site, seam: float, distance: float) -> TrueMagnet:
+    """All rings beyond a seam, from 1 between the first two, moved along z."""
+    return _bodies(magnet, lambda body: _moved(body, (0.0, 0.0, distance)),
+                   lambda body: body.ring > seam)
+
+
+def ring_twisted(magnet: TrueMagnet, site: Site, ring: float, angle: float) -> TrueMagnet:
+    """One ring turned about the z axis."""
+    turn = Rotation.from_euler("z", angle)
+
+    def twisted(body: Body) -> Body:
+        return replace(
+            body, displacement=vector(turn.apply(body.position) - body.centre),
+            rotation=vector((turn * Rotation.from_rotvec(body.rotation)).as_rotvec()))
+
+    return _bodies(magnet, twisted, _of_ring(ring))
+
+
+def ring_shifted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float) -> TrueMagnet:
+    """One ring moved across the axis."""
+    return _bodies(magnet, lambda body: _moved(body, (x, y, 0.0)), _of_ring(ring))
+
+
+def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
+    """All blocks begin further outside."""
+    def shorter(body: Body) -> Body:
+        shape = body.shape
+        if isinstance(shape, SectorBody):
+            less: SectorBody | PrismBody = replace(shape, inner=shape.inner + more)
+        else:
+            slope = (shape.outer_width - shape.inner_width) / shape.depth
+            less = replace(shape, depth=shape.depth - more,
+                           inner_width=shape.inner_width + slope * more)
+        step = vector(Rotation.from_euler("z", body.angle).apply([more / 2, 0.0, 0.0]))
+        return replace(body, shape=less, centre=vector(np.add(body.centre, step)))
+
+    return _bodies(magnet, shorter)
+
+
+def magnet_length(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet:
+    """All rings longer by a fraction, and as much further apart."""
+    def longer(body: Body) -> Body:
+        x, y, z = body.centre
+        return replace(body, centre=(x, y, z * (1 + fraction)),
+                       shape=replace(body.shape, length=body.shape.length * (1 + fraction)))
+
+    return _bodies(magnet, longer)
+
+
+# --- magnetization -----------------------------------------------------------------------------
+
+
+def blocks_swapped(magnet: TrueMagnet, site: Site, ring: float, slot: float, other_ring: float,
+                   other_slot: float) -> TrueMagnet:
+    """Two blocks in each other's places: each keeps its magnetization in its own axes."""
+    found = {(float(body.ring), float(body.slot)): body for body in magnet.bodies}
+    one, two = (ring, slot), (other_ring, other_slot)
+
+    def as_other(body: Body) -> Body:
+        other = found[two if (body.ring, body.slot) == one else one]
+        return replace(body, remanence=other.remanence, easy_axis=other.easy_axis,
+                       along=other.along, across=other.across, parts=other.parts)
+
+    return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in (one, two))
+
+
+def block_flipped(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> TrueMagnet:
+    """One block magnetized the other way."""
+    return _bodies(magnet, lambda body: _scaled(body, -1.0), _at(ring, slot))
+
+
+def block_missing(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> TrueMagnet:
+    """One block is not there."""
+    return _bodies(magnet, lambda body: replace(_scaled(body, 0.0), along=1.0, across=1.0),
+                   _at(ring, slot))
+
+
+def block_demagnetized(
+    magnet: TrueMagnet, site: Site, ring: float, slot: float, fraction: float
+) -> TrueMagnet:
+    """One block has lost a fraction of its magnetization."""
+    return _bodies(magnet, lambda body: _scaled(body, 1 - fraction), _at(ring, slot))
+
+
+def corners_demagnetized(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet:
+    """The two inner corners of all blocks, see `CORNER`, have lost a fraction of theirs."""
+    depth, width = CORNER
+    parts = (Part((0.0, depth), (-1.0, width - 1.0), 1 - fraction),
+             Part((0.0, depth), (1.0 - width, 1.0), 1 - fraction))
+    return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)))
+
+
+def magnetization_gradient(
+    magnet: TrueMagnet, site: Site, ring: float, slot: float, fraction: float
+) -> TrueMagnet:
+    """The inner half of a block's thickness is weaker by a fraction, the outer stronger; ring and
+    slot 0 are all blocks.
+    """
+    parts = (Part((0.0, 0.5), (-1.0, 1.0), 1 - fraction),
+             Part((0.5, 1.0), (-1.0, 1.0), 1 + fraction))
+    return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)),
+                   bool if (ring, slot) == (0, 0) else _at(ring, slot))
+
+
+def _draw_gradient(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    if generator.random() < 0.5:
+        return 0.0, 0.0, signed_log_uniform(generator, 0.005, 0.03)
+    return *draw_place(site, generator), signed_log_uniform(generator, 0.02, 0.1)
+
+
+def temperature(magnet: TrueMagnet, site: Site, change: float, coefficient: float) -> TrueMagnet:
+    """The whole magnet at another temperature."""
+    return _bodies(magnet, lambda body: _scaled(body, 1 + coefficient * change))
+
+
+def temperature_gradient(magnet: TrueMagnet, site: Site, change: float,
+                         coefficient: float) -> TrueMagnet:
+    """Temperature rises along y, by ``change`` from one side of the magnet to the other."""
+    return _bodies(magnet, lambda body: _scaled(
+        body, 1 + coefficient * change * body.position[1] / (2 * site.outer)))
+
+
+# --- surroundings ------------------------------------------------------------------------------
+
+
+def background(magnet: TrueMagnet, site: Site, x: float, y: float, z: float) -> TrueMagnet:
+    """A uniform field."""
+    return replace(magnet, background=vector(np.add(magnet.background, (x, y, z))))
+
+
+def neighbour_magnet(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
+    """A copy of the magnet on its axis, face to face at a distance, at lower z if negative."""
+    shift = np.sign(distance) * (2 * site.half_length + abs(distance))
+    return replace(magnet, copies=(*magnet.copies, Copy(float(shift))))
+
+
+def _draw_neighbour(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    """Beyond the map: no probe is moved into another magnet."""
+    gap = signed_log_uniform(generator, 0.5, 2.0) * site.outer
+    end = site.z_max if gap > 0 else -site.z_min
+    return (float(gap + np.sign(gap) * max(end - site.half_length, 0.0)),)
+
+
+def ferromagnetic_object(
+    magnet: TrueMagnet, site: Site, x: float, y: float, z: float, volume: float
+) -> TrueMagnet:
+    """A small sphere of soft iron, magnetized by the field where it is."""
+    return replace(magnet, objects=(*magnet.objects, SoftSphere((x, y, z), volume)))
+
+
+def _draw_object(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    """In the bore between probe and blocks, or beyond an end if there is no room."""
+    radius = (site.radius + site.inner) / 2 if site.radius < site.inner else 2 * site.outer
+    angle = generator.uniform(0, 2 * np.pi)
+    z = generator.uniform(max(site.z_min, -site.half_length), min(site.z_max, site.half_length))
+    room = abs(site.inner - site.radius) / 2
+    # a dipole of moment 3 V B / mu_0 at a distance d adds up to 6 V / (4 pi d^3) of B
+    volume = log_uniform(generator, 5e-4, 5e-3) * 4 * np.pi / 6 * room**3
+    return (float(radius * np.cos(angle)), float(radius * np.sin(angle)),
+            float(z) if site.dimension == 3 else 0.0, volume)
+
+
+# --- the list ----------------------------------------------------------------------------------
+
+
+def _draw_displacement(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    amount = site.scale * log_uniform(generator, 2e-4, 1e-3)
+    return *draw_place(site, generator), *(
+        amount * value for value in draw_direction(generator, site.dimension))
+
+
+def _draw_turn(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    axis = draw_direction(generator) if site.dimension == 3 else (0.0, 0.0, 1.0)
+    amount = signed_log_uniform(generator, 0.02, 0.08)
+    return *draw_place(site, generator), *(amount * value for value in axis)
+
+
+def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    ring, slot = draw_place(site, generator)
+    return ring, slot, ring, (slot + generator.integers(1, site.slots) - 1) % site.slots + 1
+
+
+def _draw_shift(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    amount = site.scale * log_uniform(generator, 1e-4, 5e-4)
+    ring, _ = draw_place(site, generator)
+    return ring, *(amount * value for value in draw_direction(generator, 2)[:2])
+
+
+M, RAD, PER_K = "m", "rad", "1/K"
+OWN_AXES = ("radial", "azimuthal", "z")
+
+EFFECTS = (
+    HiddenEffect("iron_ring", "field", (
+        HiddenParameter("inner_radius", M), HiddenParameter("outer_radius", M),
+        HiddenParameter("relative_permeability"), HiddenParameter("saturation_polarization", "T")),
+        _draw_iron, iron_ring, needs=("no iron",)),
+    HiddenEffect("recoil_permeability", "field", (HiddenParameter("change"),), _draw_recoil,
+           recoil_permeability, of_blocks=True),
+    HiddenEffect("recoil_permeability_across", "field", (HiddenParameter("change"),),
+           draw_number(0.03, 0.15, False), recoil_permeability_across, of_blocks=True),
+    HiddenEffect("block_displaced", "field",
+                 (*BLOCK, *(HiddenParameter(name, M) for name in OWN_AXES)),
+           _draw_displacement, block_displaced),
+    HiddenEffect("block_turned", "field",
+                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)),
+           _draw_turn, block_turned),
+    HiddenEffect("radial_gap", "field", (HiddenParameter("distance", M),),
+                 draw_length(5e-5, 4e-4, False),
+           radial_gap),
+    HiddenEffect("azimuthal_gap", "field", (HiddenParameter("distance", M),),
+                 draw_length(5e-5, 4e-4, False),
+           azimuthal_gap, of_blocks=True),
+    HiddenEffect("ring_gap", "field", (HiddenParameter("seam"), HiddenParameter("distance", M)),
+           lambda site, generator: (float(generator.integers(1, site.rings)),
+                                    site.scale * log_uniform(generator, 5e-5, 5e-4)),
+           ring_gap, needs=("3d", "rings")),
+    HiddenEffect("ring_twisted", "field", (HiddenParameter("ring"), HiddenParameter("angle", RAD)),
+           lambda site, generator: (draw_place(site, generator)[0],
+                                    signed_log_uniform(generator, 1e-3, 1e-2)),
+           ring_twisted, needs=("3d", "rings")),
+    HiddenEffect("ring_shifted", "field",
+                 (HiddenParameter("ring"), HiddenParameter("x", M), HiddenParameter("y", M)),
+           _draw_shift, ring_shifted, needs=("3d", "rings")),
+    HiddenEffect("blocks_swapped", "field",
+           (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
+                 blocks_swapped),
+    HiddenEffect("block_flipped", "field", BLOCK, draw_place, block_flipped),
+    HiddenEffect("block_missing", "field", BLOCK, draw_place, block_missing),
+    HiddenEffect("block_demagnetized", "field", (*BLOCK, HiddenParameter("fraction")),
+           lambda site,
+                 generator: (*draw_place(site, generator), log_uniform(generator, 0.04, 0.3)),
+           block_demagnetized),
+    HiddenEffect("corners_demagnetized", "field", (HiddenParameter("fraction"),),
+                 draw_number(0.03, 0.3, False),
+           corners_demagnetized),
+    HiddenEffect("magnetization_gradient", "field", (*BLOCK, HiddenParameter("fraction")),
+                 _draw_gradient,
+           magnetization_gradient, of_blocks=True),
+    HiddenEffect("temperature", "field",
+                 (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
+           lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
+    HiddenEffect("temperature_gradient", "field",
+           (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
+           lambda site, generator: (signed_log_uniform(generator, 3, 15), SMCO),
+                 temperature_gradient),
+    HiddenEffect("inner_radius", "field", (HiddenParameter("change", M),), draw_length(1e-4, 6e-4),
+                 inner_radius,
+           of_blocks=True),
+    HiddenEffect("length", "field", (HiddenParameter("fraction"),), draw_number(5e-4, 4e-3),
+                 magnet_length,
+           needs=("3d",), of_blocks=True),
+    HiddenEffect("background", "field", tuple(HiddenParameter(name, "T") for name in "xyz"),
+           lambda site, generator: tuple(
+               float(value) for value in log_uniform(generator, 5e-5, 5e-4)
+               * np.array(draw_direction(generator, site.dimension))), background),
+    HiddenEffect("neighbour_magnet", "field", (HiddenParameter("distance", M),),
+           _draw_neighbour, neighbour_magnet, needs=("3d",)),
+    HiddenEffect("ferromagnetic_object", "field",
+           (*(HiddenParameter(name, M) for name in "xyz"), HiddenParameter("volume", "m^3")),
+                 _draw_object,
+           ferromagnetic_object, needs=("3d",)),
+)

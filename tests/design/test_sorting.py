@@ -1,0 +1,185 @@
+"""Measured blocks sorted into slots, judged by magpylib's field of the true blocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.design.sorting import sort_blocks
+from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.response.multipoles import MultipoleReference, multipole_model
+from halbach_fe.solver.session import Session
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
+from tests.design.test_shimming import (
+    ORDERS,
+    RADIUS,
+    SQUARES,
+    chi2,
+    study_of,
+    true_multipoles,
+)
+
+CUBES = SQUARES | {"prior": {"types": {"a": list(range(1, 13))}, "common_mode_sd": 0.005}}
+COIL_SD = 0.002
+
+
+@pytest.fixture(scope="module")
+def session(getdp, tmp_path_factory):
+    return Session(getdp, tmp_path_factory.mktemp("work"), jobs=1)
+
+
+def blocks(study, seed, spare=0):
+    """True bodies of a magnet and some spare ones of the same slots, and what a coil says of them
+    in a shuffled table without places.
+    """
+    nominal = magnet_of(study)
+    generator = np.random.default_rng(seed)
+    count = len(nominal.bodies)
+    bodies, tables, moments = [], [], []
+    for _ in range(1 + bool(spare)):
+        single = draw_magnet(study, nominal, generator).single
+        bodies += single.bodies
+        tables.append(coil_table(study, nominal, single, COIL_SD, generator)[0])
+        # a block without a place is measured as in the first slot of its type
+        moments.append(as_mounted(study, tables[-1], np.array([
+            types_of(study)[label][0] - 1 for label in tables[-1].type])))
+    rows = np.arange(count + spare)
+    sigma, volume, temperature = (
+        np.concatenate([getattr(one, name) for one in tables])[rows]
+        for name in ("sigma", "volume", "temperature"))
+    return bodies, BlockTable(
+        tuple(f"S{row:03d}" for row in rows), tuple((tables[0].type * 2)[row] for row in rows),
+        np.zeros(len(rows), int), np.zeros(len(rows), int), np.vstack(moments)[rows], sigma, volume,
+        temperature)
+
+
+def part(table, count):
+    """The first rows of a table."""
+    return replace(table, **{name: getattr(table, name)[:count] for name in (
+        "serial", "type", "ring", "slot", "moment", "sigma", "volume", "temperature")})
+
+
+def assembled(study, bodies, table):
+    """The true magnet of a table with places: every body carried to its slot by hand."""
+    nominal = magnet_of(study)
+    result = []
+    for row, (ring, slot) in enumerate(table.places):
+        if ring:
+            where, body = nominal.bodies[slot - 1], bodies[row]
+            facing = where.angle + getattr(where.shape, "turn", 0.0)
+            result.append(replace(body, slot=slot, ring=ring, centre=where.centre,
+                                  angle=facing - getattr(body.shape, "turn", 0.0)))
+    return result
+
+
+def test_sorted_blocks_beat_random_ones(session):
+    """Of 20 sets of cubes: sorted, the true multipoles are below those of nearly all random orders,
+    and as foretold: chi2 per number is 1 +- 0.11 (160 numbers), three of that.
+    """
+    study = study_of(**CUBES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    scores, ratios = [], []
+    for seed in range(20):
+        bodies, table = blocks(study, seed)
+        found = sort_blocks(study, table, model, np.random.default_rng(seed))
+        assert sorted(found.table.slot.tolist()) == list(range(1, 13))
+        truth, _ = true_multipoles(assembled(study, bodies, found.table), 1, model.turn)
+        scores.append(chi2(found.best, truth))
+        generator, others = np.random.default_rng(seed), []
+        for _ in range(5):
+            shuffled = replace(found.table, slot=generator.permutation(12) + 1)
+            values, _ = true_multipoles(assembled(study, bodies, shuffled), 1, model.turn)
+            others.append(np.sqrt(values @ values))
+        ratios.append(np.sqrt(truth @ truth) / np.array(others))
+    assert np.mean(scores) == pytest.approx(1, abs=0.35)
+    assert np.median(ratios) < 0.3
+    assert np.mean(np.array(ratios) < 1) > 0.97  # of 100
+
+
+def test_random_orders_are_as_they_are(session):
+    """Negative control: another set's moments sort no better than chance, and what is foretold of
+    the own order is true.
+    """
+    study = study_of(**CUBES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    wrong, foretold, random = [], [], []
+    for seed in range(10):
+        _, table = blocks(study, seed)
+        others, _ = blocks(study, seed + 50)
+        found = sort_blocks(study, table, model, np.random.default_rng(seed))
+        truth, _ = true_multipoles(assembled(study, others, found.table), 1, model.turn)
+        wrong.append(np.sqrt(np.sum(truth**2) / len(ORDERS)))
+        foretold.append(np.sqrt(np.mean(found.best.sizes**2)))
+        random.append(np.median(found.random))
+    assert np.mean(wrong) == pytest.approx(np.mean(random), rel=0.3)
+    assert np.mean(wrong) > 3 * np.mean(foretold)
+
+
+def test_spare_blocks_help(session):
+    study = study_of(**CUBES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    bodies, table = blocks(study, 3, spare=6)
+    found = sort_blocks(study, table, model, np.random.default_rng(1))
+    assert found.left_over == 6
+    without = sort_blocks(study, part(table, 12), model, np.random.default_rng(1))
+    assert np.sum(found.best.mean**2) < np.sum(without.best.mean**2)
+    truth, _ = true_multipoles(assembled(study, bodies, found.table), 1, model.turn)
+    assert chi2(found.best, truth) < 3  # of 8 numbers: 1 +- 0.5, four of that
+
+
+def test_sorted_tables_are_priors(session):
+    """What `infer --blocks` makes of the sorted table is what `sort` foretells."""
+    study = study_of(**CUBES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    _, table = blocks(study, 5)
+    found = sort_blocks(study, table, model, np.random.default_rng(5))
+    prior = prior_from_blocks(study, found.table).gaussian
+    known = model.of(prior)
+    np.testing.assert_allclose(known.mean, found.best.mean, atol=1e-6)
+    np.testing.assert_allclose(known.sd, found.best.sd, rtol=1e-6)
+    again = sort_blocks(study, found.table, model, np.random.default_rng(6))
+    assert again.own_order == "as placed in the table"
+    np.testing.assert_allclose(again.numbered.mean, found.best.mean, atol=1e-6)
+    # negative control: moments that are not turned into the slots' own axes
+    with pytest.raises(MeasurementError, match="moment of block"):
+        prior_from_blocks(study, replace(found.table, moment=table.moment))
+
+
+def test_types_stay_in_their_slots(session):
+    """Opposite blocks of a dipole are magnetized in opposite directions from their own axes; and a
+    type needs a block for each of its slots.
+    """
+    study = study_of(prior__types={str(slot): [slot, slot + 6] for slot in range(1, 7)})
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    _, table = blocks(study_of(), 3)
+    table = replace(table, type=tuple(str((int(name) - 1) % 6 + 1) for name in table.type))
+    with pytest.raises(StudyError, match="alike"):
+        sort_blocks(study, table, model, np.random.default_rng(1))
+    with pytest.raises(MeasurementError, match="enough for the 1 slots"):
+        sort_blocks(study_of(), part(blocks(study_of(), 3)[1], 11), model,
+                    np.random.default_rng(1))
+
+
+def test_where_there_is_no_choice_it_is_said(session):
+    study = study_of(**SQUARES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    nominal = magnet_of(study)
+    table, _ = coil_table(study, nominal, nominal, COIL_SD, np.random.default_rng(0))
+    with pytest.warns(HalbachWarning, match="nothing to sort"):
+        sort_blocks(study, table, model, np.random.default_rng(0))
+
+
+def test_the_seed_decides(session):
+    study = study_of(**CUBES)
+    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    _, table = blocks(study, 8)
+    one, same, other = (sort_blocks(study, table, model, np.random.default_rng(seed))
+                        for seed in (1, 1, 2))
+    assert one.table.places == same.table.places
+    np.testing.assert_array_equal(one.random, same.random)
+    assert (one.random != other.random).any()

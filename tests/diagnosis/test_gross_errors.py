@@ -1,0 +1,176 @@
+"""Gross errors of maps by magpylib, named and put right; effects of usual size are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.gross_errors import find_gross_errors
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.measurement.instrument import as_read, probe, remainder
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.vacuum_field import field_of
+from tests.diagnosis.campaign import CIRCLES, STUDY, measured, with_array
+
+NONE = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return measured(STUDY, np.random.default_rng(7))
+
+
+def written(data, positions=NONE, fields=NONE):
+    """A map whose columns are those of the right one times matrices."""
+    return field_map(points_of(data) @ np.transpose(positions),
+                     data["B_T"].values @ np.transpose(fields))
+
+
+def flipped(*names):
+    return np.diag([-1.0 if name in names else 1.0 for name in "xyz"])
+
+
+def swapped(order):
+    return np.eye(3)[["xyz".index(name) for name in order]]
+
+
+def about_z(degrees):
+    angle = np.radians(degrees)
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
+                     [0, 0, 1]])
+
+
+WRITTEN = {
+    "millimetres": (1e3 * NONE, NONE), "centimetres": (100 * NONE, NONE),
+    "millitesla": (NONE, 1e3 * NONE), "gauss": (NONE, 1e4 * NONE),
+    "reversed_z": (flipped("z"), NONE),
+    "sign_flipped_axis x": (NONE, flipped("x")), "sign_flipped_axis y": (NONE, flipped("y")),
+    "sign_flipped_axis frame": (flipped("x"), flipped("x")),
+    "swapped_axes probe": (NONE, swapped("xzy")), "swapped_axes points": (swapped("zyx"), NONE),
+    "swapped_axes frame": (swapped("yxz"), swapped("yxz")),
+    "rotated_by_one_block": (about_z(30), about_z(30)),
+    "rotated_by_one_block 3 back": (about_z(-90), about_z(-90)),
+    "wrong_radius 0.5": (np.diag([2.0, 2.0, 1.0]), NONE),  # then inside of the magnet
+    "wrong_radius 1.25": (np.diag([0.8, 0.8, 1.0]), NONE)}
+
+
+@pytest.mark.parametrize("case", WRITTEN)
+def test_a_map_that_is_written_wrongly(case, right):
+    """One error, which may have others that the magnet's symmetry makes the same."""
+    data = written(right, *WRITTEN[case])
+    (found,) = find_gross_errors(STUDY, data)
+    assert len(found.names) == 1
+    assert case.split()[0] in {*found.names, *(name for one in found.alternatives
+                                               for name in one.names)}
+    # blocks of 1 % leave 0.6 % here, and 0.8 % of a flipped By, which is 5 % of the field
+    assert found.misfit_after < 0.01 < 0.04 < found.misfit_before
+    study = found.apply(STUDY)
+    assert find_gross_errors(study, data) == ()
+    if case.startswith(("milli", "centi", "gauss", "wrong_radius", "swapped_axes p")):
+        # without a symmetry it is the map that it was
+        read = as_read(study.instrument, data)
+        factor = 1 + study.instrument.radius_scale
+        np.testing.assert_allclose(points_of(read) * [factor, factor, 1], points_of(right),
+                                   atol=2e-3)  # a radius to 2 %, by a field that is off by 1 %
+        np.testing.assert_allclose(read["B_T"], right["B_T"], atol=1e-12)
+
+
+@pytest.mark.parametrize(("case", "keys"), {
+    "wrong_ring_count": {"rings": 4}, "wrong_ring_count less": {"rings": 2},
+    "wrong_magnetization_direction": {"first_magnetization_angle_deg": 0.0},
+    "wrong_magnetization_direction 90": {"first_magnetization_angle_deg": 270.0},
+    "wrong_multipole_order": {"multipole_order": 2}}.items())
+def test_another_magnet(case, keys, generator):
+    built = with_array(**keys)
+    data = measured(built, generator)
+    (found,) = find_gross_errors(STUDY, data)
+    assert case.split()[0] in {*found.names, *(name for one in found.alternatives
+                                               for name in one.names)}
+    study = found.apply(STUDY)
+    assert find_gross_errors(study, data) == ()
+    if found.names == (case.split()[0],):
+        assert study.array == built.array
+
+
+def test_points_that_were_elsewhere(generator):
+    shift = np.array([0.012, -0.005, 0.02])
+    data = measured(STUDY, generator, at=CIRCLES + shift)
+    (found,) = find_gross_errors(STUDY, data)
+    assert found.names == ("wrong_line",)
+    # blocks of 1 % move the field by as much as 1 mm does
+    np.testing.assert_allclose(found.apply(STUDY).instrument.translation_m, shift, atol=1e-3)
+
+
+def test_several_errors(right):
+    """In mm and mT, with Bx of the wrong sign: each alone explains nothing."""
+    data = written(right, 1e3 * NONE, 1e3 * flipped("x"))
+    (found,) = find_gross_errors(STUDY, data)
+    assert found.names == ("millimetres", "millitesla", "sign_flipped_axis")
+    study = found.apply(STUDY)
+    np.testing.assert_allclose(as_read(study.instrument, data)["B_T"], right["B_T"], atol=1e-12)
+
+
+def test_what_the_study_knows_is_no_error(right):
+    data = written(right, 1e3 * NONE)
+    study = STUDY.model_copy(update={"instrument": STUDY.instrument.model_copy(
+        update={"length_unit_m": 1e-3})})
+    assert find_gross_errors(study, data) == ()
+
+
+def test_a_line_with_one_component(generator):
+    """Of the axis little is to be seen; what is, is named with all that it may be."""
+    line = np.column_stack([np.zeros((41, 2)), np.linspace(-0.2, 0.2, 41)])
+    data = measured(STUDY, generator, line)
+    data["B_T"].values[:, 1:] = np.nan
+    assert find_gross_errors(STUDY, data) == ()
+    assert find_gross_errors(STUDY, field_map(-line, data["B_T"].values)) == ()  # it looks the same
+    (found,) = find_gross_errors(STUDY, field_map(1e3 * line, data["B_T"].values))
+    assert found.names == ("millimetres",)
+    data["B_T"].values[:, 0] *= -1
+    (found,) = find_gross_errors(STUDY, data)
+    assert found.names == ("sign_flipped_axis",)
+    assert {"wrong_magnetization_direction", "rotated_by_one_block"} <= {
+        name for one in found.alternatives for name in one.names}
+
+
+def test_a_clean_map(right):
+    assert find_gross_errors(STUDY, right) == ()
+
+
+SOLVED = {"iron_ring", "iron_saturation", "recoil_permeability", "recoil_permeability_across"}
+GROSS = {"wrong_line", "wrong_radius"}
+"""Where the catalogue and the gross errors meet; smaller ones are the former's."""
+
+
+@pytest.mark.parametrize("effect", [
+    one for one in catalogue() if one.name not in SOLVED | GROSS and one.name[-2:] not in (
+        "_y", "_z")],
+                         ids=lambda one: one.name)
+def test_effects_of_usual_size_are_no_gross_errors(effect, right, generator):
+    """Negative control: three standard deviations of anything in the catalogue; of sensors that
+    differ by their component one.
+    """
+    places = effect.places(STUDY)
+    place = places[int(generator.integers(len(places)))]
+    values = [(1 if effect.certain else 3) * one.sd for one in effect.parameters]
+    true = effect.apply(STUDY, place, values)
+
+    def shown(study):
+        used = probe(study.instrument, CIRCLES)
+        linear = (used.operator @ (field_of(blocks_of(study), used.points) + external_field(
+            study, used.points)).ravel()).reshape(-1, 3)
+        return linear + remainder(study.instrument, linear, np.linspace(0, 1, len(CIRCLES)))
+
+    change = shown(true) - shown(STUDY)
+    found = find_gross_errors(STUDY, field_map(CIRCLES, right["B_T"].values + change))
+    assert found == ()
+
+
+def test_what_no_error_explains_is_not_named(right, generator):
+    """Negative controls: readings in disorder, another bore."""
+    order = generator.permutation(len(CIRCLES))
+    assert find_gross_errors(STUDY, field_map(CIRCLES, right["B_T"].values[order])) == ()
+    other = measured(with_array(inner_radius_m=0.12, outer_radius_m=0.17), generator)
+    assert find_gross_errors(STUDY, other) == ()

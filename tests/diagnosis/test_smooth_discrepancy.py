@@ -1,0 +1,68 @@
+"""Smooth fields and smooth errors of sensors."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+
+from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.smooth_discrepancy import (
+    harmonic_fields,
+    judge_smooth_terms,
+    sensor_errors,
+)
+from tests.conftest import circle
+
+STEP = 1e-5
+POINTS = np.vstack([circle(radius, 16, z) for radius in (0.03, 0.06)
+                    for z in np.linspace(-0.2, 0.2, 15)])
+SIGMA = 5e-5
+
+
+def derivatives(points):
+    """Of all harmonic fields, (k, n, component, direction)."""
+    moved = [points + sign * STEP * axis for axis in np.eye(3) for sign in (1, -1)]
+    ends = np.array([[0.06, 0, 0.2], [-0.06, 0, -0.2]])  # the same map's extent for all
+    fields = harmonic_fields(np.vstack([*moved, ends])).fields
+    parts = fields[:, :-2].reshape(len(fields), 3, 2, len(points), 3)
+    return np.moveaxis((parts[:, :, 0] - parts[:, :, 1]) / (2 * STEP), 1, 3)
+
+
+def test_harmonic_fields_have_no_source_in_the_bore():
+    points = np.random.default_rng(1).uniform(-0.03, 0.03, (12, 3))
+    gradient = derivatives(points)
+    size = np.abs(gradient).max()
+    # differences of STEP are off by rounding, 1e-16 / STEP, and by its square
+    assert np.abs(np.trace(gradient, axis1=2, axis2=3)).max() < 1e-5 * size
+    assert np.abs(gradient - np.swapaxes(gradient, 2, 3)).max() < 1e-5 * size
+
+
+def factors(field):
+    """Log Bayes factors of both kinds for a field in T, with noise."""
+    noise = np.random.default_rng(3).standard_normal(field.size)
+    residual = field.ravel() / SIGMA + noise
+    marginal = Marginal.of(np.zeros((field.size, 1)))
+    return [judge_smooth_terms(marginal.evidence(
+        terms.fields.reshape(len(terms.fields), -1).T, residual), terms.fineness).log_bayes_factor
+        for terms in (harmonic_fields(POINTS), sensor_errors(POINTS))]
+
+
+def test_a_coil_is_a_field():
+    coil = magpylib.current.Circle(current=100, diameter=0.4, position=(0.02, 0, 0.1))
+    field, instrument = factors(coil.getB(POINTS))
+    assert field > instrument + 20
+    assert field > 50
+
+
+def test_a_ripple_of_one_sensor_is_the_instrument():
+    ripple = np.zeros_like(POINTS)
+    ripple[:, 0] = 2e-4 * np.sin(2 * np.pi * POINTS[:, 2] / 0.15)
+    field, instrument = factors(ripple)
+    assert instrument > field + 50
+    assert instrument > 50
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_noise_is_neither(size):
+    assert max(factors(size * np.ones_like(POINTS))) < 0

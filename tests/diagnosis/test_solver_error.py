@@ -1,0 +1,52 @@
+"""Numerical causes come before physical ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.summary import diagnosis_summary, others
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.diagnosis import verdict
+from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.study.reader import parse_study
+from tests.conftest import DIPOLE, changed, circle
+
+SIGMA = 3e-5
+POINTS = np.vstack([circle(radius, 40, 0.0) for radius in (0.05, 0.08)])
+
+
+def found(session, generator, method, gain=0.0):
+    """Diagnose an exact field, by the coarse mesh alone or as what reacts only."""
+    study = parse_study(changed(
+        DIPOLE, array__recoil_permeability=1.0, solver={"method": method},
+        noise={"regions": [{"name": "all", "sigma_T": SIGMA}]},
+        prior={"magnitude_sd": 0.002, "direction_sd_deg": 0.1, "common_mode_sd": 0.002}))
+    blocks = [replace(one, remanence=one.remanence * (1 + 0.002 * generator.standard_normal()))
+              for one in blocks_of(study)]
+    readings = field_of(blocks, POINTS) + SIGMA * generator.standard_normal(POINTS.shape)
+    readings[:, 0] *= 1 + gain
+    return diagnose(study, field_map(POINTS, readings), session)
+
+
+def test_a_coarse_mesh_is_no_effect(session, generator):
+    diagnosis = found(session, generator, "direct")
+    assert (diagnosis.named, diagnosis.unknown, diagnosis.rounds) == ((), None, 1)
+    assert diagnosis.numerical.chi2_noise > diagnosis.before.conflict_limit
+    assert diagnosis.numerical.largest_over_noise > 1
+    assert diagnosis_summary(diagnosis)["verdict"] == "numerical"
+    assert [one.name for one in others(diagnosis)] == ["solver_error"]
+    assert verdict(diagnosis)[-1].startswith("The solver's own error explains the misfit")
+
+
+@pytest.mark.parametrize(("method", "gain"), [("reaction", 0.0), ("direct", 0.1)])
+def test_what_the_mesh_does_not_explain(session, generator, method, gain):
+    """Negative controls: no misfit, and one that is larger than the error of the mesh."""
+    diagnosis = found(session, generator, method, gain)
+    assert diagnosis.numerical is None
+    assert bool(gain) == (diagnosis.before.prior_conflict > diagnosis.before.conflict_limit)
+    assert bool(gain) == bool(diagnosis.named or diagnosis.unknown)

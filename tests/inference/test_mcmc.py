@@ -1,0 +1,197 @@
+"""The non-linear posterior of a cross-section with steel: truth by NGSolve, chains by us."""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import ngsolve
+import numpy as np
+import pytest
+import xarray as xr
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import SamplingError
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
+from tests.conftest import DIPOLE, changed, circle
+from tests.oracles import ngsolve_nonlinear
+
+STEEL = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "curve": {
+    "kind": "froehlich_kennelly", "initial_relative_permeability": 1000.0,
+    "saturation_polarization_T": 2.0}}
+SPREAD = 0.02
+STUDY_FILE = """
+name = "steel"
+dimension = 2
+[array]
+blocks_per_ring = 16
+inner_radius_m = 0.104
+outer_radius_m = 0.1865
+first_block_angle_deg = 90.0
+first_magnetization_angle_deg = 180.0
+recoil_permeability = 1.05
+remanence_T = 1.06
+block = { shape = "sector" }
+[iron_ring]
+inner_radius_m = 0.19
+outer_radius_m = 0.2
+[iron_ring.curve]
+kind = "froehlich_kennelly"
+initial_relative_permeability = 1000.0
+saturation_polarization_T = 2.0
+[mesh]
+block_size_m = 0.014
+[observation]
+quantity = "flux_density"
+components = ["x", "y"]
+positions = { kind = "circles", radius_m = 0.075, angles = 24 }
+[[noise.regions]]
+name = "all"
+sigma_T = 1e-4
+[prior]
+magnitude_sd = 0.02
+direction_sd_deg = 1.146
+"""
+
+
+@pytest.fixture(scope="module")
+def campaign(getdp, tmp_path_factory):
+    """Study, truth, and the linearized update of a map by NGSolve; blocks 2 % and 1.1 deg off."""
+    study = parse_study(changed(
+        DIPOLE, iron_ring=STEEL, mesh__block_size_m=0.014, observation__components=["x", "y"],
+        noise={"regions": [{"name": "all", "sigma_T": 1e-4}]},
+        prior={"magnitude_sd": SPREAD, "direction_sd_deg": np.degrees(SPREAD)}))
+    generator = np.random.default_rng(20231)
+    nominal = np.array([block.magnetization[:2] for block in blocks_of(study)])
+    truth = nominal + SPREAD * np.linalg.norm(nominal[0]) * generator.standard_normal(nominal.shape)
+    points = np.vstack([circle(0.075, 30), circle(0.06, 20, start=0.1)])
+    magnet = magnet_of(study).with_magnetizations(truth)
+    with ngsolve.TaskManager():
+        field = ngsolve_nonlinear.section_field(
+            magnet, mesh_of(magnet, points, Elements(0.02)), 4, points)
+    field[:, :2] += 1e-4 * generator.standard_normal((len(points), 2))
+    field[:, 2] = np.nan
+    data = field_map(points, field)
+    folder = tmp_path_factory.mktemp("sampled")
+    session = Session(getdp, folder / "work", jobs=2)
+    return study, truth.ravel(), data, infer(study, data, session), session
+
+
+def room(session, name):
+    return replace(session, folder=session.folder / name)
+
+
+@pytest.fixture(scope="module")
+def found(campaign):
+    return sample_posterior(campaign[3], room(campaign[4], "undisturbed"), 1000)
+
+
+def test_chains_converge_on_the_truth(campaign, found):
+    """32 values: the rms of error over sd is 1 +- 0.13 for a posterior that is right; 4 sigma."""
+    truth = campaign[1]
+    score = (found.mean - truth) / found.sd
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    assert found.agreement_T < 1e-8
+    updated = with_samples(campaign[3], found)
+    np.testing.assert_allclose(updated.posterior.sd, found.sd, rtol=1e-3)
+    residual = (updated.readings - updated.prediction_posterior.mean) / updated.sigma
+    assert np.sqrt(np.mean(residual**2)) < 1.3
+
+
+def test_stored_for_arviz(campaign, found):
+    write_sampled(found, campaign[4].folder)
+    assert len((campaign[4].folder / "sampled.csv").read_text().splitlines()) == 33
+    path = campaign[4].folder / "undisturbed" / "chains.nc"
+    with xr.open_dataset(path, group="posterior", engine="h5netcdf") as stored:
+        assert stored["magnetization"].dims == ("chain", "draw", "parameter")
+        np.testing.assert_array_equal(stored["magnetization"].values[:, 100:], found.draws)
+
+
+def test_interrupted_chains_go_on(campaign, found):
+    """What an interrupted run stored is used, and the result is that of an undisturbed one, also
+    if the chains go on at a time, in processes of their own, to which the model travels.
+    """
+    session = room(campaign[4], "interrupted")
+
+    def interrupt(text):
+        if text.startswith("500"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_posterior(campaign[3], session, 1000, say=interrupt)
+    said: list[str] = []
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        again = sample_posterior(campaign[3], session, 1000, say=said.append, mapped=pool.map)
+    assert said[1].startswith("750")
+    np.testing.assert_array_equal(again.draws, found.draws)
+
+
+def test_longer_chains_go_on_from_shorter_ones_and_other_readings_do_not(campaign, found):
+    """Draws are added; a map with other noise starts anew (the control)."""
+    folder = room(campaign[4], "interrupted")
+    said: list[str] = []
+    more = sample_posterior(campaign[3], folder, 1250, say=said.append)
+    assert said[1].startswith("1250")
+    np.testing.assert_array_equal(more.draws[:, :875], found.draws[:, 25:])
+    other = replace(campaign[3], readings=campaign[3].readings + 1e-6)
+    said.clear()
+    with pytest.raises(SamplingError, match=r"effective samples|do not agree|cannot be judged"):
+        sample_posterior(other, folder, 250, effective=1e9, say=said.append)
+    assert said[1].startswith("250 of 250")
+
+
+def test_too_few_draws_are_refused(campaign):
+    with pytest.raises(SamplingError, match=r"effective samples|do not agree"):
+        sample_posterior(campaign[3], room(campaign[4], "short"), 20)
+    with pytest.raises(SamplingError, match="at least 20"):
+        sample_posterior(campaign[3], room(campaign[4], "short"), 3)
+
+
+def test_samples_from_the_command_line(campaign, tmp_path, capsys):
+    """The summary says that the posterior is sampled; short chains leave the linearized one."""
+    write_map(campaign[2], tmp_path / "map.csv")
+    (tmp_path / "study.toml").write_text(STUDY_FILE)
+    command = ["infer", str(tmp_path / "study.toml"), "--measurements",
+               str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--json", "--samples"]
+    assert main([*command, "20"]) == 10
+    assert "linearized" in (tmp_path / "out" / "summary.json").read_text()
+    assert main([*command, "1000"]) == 0
+    out = capsys.readouterr()
+    assert '"posterior": "samples"' in out.out
+    assert "needs the non-linear posterior" not in out.err
+    assert (tmp_path / "out" / "sampled.json").exists()
+    assert "samples" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_linear_study_needs_no_samples(campaign, tmp_path, capsys):
+    write_map(campaign[2], tmp_path / "map.csv")
+    (tmp_path / "study.toml").write_text("""
+name = "linear"
+dimension = 2
+[array]
+blocks_per_ring = 16
+inner_radius_m = 0.104
+outer_radius_m = 0.1865
+remanence_T = 1.06
+block = { shape = "sector" }
+[mesh]
+block_size_m = 0.02
+[observation]
+quantity = "flux_density"
+positions = { kind = "circles", radius_m = 0.075, angles = 24 }
+[[noise.regions]]
+name = "all"
+sigma_T = 1e-4
+""")
+    code = main(["infer", str(tmp_path / "study.toml"), "--measurements",
+                 str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--samples", "10"])
+    assert code == 3
+    assert "closed form" in capsys.readouterr().err

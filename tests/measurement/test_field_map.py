@@ -1,0 +1,170 @@
+"""Maps survive their files, and files that are no maps are refused by name."""
+
+from __future__ import annotations
+
+import meshio
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from halbach_fe.core.errors import MeasurementError, OutputError
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+
+HEADER = "x_m,y_m,z_m,Bx_T,By_T,Bz_T\n"
+finite = st.floats(-9, 9, allow_nan=False)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5"])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(finite, finite, finite), min_size=1, max_size=5, unique=True),
+       st.randoms(use_true_random=False))
+def test_round_trip_is_exact(tmp_path, suffix, points, random):
+    points = np.array(points)
+    if len(np.unique(points, axis=0)) < len(points):  # 0.0 and -0.0
+        return
+    values = np.array([[random.uniform(-1, 1) for _ in range(3)] for _ in points])
+    values[0, random.randrange(3)] = np.nan
+    data = field_map(points, values, np.full_like(values, 1e-4), {"coil": "A 7", "note": "x: y"})
+    data["time_s"] = ("point", np.arange(len(points), dtype=float))
+    data["scan"] = ("point", [f"s{i}" for i in range(len(points))])
+    write_map(data, tmp_path / f"map{suffix}")
+    again = read_map(tmp_path / f"map{suffix}")
+    for name in ("B_T", "x_m", "y_m", "z_m", "sigma_T", "time_s", "scan"):
+        np.testing.assert_array_equal(again[name].values, data[name].values)
+    assert again.attrs == data.attrs
+
+
+def test_vtu_reads_back(tmp_path):
+    data = field_map(np.eye(3), np.arange(9.0).reshape(3, 3))
+    write_map(data, tmp_path / "map.vtu")
+    mesh = meshio.read(tmp_path / "map.vtu")
+    np.testing.assert_allclose(mesh.points, np.eye(3))
+    np.testing.assert_allclose(mesh.point_data["B_T"], data["B_T"].values)
+    data["B_T"].values[1, 1] = np.nan
+    data["sigma_T"] = (("point", "component"), np.full((3, 3), 1e-4))
+    write_map(data, tmp_path / "map.vtu")
+    again = read_map(tmp_path / "map.vtu")
+    for name in ("B_T", "sigma_T", "x_m", "y_m", "z_m"):
+        np.testing.assert_array_equal(again[name].values, data[name].values)
+    (tmp_path / "map.vtu").write_text("<VTKFile")
+    with pytest.raises(MeasurementError, match="VTU"):
+        read_map(tmp_path / "map.vtu")
+
+
+def test_columns_in_any_order_and_missing_components(tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text("# probe: 3D Hall\nBz_T,z_m,x_m,y_m,Bx_T,sigma_Bz_T,sigma_Bx_T\n"
+                    "0.1,3,1,2,,1e-4,\n0.2,3,1,4,0.5,1e-4,2e-4\n", encoding="utf-8")
+    data = read_map(path)
+    np.testing.assert_array_equal(points_of(data), [[1, 2, 3], [1, 4, 3]])
+    np.testing.assert_array_equal(data["B_T"].values, [[np.nan, np.nan, 0.1], [0.5, np.nan, 0.2]])
+    np.testing.assert_array_equal(data["sigma_T"].values[1], [2e-4, np.nan, 1e-4])
+    assert data.attrs["probe"] == "3D Hall"
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("", "an empty file"),
+    ("# only: comments\n", "only comments"),
+    (HEADER, "a header alone"),
+    ("x_m,y_m,Bx_T\n0,0,1\n", "complete with z_m"),
+    ("x_m,y_m,z_m\n0,0,0\n", "at least one of Bx_T"),
+    ("x_mm,y_m,z_m,Bx_T\n0,0,0,1\n", "column 'x_mm'"),
+    ("x_m,y_m,z_m,Bx_T,Bx_T\n0,0,0,1,1\n", "repeated"),
+    ("x_m,y_m,z_m,Bx_T,sigma_T,sigma_Bx_T\n0,0,0,1,1,1\n", "not both"),
+    (HEADER + "0,0,0,1,1\n", "cut short"),
+    (HEADER + "0,0,0,nan,1,1\n", "Bx_T in line 2"),
+    (HEADER + "0,0,inf,1,1,1\n", "z_m in line 2"),
+    (HEADER + "0,0,,1,1,1\n", "z_m in line 2"),
+    (HEADER + "0,0,0,one,1,1\n", "'one'"),
+    (HEADER + "0,0,0,,,\n", "at least one component"),
+    (HEADER + "0,0,0,.1,.1,.1\n0,0,1,.1,.1,.1\n0,0,0,.2,.1,.1\n", "reading 3"),
+    ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,0\n", "sigma"),
+    ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,-1\n", "sigma"),
+    (HEADER + "0,0,0,1,1," + "1" * 200_000 + "\n", "line 2"),
+])
+def test_bad_csv_is_refused_by_name(tmp_path, text, said):
+    path = tmp_path / "map.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MeasurementError) as caught:
+        read_map(path)
+    assert said in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_repeated_readings_need_a_time_or_scan(tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text("x_m,y_m,z_m,Bx_T,time_s\n0,0,0,1,1\n0,0,0,1,2\n", encoding="utf-8")
+    assert read_map(path).sizes["point"] == 2
+
+
+@pytest.mark.parametrize("damage", ["missing", "binary", "truncated", "other", "infinite"])
+def test_bad_files_are_refused(tmp_path, damage):
+    path = tmp_path / "map.h5"
+    write_map(field_map(np.eye(3), np.ones((3, 3))), path)
+    if damage == "missing":
+        path = tmp_path / "none.h5"
+    elif damage == "binary":
+        path = tmp_path / "map.csv"
+        path.write_bytes(bytes(range(256)))
+    elif damage == "truncated":
+        path.write_bytes(path.read_bytes()[:-500])
+    elif damage == "other":
+        xr.Dataset({"a": ("b", [1.0])}).to_netcdf(path, engine="h5netcdf")
+    else:
+        write_map(field_map(np.eye(3), np.full((3, 3), np.inf)), path)
+    with pytest.raises(MeasurementError, match=path.name):
+        read_map(path)
+
+
+@pytest.mark.parametrize(("name", "value", "said"), [
+    ("B_T", (("point", "component"), np.full((3, 3), "a")), "`B_T`"),
+    ("time_s", ("point", np.array(["2026-01-01"] * 3, "datetime64[s]")), "`time_s`"),
+    ("x_m", ((), 1.0), "`x_m`"),
+    ("sigma_T", (("point", "other"), np.ones((3, 2))), "`sigma_T`"),
+])
+def test_hdf5_of_another_make_is_refused(tmp_path, name, value, said):
+    data = field_map(np.eye(3), np.ones((3, 3))).drop_vars([name], errors="ignore")
+    data[name] = value
+    data.to_netcdf(tmp_path / "map.h5", engine="h5netcdf")
+    with pytest.raises(MeasurementError, match=said):
+        read_map(tmp_path / "map.h5")
+
+
+def test_hdf5_sigma_for_all_components_at_once(tmp_path):
+    data = field_map(np.eye(3), np.ones((3, 3)))
+    data["sigma_T"] = ("point", [1e-4, 2e-4, 3e-4])
+    data.to_netcdf(tmp_path / "map.h5", engine="h5netcdf")
+    assert read_map(tmp_path / "map.h5")["sigma_T"].values[:, 2].tolist() == [1e-4, 2e-4, 3e-4]
+
+
+def test_hdf5_without_readings_is_refused(tmp_path):
+    field_map(np.zeros((0, 3)), np.zeros((0, 3))).to_netcdf(tmp_path / "map.h5",
+                                                            engine="h5netcdf")
+    with pytest.raises(MeasurementError, match="at least one reading"):
+        read_map(tmp_path / "map.h5")
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "map.csv"
+    write_map(field_map(np.eye(3), np.ones((3, 3))), path)
+    before = path.read_bytes()
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("halbach_fe.measurement.tables._cell", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unknown_suffix_and_unwritable_folder(tmp_path):
+    data = field_map(np.eye(3), np.ones((3, 3)))
+    with pytest.raises(OutputError, match="suffix"):
+        write_map(data, tmp_path / "map.xls")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="Cannot write"):
+        write_map(data, tmp_path / "file" / "map.csv")

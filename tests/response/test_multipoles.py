@@ -1,0 +1,237 @@
+"""Multipoles of magnets, by other means: magpylib's field, and closed forms."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.multipoles import (
+    UNITS,
+    MultipoleReference,
+    circle_models,
+    met,
+    multipole_model,
+    multipole_models,
+)
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.magpylib_field import vacuum_field
+from tests.conftest import DIPOLE, changed
+
+ORDERS = (1, 2, 3, 4, 5, 6)
+
+
+def study_of(**changes):
+    return parse_study(changed(DIPOLE, array__recoil_permeability=1.0,
+                               array__blocks_per_ring=12, **changes))
+
+
+def fourier(field, angle, order):
+    """C_n of B (..., angles, 3) on a circle, B_y + i B_x = sum C_n e^{i (n-1) phi}."""
+    values = field[..., 1] + 1j * field[..., 0]
+    return np.mean(values * np.exp(-1j * (order - 1) * angle), axis=-1)
+
+
+def deviating(study, generator):
+    """A magnet with errors of 2 %, and its magnetizations."""
+    nominal = magnet_of(study)
+    size = study.dimension
+    bodies = tuple(body.with_magnetization(body.magnetization + np.pad(
+        0.02 * np.linalg.norm(body.magnetization) * generator.standard_normal(size),
+        (0, 3 - size))) for body in nominal.bodies)
+    return bodies, np.concatenate([body.magnetization[:size] for body in bodies])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_cross_section_is_magpylibs(session, generator, order):
+    """Both fields are exact: 1e-8 of the main multipole, what sums over angles leave."""
+    study = study_of(array__multipole_order=order, array__first_magnetization_angle_deg=70.0)
+    model = multipole_model(study, MultipoleReference(0.06, ORDERS), session)
+    bodies, magnetizations = deviating(study, generator)
+    angle = 2 * np.pi * np.arange(200) / 200
+    points = 0.06 * np.column_stack([np.cos(angle + model.turn), np.sin(angle + model.turn),
+                                     0 * angle])
+    c, s = np.cos(model.turn), np.sin(model.turn)
+    field = vacuum_field(bodies, points) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    main = abs(fourier(field, angle, order))
+    known = model.of(Gaussian(magnetizations, np.zeros((len(magnetizations), 1))))
+    assert known.main == pytest.approx(main, rel=1e-6)
+    truth = np.array([fourier(field, angle, n) for n in model.orders]) * UNITS / main
+    found = known.mean.reshape(2, -1)
+    np.testing.assert_allclose(found[0] + 1j * found[1], truth, atol=1e-3)
+    assert model.orders == tuple(n for n in ORDERS if n != order)
+    assert np.abs(truth).max() > 10
+    # the nominal main multipole is normal: C_N of these axes is real and positive
+    nominal = vacuum_field(magnet_of(study).bodies, points) @ np.array(
+        [[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    own = fourier(nominal, angle, order)
+    assert own.real == pytest.approx(abs(own), rel=1e-9)
+    roll = -np.angle(fourier(field, angle, order)) / order
+    assert known.roll == pytest.approx(roll, abs=1e-8)
+    # negative control: another reference radius
+    other = multipole_model(study, MultipoleReference(0.066, ORDERS), session).of(
+        Gaussian(magnetizations, np.zeros((len(magnetizations), 1))))
+    assert np.abs(other.mean - known.mean).max() > 1
+
+
+def test_a_short_magnet_integrated_along_z(session, generator):
+    """magpylib's field summed over z, to 20 outer radii beyond the ends in fine steps, where ours
+    ends at 4.5: the higher multipoles of blocks fall fast, 0.01 units were left out.
+    """
+    study = parse_study(changed(
+        DIPOLE, dimension=3, array__recoil_permeability=1.0, array__blocks_per_ring=8,
+        array__ring_length_m=0.08, array__rings=2))
+    model = multipole_model(study, MultipoleReference(0.05, (2, 3, 4)), session)
+    assert model.integrated
+    bodies, magnetizations = deviating(study, generator)
+    angle = 2 * np.pi * np.arange(32) / 32
+    z, weight = np.polynomial.legendre.leggauss(24)
+    edges = np.array([0, 0.05, 0.1, 0.17, 0.3, 0.6, 1.5, 4.0])
+    heights = np.concatenate([(a + b) / 2 + (b - a) / 2 * z for a, b in pairwise(edges)])
+    weights = np.concatenate([(b - a) / 2 * weight for a, b in pairwise(edges)])
+    heights, weights = np.concatenate([-heights, heights]), np.tile(weights, 2)
+    turned = angle + model.turn
+    points = np.array([[0.05 * np.cos(phi), 0.05 * np.sin(phi), height]
+                       for height in heights for phi in turned])
+    c, s = np.cos(model.turn), np.sin(model.turn)
+    field = (vacuum_field(bodies, points) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])).reshape(
+        len(heights), 32, 3)
+    truth = np.array([weights @ fourier(field, angle, n) for n in (1, 2, 3, 4)])
+    known = model.of(Gaussian(magnetizations, np.zeros((len(magnetizations), 1))))
+    assert known.main == pytest.approx(abs(truth[0]), rel=1e-4)
+    found = known.mean.reshape(2, -1)
+    relative = UNITS * truth[1:] / abs(truth[0])
+    np.testing.assert_allclose(found[0] + 1j * found[1], relative, atol=0.02)
+    assert np.abs(relative).max() > 10
+    # negative control: the circle in the middle is not the integral
+    local = multipole_model(study, MultipoleReference(0.05, (2, 3, 4), 0.0), session)
+    assert not local.integrated
+    middle = local.of(Gaussian(magnetizations, np.zeros((len(magnetizations), 1)))).mean
+    assert np.abs(middle - known.mean).max() > 1
+
+
+def test_covariances_are_those_of_samples(session, generator):
+    """Of 4000 magnets, the covariance of c_n with the main multipole that each has: 5 % of the
+    largest variance (sqrt(2/4000) = 2.2 %).
+    """
+    study = study_of()
+    model = multipole_model(study, MultipoleReference(0.06, ORDERS), session)
+    root = 0.01 * np.abs(model.nominal).max() * generator.standard_normal((24, 24)) / 5
+    drawn = Gaussian(model.nominal, root).sample(4000, generator)
+    values = model.units(model.offset + drawn @ model.matrix.T)
+    known = model.of(Gaussian(model.nominal, root))
+    scale = np.diag(known.covariance).max()
+    np.testing.assert_allclose(np.cov(values.T), known.covariance, atol=0.05 * scale)
+    # a common factor moves the main multipole and nothing else; relative to a fixed one it would
+    common = model.of(Gaussian(drawn[0], 0.1 * drawn[0][:, None]))
+    assert np.sqrt(np.diag(common.covariance)).max() < 1e-9 * UNITS
+    assert common.main_sd == pytest.approx(0.1 * common.main, rel=1e-9)
+    fixed = model.scaled(model.nominal_main) @ (0.1 * drawn[0])
+    assert np.abs(fixed).max() > 1
+    sizes = known.sizes_of(generator.standard_normal((4000, 2 * len(known.orders))))
+    mine, real = np.mean(sizes**2, axis=0), np.mean(
+        np.sum(values.reshape(-1, 2, len(known.orders))**2, axis=1), axis=0)
+    np.testing.assert_allclose(mine, real, rtol=0.15)
+    assert met(sizes, float(sizes.max())) == 1.0
+    assert met(sizes, 0.0) == 0.0
+
+
+def test_the_radius_is_that_of_the_studys_circle(session):
+    assert multipole_model(study_of(), MultipoleReference(), session).radius == 0.075
+    line = study_of(observation__positions={
+        "kind": "line", "start_m": [0, 0, 0], "end_m": [0.05, 0, 0], "count": 3})
+    assert multipole_model(line, MultipoleReference(),
+                           session).radius == pytest.approx(0.104 * 2 / 3)
+
+
+def test_what_the_mapper_does_is_no_multipole(session):
+    """The reference circle is no measurement: a probe's gain does not come into it."""
+    study = study_of(instrument={"gain": [0.1, 0.0, 0.0], "offset_T": [0.01, 0, 0]})
+    one, other = (multipole_model(some, MultipoleReference(0.06, ORDERS), session)
+                  for some in (study, study_of()))
+    np.testing.assert_array_equal(one.matrix, other.matrix)
+
+
+def test_permeability_and_its_error(session):
+    """A symmetric dipole has no unwanted multipoles; the error bar allows for those of the mesh."""
+    study = parse_study(DIPOLE)
+    model = multipole_model(study, MultipoleReference(0.06, (3, 5)), session)
+    assert model.error.max() > 0
+    known = model.of(Gaussian(model.nominal, np.zeros((32, 1))))
+    assert np.abs(known.mean).max() < 3 * known.sd.max()
+    assert known.sd.max() < 1
+
+
+RINGS = {"dimension": 3, "array__ring_length_m": 0.08, "array__rings": 2}
+CIRCLES = {"kind": "circles", "radius_m": 0.06, "angles": 40, "z_min_m": -0.05, "z_max_m": 0.1,
+           "count": 4}
+
+
+def circles_of(study, session, measured=None):
+    points = points_from(study.observation.positions)
+    observation = observe(study, points, np.ones_like(points, bool) if measured is None
+                          else measured)
+    return circle_models(study, observation, response_matrix(study, observation, session))
+
+
+@pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
+def test_circles_that_are_read(session, generator, quantity):
+    """Without permeability both fields are exact; each circle is in units of the one at z = 0."""
+    observed = {"quantity": quantity, "positions": CIRCLES}
+    if quantity == "fourier_coefficients":
+        observed["harmonics"] = 6
+    study = study_of(**RINGS, observation=observed)
+    models = circles_of(study, session)
+    assert [model.z for model in models] == pytest.approx([-0.05, 0, 0.05, 0.1])
+    bodies, magnetizations = deviating(study, generator)
+    angle = 2 * np.pi * np.arange(40) / 40
+    exact = Gaussian(magnetizations, np.zeros((len(magnetizations), 1)))
+
+    def analysed(field, order):  # B_r, as a study's coefficients are
+        radial = field[:, 0] * np.cos(angle) + field[:, 1] * np.sin(angle)
+        return 2 * np.mean(radial * (np.sin(order * angle) + 1j * np.cos(order * angle)))
+
+    turn = -models[0].turn
+    fields = [vacuum_field(bodies, np.column_stack(
+        [0.06 * np.cos(angle), 0.06 * np.sin(angle), 0 * angle + model.z])) for model in models]
+    main = abs(analysed(fields[1], 1))
+    for model, field in zip(models, fields, strict=True):
+        truth = np.array([analysed(field, n) * np.exp(-1j * turn * n) for n in model.orders])
+        known = model.of(exact)
+        assert known.main == pytest.approx(main, rel=1e-8)
+        b, a = known.mean.reshape(2, -1)
+        np.testing.assert_allclose(b + 1j * a, UNITS * truth / main, atol=1e-4)
+    assert models[3].of(exact).mean[0] < 0.8 * UNITS  # the ends are weaker
+
+
+def test_circles_that_are_none(session):
+    """Nothing is said of a line, of half a circle, of one component, or through a probe's gain."""
+    study = study_of()
+    count = len(points_from(study.observation.positions))
+    assert circles_of(study, session)
+    measured = np.ones((count, 3), bool)
+    measured[::3] = False
+    assert circles_of(study, session, measured) == []
+    for changes in ({"observation__components": ["x"]}, {"instrument": {"gain": [0.1, 0, 0]}},
+                    {"observation__positions": {"kind": "line", "start_m": [0, 0, 0],
+                                                "end_m": [0.05, 0, 0], "count": 3}}):
+        assert circles_of(study_of(**changes), session) == []
+
+
+def test_references_solved_together(session):
+    """Are the same as one by one."""
+    study = study_of(**RINGS)
+    wanted = MultipoleReference(0.05, (2, 3)), MultipoleReference(0.05, (2, 4), 0.02)
+    together = multipole_models(study, wanted, session)
+    for one, reference in zip(together, wanted, strict=True):
+        alone = multipole_model(study, reference, session)
+        np.testing.assert_allclose(one.matrix, alone.matrix, rtol=1e-12, atol=1e-20)
+        assert (one.orders, one.z, one.integrated) == (alone.orders, alone.z, alone.integrated)
+    assert together[0].integrated
+    assert not together[1].integrated

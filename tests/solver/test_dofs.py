@@ -1,0 +1,232 @@
+"""Dumped solutions: read back, evaluated as GetDP evaluates them, and refused when damaged."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from halbach_fe.core.errors import GetDPError, PointsOutsideError
+from halbach_fe.solver import magnetostatics
+from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
+from halbach_fe.solver.field import finite_element_part
+from halbach_fe.solver.interpolation import coordinates, locate, probes_of, shape_functions
+from halbach_fe.solver.mesh import build_meridian, build_mesh, verify_mesh
+from tests.conftest import circle
+
+
+def vectors(rows):
+    """PETSc's binary format."""
+    return b"".join(np.array([1211214, len(row)], ">i4").tobytes()
+                    + np.array(row, ">f8").tobytes() for row in rows)
+
+
+def test_solutions_come_back(tmp_path):
+    path = tmp_path / "x.bin"
+    path.write_bytes(vectors([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    assert read_solutions(path, 3, 2).tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (vectors([[1.0, 2.0, 3.0]]), "in place of 2 solutions"),
+    (vectors([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])[:-1], "in place of 2 solutions"),
+    (vectors([[1.0, 2.0, 3.0], [4.0, np.nan, 6.0]]), "not finite"),
+    (vectors([[1.0, 2.0, 3.0], [4.0, np.inf, 6.0]]), "not finite"),
+    (vectors([[1.0, 2.0, 3.0, 0.0], [4.0, 5.0]]), "does not hold 2 PETSc vectors"),
+    (b"", "cannot be read"), (None, "cannot be read")])
+def test_damaged_solutions_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.bin"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(GetDPError, match=said):
+        read_solutions(path, 3, 2)
+
+
+def matrix(rows, unknowns=3, identifier=1211216, lengths=None):
+    """PETSc's binary format of sparse rows, {column: value} each."""
+    lengths = lengths or [len(row) for row in rows]
+    columns = [column for row in rows for column in row]
+    values = [value for row in rows for value in row.values()]
+    return (np.array([identifier, unknowns, unknowns, len(values), *lengths, *columns], ">i4")
+            .tobytes() + np.array(values, ">f8").tobytes())
+
+
+ROWS = [{0: 1.0, 2: 2.0}, {}, {1: -3.5}]
+
+
+def test_a_matrix_comes_back(tmp_path):
+    path = tmp_path / "x.bin"
+    path.write_bytes(matrix(ROWS))
+    assert read_matrix(path, 3).toarray().tolist() == [[1, 0, 2], [0, 0, 0], [0, -3.5, 0]]
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (matrix(ROWS, unknowns=4), "another header"), (matrix(ROWS, identifier=1211214), "another"),
+    (vectors([[1.0, 2.0, 3.0]]), "another header"), (matrix(ROWS) + b"\0", "truncated"),
+    (matrix([{0: 1.0, 2: np.nan}, {}, {1: 1.0}]), "not finite"),
+    (matrix([{0: 1.0, 2: np.inf}, {}, {1: 1.0}]), "not finite"),
+    (matrix([{0: 1.0, 3: 2.0}, {}, {1: 1.0}]), "outside the matrix"),
+    (matrix([{0: 1.0, -1: 2.0}, {}, {1: 1.0}]), "outside the matrix"),
+    (matrix(ROWS, lengths=[4, -1, 0]), "outside the matrix"),
+    (None, "cannot be read")])
+def test_damaged_matrices_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.bin"
+    if content is not None:
+        assert content != matrix(ROWS)
+        path.write_bytes(content)
+    with pytest.raises(GetDPError, match=said):
+        read_matrix(path, 3)
+
+
+def test_every_truncation_of_a_matrix_is_refused(tmp_path):
+    path = tmp_path / "x.bin"
+    for cut in range(len(matrix(ROWS))):
+        path.write_bytes(matrix(ROWS)[:cut])
+        with pytest.raises(GetDPError, match="cannot be read"):
+            read_matrix(path, 3)
+
+
+def saved(rows):
+    """GetDP's .res file."""
+    return "$ResFormat /* GetDP 3.2.0, ascii */\n1.1 0\n$EndResFormat\n" + "".join(
+        f"$Solution  /* DofData #0 */\n0 0 0 {number}\n"
+        + "".join(f"{value!r}\n" for value in row) + "$EndSolution\n"
+        for number, row in enumerate(rows))
+
+
+SOLUTIONS = [[1.0, 2.0, 3e-17], [4.0, -5.0, 6.0]]
+
+
+def test_saved_solutions_come_back(tmp_path):
+    path = tmp_path / "x.res"
+    path.write_text(saved(SOLUTIONS))
+    assert read_saved(path, 3, 2).tolist() == SOLUTIONS
+
+
+def test_getdps_own_file_is_like_that(dipole, session, monkeypatch):
+    """What is made by hand here has the format of the real one."""
+    study = dipole(mesh__block_size_m=0.06, mesh__growth=3.0, iron_ring={
+        "inner_radius_m": 0.2, "outer_radius_m": 0.24,
+        "curve": {"kind": "steel", "name": "aisi_1010"}})
+    seen = []
+
+    def keep(path, unknowns, count):
+        seen.append((path.read_text(), unknowns, read_saved(path, unknowns, count)))
+        return seen[-1][2]
+
+    monkeypatch.setattr(magnetostatics, "read_saved", keep)
+    finite_element_part(study, circle(0.05, 5), session, columns=False)
+    for text, unknowns, solutions in seen:
+        real, ours = text.splitlines(), saved(solutions.tolist()).splitlines()
+        assert len(real) == len(ours)
+        assert real[3].split() == ours[3].split()
+        assert [float(line) for line in real[5:-1]] == [float(line) for line in ours[5:-1]]
+        assert len(ours) == unknowns + 6
+    assert seen
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (saved(SOLUTIONS[:1]), r"\(1, 3\) in place of 2 of 3"),
+    (saved([[1.0, 2.0], [4.0, 5.0]]), r"\(2, 2\) in place"),
+    (saved([[1.0, 2.0, 3.0], [4.0, 5.0]]), "cannot be read"), ("", "in place of 2"),
+    (saved([[1.0, 2.0, 3.0], [4.0, np.nan, 6.0]]).replace("np.", ""), "not finite"),
+    (saved([[1.0, 2.0, 3.0], [4.0, np.inf, 6.0]]), "not finite"),
+    (saved(SOLUTIONS).replace("4.0", "four"), "cannot be read"),
+    (saved(SOLUTIONS).replace("$Sol", "$Dof"), "in place of 2"), ("\xb5", "cannot be read"),
+    (None, "cannot be read")])
+def test_damaged_saved_solutions_are_refused(tmp_path, content, said):
+    path = tmp_path / "x.res"
+    if content is not None:
+        path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(GetDPError, match=said):
+        read_saved(path, 3, 2)
+
+
+def test_every_truncation_of_saved_solutions_is_refused_or_complete(tmp_path):
+    """What ends behind the last line of numbers has them all."""
+    path, text = tmp_path / "x.res", saved(SOLUTIONS)
+    complete = text.rindex("6.0\n") + len("6.0\n")
+    for cut in range(len(text)):
+        path.write_text(text[:cut])
+        if cut < complete:
+            with pytest.raises(GetDPError):
+                read_saved(path, 3, 2)
+        else:
+            assert read_saved(path, 3, 2).tolist() == SOLUTIONS
+
+
+@pytest.mark.parametrize("content", [None, "", "$DofData /* #0 */\n0 0\n", "nonsense\n" * 9])
+def test_damaged_lists_of_unknowns_are_refused(tmp_path, content):
+    path = tmp_path / "x.pre"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(GetDPError, match="list of unknowns"):
+        read_unknowns(path, "tetra10")
+
+
+@pytest.mark.parametrize(("route", "order", "part", "corners_only"), [
+    *(("azimuthal_modes", 1, part, False) for part in range(3)),
+    ("scalar_potential", 1, 0, False), ("scalar_potential", 1, 0, True),
+    ("edge_elements", 1, 0, False), *(("edge_elements", 2, part, False) for part in range(3))])
+def test_other_numbering_is_noticed(
+    short_dipole, session, monkeypatch, route, order, part, corners_only
+):
+    """Negative control of the comparison with GetDP's own print: unknowns in another order."""
+    study = short_dipole(solver={"route": route, "edge_order": order},
+                         mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
+    points = circle(0.05, 5, 0.013)
+    finite_element_part(study, points, session, columns=False)
+    mesh = None if route == "azimuthal_modes" else verify_mesh(
+        build_mesh(study, session.folder / "again"))
+
+    def shifted(path, cell_type):
+        unknowns = read_unknowns(path, cell_type)
+        some = unknowns.functions[part].copy()
+        if corners_only:
+            corners = np.unique(mesh.cells[:, :4]) + 1
+            some[corners] = np.roll(some[corners], 7)
+        else:
+            some = np.roll(some, 7)
+        return dataclasses.replace(unknowns, functions=(
+            *unknowns.functions[:part], some, *unknowns.functions[part + 1:]))
+
+    monkeypatch.setattr(magnetostatics, "read_unknowns", shifted)
+    monkeypatch.setattr("halbach_fe.solver.azimuthal_modes.read_unknowns", shifted)
+    with pytest.raises(GetDPError, match="numbered in another way"):
+        finite_element_part(study, points, session, columns=False)
+
+
+@given(st.sampled_from([("triangle6", 2), ("tetra10", 3), ("quad", 2)]), st.integers(0, 10**6))
+def test_shape_functions(kind, seed):
+    """They add up to one, and their derivatives are those of differences."""
+    name, dimension = kind
+    at = np.random.default_rng(seed).uniform(0, 0.3, (1, dimension))
+    values, slopes = shape_functions(name, at)
+    assert values.sum() == pytest.approx(1)
+    for axis in range(dimension):
+        step = 1e-6 * np.eye(dimension)[axis]
+        difference = (shape_functions(name, at + step)[0] - shape_functions(name, at - step)[0])
+        np.testing.assert_allclose(slopes[..., axis], difference / 2e-6, atol=1e-8)
+
+
+def test_points_are_found_where_they_are(short_dipole, dipole, tmp_path, generator):
+    points = np.vstack([circle(0.05, 9, 0.02), circle(0.104 * (1 - 1e-9), 9, 0.0),
+                        generator.uniform(-0.07, 0.07, (200, 3))])
+    r_z = np.column_stack([np.hypot(*points[:, :2].T), points[:, 2], np.zeros(len(points))])
+    for mesh, where in (
+            (verify_mesh(build_mesh(short_dipole(), tmp_path / "3d")), points),
+            (verify_mesh(build_mesh(dipole(), tmp_path / "2d")), points * [1, 1, 0]),
+            (verify_mesh(build_meridian(short_dipole(), tmp_path / "rz")), r_z)):
+        located = locate(mesh, where)
+        np.testing.assert_allclose(coordinates(mesh, located),
+                                   where[:, :mesh.points.shape[1]], atol=1e-9)
+        assert mesh.in_air[located.cells].all()
+        probes, places = probes_of(mesh, located)
+        np.testing.assert_allclose(coordinates(mesh, probes), places[:, :mesh.points.shape[1]])
+        with pytest.raises(PointsOutsideError):
+            locate(mesh, np.array([[100.0, 0, 0]]))
+        with pytest.raises(PointsOutsideError):  # in a block
+            locate(mesh, np.array([[0.15, 0.0, 0.0]]))

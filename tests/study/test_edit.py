@@ -1,0 +1,169 @@
+"""Studies changed in the user's own file: it reads back to the same study, and keeps the rest."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from halbach_fe.core.errors import StudyError
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.study import edit
+from halbach_fe.study.edit import LOST, edited_text
+from halbach_fe.study.magnet import IronRing, SteelCurve
+from halbach_fe.study.reader import parse_study, read_study
+from tests.conftest import ROOT
+
+EFFECTS = {effect.name: effect for effect in catalogue()}
+PLAIN = (ROOT / "studies" / "faser" / "study.toml").read_text()
+
+BARE = """name = "bare"
+[mesh]
+block_size_m = 0.03
+[observation]
+quantity = "flux_density"
+positions = { kind = "circles", radius_m = 0.05, angles = 8 }
+"""
+RINGS = """rings = 3  # as ordered
+blocks_per_ring = 8
+inner_radius_m = 0.1
+outer_radius_m = 0.18
+ring_length_m = 0.08
+remanence_T = 1.0
+"""
+KEYS = [line.partition(" #")[0] for line in RINGS.splitlines()]
+LAYOUTS = {
+    "faser": PLAIN,
+    "quadrupole": (ROOT / "studies" / "quadrupole" / "study.toml").read_text(),
+    "cubes": (ROOT / "studies" / "mri" / "study.toml").read_text(),
+    "iron": (ROOT / "studies" / "faser" / "iron.toml").read_text(),
+    "tables last": BARE + f'[array]\n{RINGS}[array.block]\nshape = "sector"',
+    "exceptions": BARE + f'[array]\n{RINGS}[array.block]\nshape = "sector"\n'
+    "[[array.exceptions]]  # mine\nring = 2\nmagnetization_factor = 0.9  # weak\n",
+    "in line": BARE.replace("[mesh]", "array = {" + ", ".join(KEYS) + ', block = {shape = '
+                            '"trapezoid"}}  # all of it\ninstrument = {gain = [0.001, 0, 0]}\n'
+                            "[mesh]"),
+    "dotted": BARE.replace("[mesh]", "\n".join(f"array.{key}" for key in KEYS) + '\narray.block.'
+                           'shape = "sector"\narray.exceptions = [\n  {ring = 2},  # mine\n]\n'
+                           "instrument.crosstalk.zx = 1e-3\nexternal.background_T = [0, 0, 1e-4]\n"
+                           "[mesh]"),
+    "out of order": '[array]\n' + RINGS + "[instrument.crosstalk]\nzx = 1e-3\n[external]\n"
+    '[array.block]\nshape = "sector"\n[instrument]\ngain = [0.001, 0, 0]\n',
+    "in pieces": f'[array]\n{RINGS}block.shape = "sector"\n[[array.exceptions]]\nring = 2\n'
+    "[external]\n[[array.exceptions]]\nring = 3\n"}
+for name in ("out of order", "in pieces"):
+    LAYOUTS[name] = BARE.replace("[mesh]", LAYOUTS[name] + "[mesh]")
+
+
+def with_effects(study, names, generator):
+    """Studies on the way to one with effects of random sizes at random places, and notes."""
+    found = []
+    for name in names:
+        effect = EFFECTS[name]
+        places = effect.places(study)
+        if not places:
+            continue
+        place = places[generator.integers(len(places))]
+        values = [1.0] if effect.certain else [
+            parameter.sd * float(generator.standard_normal()) for parameter in effect.parameters]
+        try:
+            now = effect.apply(study, place, values)
+            parse_study(now.model_dump())
+        except (StudyError, ValidationError):  # a gap or a loss below 0
+            continue
+        study = now
+        found.append((study, f"{name} {place.name}: {values[0]:.3g}"))
+    return found
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@settings(max_examples=12, deadline=None, derandomize=True,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(names=st.lists(st.sampled_from(sorted(EFFECTS)), max_size=6, unique=True),
+       seed=st.integers(0, 1000))
+def test_files_read_back_to_the_study(layout, names, seed):
+    text = LAYOUTS[layout]
+    study = parse_study(tomllib.loads(text))
+    steps = with_effects(study, names, np.random.default_rng(seed))
+    changed = edited_text(text, steps)
+    assert parse_study(tomllib.loads(changed)) == ([study] + [one for one, _ in steps])[-1]
+    for before, (after, note) in zip([study, *(one for one, _ in steps)], steps, strict=False):
+        assert before == after or note in changed
+    if layout not in ("in pieces", "out of order", "dotted"):  # tables in several pieces
+        assert LOST not in changed
+        for line in text.splitlines():
+            assert line.partition("#")[2].strip() in changed
+
+
+def test_nothing_to_change_is_the_file_itself():
+    study = parse_study(tomllib.loads(PLAIN))
+    assert edited_text(PLAIN, [(study, "not needed")]) == PLAIN
+
+
+def test_order_and_comments_stay():
+    study = parse_study(tomllib.loads(PLAIN))
+    (background,) = with_effects(study, ["background"], np.random.default_rng(1))
+    gap = EFFECTS["ring_gap"]
+    wide = gap.apply(background[0], gap.places(study)[2], [1e-4])
+    longer = EFFECTS["length"].apply(wide, EFFECTS["length"].places(study)[0], [1e-3])
+    changed = edited_text(PLAIN, [background, (wide, "the gap"), (longer, "the length")])
+    lines = changed.splitlines()
+    kept = [line for line in PLAIN.splitlines()
+            if not line.startswith(("ring_length_m", "block_moment_A_m2"))]
+    rest = iter(lines)
+    assert all(line in rest for line in kept)  # in the same order
+    (length,) = [line for line in lines if line.startswith("ring_length_m")]
+    assert length.endswith("# inferred: 1.0 m / 12; the length")
+    (moment,) = [line for line in lines if "block_moment_A_m2" in line]
+    assert moment.startswith("# block_moment_A_m2 = 330.0  # the paper;")
+    assert lines.count("[[array.exceptions]]  # the gap") == 3
+    (field,) = [line for line in lines if line.startswith("background_T")]
+    assert field.endswith(background[1])
+    assert "\n\n\n" not in changed
+
+
+def test_an_iron_table_comes_along(tmp_path):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "steel.csv").write_text(
+        "H_A_per_m,B_T\n100,0.1\n160,0.25\n382,1.0\n758,1.3\n1837,1.5\n")
+    text = LAYOUTS["tables last"] + (
+        "\n[iron_ring]\ninner_radius_m = 0.2\nouter_radius_m = 0.22\n[iron_ring.curve]\n"
+        'kind = "table"\nfile = "steel.csv"  # of the supplier\n')
+    (tmp_path / "here" / "study.toml").write_text(text)
+    study = read_study(tmp_path / "here" / "study.toml")
+    changed = edited_text(text, [(study, "so that it needs no other file")])
+    (tmp_path / "there.toml").write_text(changed)
+    assert read_study(tmp_path / "there.toml") == study
+    assert '# file = "steel.csv"  # of the supplier' in changed
+
+
+def test_iron_in_place_of_none():
+    study = parse_study(tomllib.loads(PLAIN))
+    iron = IronRing(inner_radius_m=0.19, outer_radius_m=0.2,
+                    curve=SteelCurve(kind="steel", name="aisi_1010"))
+    changed = edited_text(PLAIN, [(study.model_copy(update={"iron_ring": iron}), "a ring")])
+    assert changed.startswith(PLAIN.rstrip("\n"))
+    assert "[iron_ring]  # a ring\n" in changed
+
+
+def test_a_file_that_cannot_be_changed_is_written_anew(monkeypatch):
+    """Negative control: if setting keys did nothing, that would show."""
+    study = parse_study(tomllib.loads(PLAIN))
+    (step,) = with_effects(study, ["gain_x"], np.random.default_rng(1))
+    assert LOST not in edited_text(PLAIN, [step])
+    monkeypatch.setattr(edit, "_set", lambda *_: None)
+    changed = edited_text(PLAIN, [step])
+    assert changed.startswith(f"# {LOST}\n# {step[1]}\n")
+    assert parse_study(tomllib.loads(changed)) == step[0]
+
+
+def test_impossible_studies_are_refused():
+    study = parse_study(tomllib.loads(PLAIN))
+    gap = EFFECTS["azimuthal_gap"]
+    narrow = gap.apply(study, gap.places(study)[0], [-1e-3])
+    with pytest.raises(StudyError, match=r"angular_gap_deg.*greater than or equal to 0"):
+        edited_text(PLAIN, [(narrow, "")])

@@ -1,0 +1,310 @@
+"""The study file: what is accepted, and the sentence for what is not."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from halbach_fe.core.errors import HalbachError, StudyError
+from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import curve_of
+from halbach_fe.study.reader import parse_study, read_study
+from tests.conftest import DIPOLE, ROOT, changed
+
+STUDIES = sorted((ROOT / "studies").rglob("*.toml"))
+H_B = {"H_A_per_m": [100.0, 160.0, 382.0, 758.0, 1837.0], "B_T": [0.1, 0.25, 1.0, 1.3, 1.5]}
+
+
+def iron(**curve):
+    """An iron ring with an H(B) curve."""
+    return {"inner_radius_m": 0.2, "outer_radius_m": 0.24, "curve": curve}
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.parent.name)
+def test_shipped_studies_are_valid(path):
+    study = read_study(path)
+    assert len(blocks_of(study)) == study.array.rings * study.array.blocks_per_ring
+
+
+def test_studies_are_frozen(dipole):
+    with pytest.raises(ValueError, match="frozen"):
+        dipole().array.rings = 3
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"array__inner_radius": 0.1}, "Did you mean `inner_radius_m`?"),
+    ({"arry": {}}, "Did you mean `array`?"),
+    ({"array__block": {"shape": "sector", "angular_gap": 1}}, "Did you mean `angular_gap_deg`?"),
+    ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
+    ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
+    ({"array__inner_radius_m": 0.2}, "must be larger than inner_radius_m"),
+    ({"array__inner_radius_m": math.nan}, "`array.inner_radius_m`"),
+    ({"array__block": {"shape": "hexagon"}}, "`array.block`"),
+    ({"array__blocks_per_ring": 16.5}, "`array.blocks_per_ring`"),
+    ({"array__block_moment_A_m2": 330}, "exactly one of remanence_T and block_moment_A_m2"),
+    ({"dimension": 3}, "ring_length_m"),
+    ({"array__rings": 2}, "array.rings must be 1"),
+    ({"mesh": {}}, "`mesh.block_size_m`"),
+    ({"name": "../../etc"}, "`name`"),
+    ({"observation__positions": {"kind": "circles", "radius_m": 0.07, "angles": 8, "count": 3}},
+     "make no sense"),
+    ({"observation__positions": {"kind": "circles", "radius_m": [0.07, 50], "angles": 8}},
+     "Was it meant in millimetres? Then write 0.05."),
+    ({"observation__positions": {"kind": "circles", "radius_m": [0.07, 0.07], "angles": 8}},
+     "name each radius once"),
+    ({"observation__positions": {"kind": "circles", "radius_m": [], "angles": 8}},
+     "`observation.positions.radius_m`"),
+    ({"observation__positions": {"kind": "grid", "start_m": [0, 0, 0], "end_m": [0, 0, 0.1],
+                                 "count": [1, 2, 5]}}, "2 points from y = 0.0 to 0.0 make no"),
+    ({"observation__positions": {"kind": "grid", "start_m": [0, 0, 0.1], "end_m": [0, 0, 0],
+                                 "count": [1, 1, 5]}}, "5 points from z = 0.1 to 0.0 make no"),
+    ({"observation__positions": {"kind": "grid", "start_m": [0, 0, 0], "end_m": [1, 1, 1],
+                                 "count": [200, 200, 200]}}, "may have 1000000 points"),
+    ({"observation__positions": {"kind": "grid", "start_m": [0, 0, 0], "end_m": [0, 0, 100],
+                                 "count": [1, 1, 0]}}, "`observation.positions.count[2]`"),
+    ({"observation": {"quantity": "fourier_coefficients", "harmonics": 8, "positions": {
+        "kind": "circles", "radius_m": 0.07, "angles": 16}}}, "more than 16 angles"),
+    ({"iron_ring": {"inner_radius_m": 0.3, "outer_radius_m": 0.2, "relative_permeability": 100}},
+     "`iron_ring`"),
+    ({"noise": {"regions": [{"name": "a", "z_min_m": -430, "z_max_m": 420, "sigma_T": 1e-4}]}},
+     "Was it meant in millimetres?"),
+    ({"noise": {"regions": [{"name": "a", "z_min_m": 0.4, "z_max_m": 0.1, "sigma_T": 1e-4}]}},
+     "must be below z_max_m"),
+    ({"mesh__block_size_m": 8.0}, "is it in millimetres?"),
+    ({"instrument": {"field_axes": ["x", "-x", "z"]}}, "field_axes must name x, y and z once each"),
+    ({"instrument": {"position_axes": ["x", "y"]}}, "`instrument.position_axes"),
+    ({"instrument": {"length_unit_m": 0.0}}, "`instrument.length_unit_m`"),
+    ({"inference": {"excluded_readings": [0]}}, "`inference.excluded_readings[0].row`"),
+    ({"inference": {"excluded_readings": [{"row": 3, "components": ["w"]}]}},
+     "`inference.excluded_readings[0].components[0]`"),
+    ({"prior": {"types": {"a": [1, 2]}}}, "prior.types must name every slot from 1 to 16 once"),
+    ({"prior": {"types": {"a": list(range(1, 17)), "b": [3]}}}, "every slot from 1 to 16 once"),
+    ({"prior": {"temperature_coefficient_per_K": -1e-3}}, "together, or neither"),
+    ({"prior": {"temperature_coefficient_per_K": -0.1, "reference_temperature_C": 20}},
+     "`prior.temperature_coefficient_per_K`"),
+    ({"prior": {"mounting_sd_deg": -1}}, "`prior.mounting_sd_deg`"),
+    ({"noise": {"regions": [{"name": "all", "sigma_T": -1e-4}]}}, "`noise.regions[0].sigma_T`"),
+    ({"noise": {"regions": [{"name": "all", "components": ["w"], "sigma_T": 1e-4}]}},
+     "`noise.regions[0].components[0]`"),
+    ({"noise": {"regions": [{"name": "all", "components": [], "sigma_T": 1e-4}]}},
+     "`noise.regions[0].components`"),
+    ({"noise": {}}, "give regions, position_sd_m, or both"),
+    ({"noise": {"position_sd_m": -1e-4}}, "`noise.position_sd_m[0]`"),
+    ({"noise": {"position_sd_m": 0.1}}, "less than or equal to 0.01"),
+    ({"noise": {"position_sd_m": [1e-4, 1e-4]}}, "one value or three, for x, y and z, not 2"),
+    ({"noise": {"position_sd_m": "much"}}, "`noise.position_sd_m[0]`"),
+    ({"observation": {"quantity": "fourier_coefficients", "harmonics": 4, "positions": {
+        "kind": "circles", "radius_m": 0.07, "angles": 16}},
+      "noise": {"regions": [{"name": "all", "components": ["x"], "sigma_T": 1e-4}]}},
+     "noise.regions may name components of flux_density only"),
+    ({"observation": {"quantity": "fourier_coefficients", "harmonics": 4, "positions": {
+        "kind": "circles", "radius_m": 0.07, "angles": 16}},
+      "inference": {"held_out": {"components": ["x"]}}},
+     "inference.held_out may name components of flux_density only"),
+    ({"inference": {"held_out": {"radii_m": [0.05], "window": 3}}}, "window needs every"),
+    ({"inference": {"held_out": {"z_ranges_m": [[0.1, -0.1]]}}}, "a lower and an upper limit"),
+    ({"inference": {"held_out": {"radii_m": [-0.05]}}}, "`inference.held_out.radii_m[0]`"),
+    ({"inference": {"held_out": {"components": ["r"]}}}, "`inference.held_out.components[0]`"),
+    ({"inference": {"held_out": {"every": 1}}}, "`inference.held_out.every`"),
+    ({"iron_ring": {"inner_radius_m": 0.2, "outer_radius_m": 0.24}},
+     "exactly one of relative_permeability and curve"),
+    ({"iron_ring": iron(kind="table", **H_B) | {"relative_permeability": 100}},
+     "exactly one of relative_permeability and curve"),
+    ({"iron_ring": iron(kind="steel", name="1010")},
+     "there are aisi_1008, aisi_1010, pure_iron_rfe80, vacoflux_50."),
+    ({"iron_ring": iron(kind="steel", nme="aisi_1010")}, "Did you mean `name`?"),
+    ({"iron_ring": iron(kind="table")}, "give a file, or H_A_per_m and B_T."),
+    ({"iron_ring": iron(kind="table", file="x.csv", **H_B)}, "not both"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=H_B["H_A_per_m"], B_T=H_B["B_T"][:-1])},
+     "`iron_ring.curve` of study file x.toml must be consistent: H and B must be lists of equal"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=["a"], B_T=[1])}, "`iron_ring.curve.H_A_per_m[0]`"),
+    ({"iron_ring": iron(kind="table", H_A_per_m=H_B["B_T"], B_T=H_B["H_A_per_m"])},
+     "`iron_ring.curve` of study file x.toml must be consistent: H and B look exchanged"),
+    ({"iron_ring": iron(kind="brauer", k1_m_per_H=1e6, k2_per_T2=1, k3_m_per_H=0)},
+     "k1 + k3 must be a reluctivity"),
+    ({"iron_ring": iron(kind="froehlich_kennelly", initial_relative_permeability=1000,
+                        saturation_polarization_T=2100)}, "Was it meant in millitesla?"),
+    ({"iron_ring": iron(kind="froehlich_kennelly", initial_relative_permeability=1e6,
+                        saturation_polarization_T=0.01)}, "must rise between the points"),
+])
+def test_bad_values_are_refused_by_name(changes, said):
+    with pytest.raises(StudyError) as caught:
+        parse_study(changed(DIPOLE, **changes), "study file x.toml")
+    sentence = str(caught.value)
+    assert said in sentence
+    assert sentence.startswith("Input `")
+    assert "of study file x.toml must be" in sentence
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (b"", "an empty file"),
+    (b"  \n\n", "an empty file"),
+    (b"[array\nrings = 1", "must be complete TOML"),
+    (b"name = \"x\xff\"", "must be UTF-8"),
+])
+def test_unreadable_files_are_refused(tmp_path, content, said):
+    path = tmp_path / "study.toml"
+    path.write_bytes(content)
+    with pytest.raises(StudyError, match=said):
+        read_study(path)
+
+
+STUDY_WITH_TABLE = """
+name = "iron"
+dimension = 2
+mesh.block_size_m = 0.02
+[array]
+blocks_per_ring = 8
+inner_radius_m = 0.05
+outer_radius_m = 0.09
+remanence_T = 1.0
+block.shape = "sector"
+[iron_ring]
+inner_radius_m = 0.1
+outer_radius_m = 0.12
+curve = { kind = "table", file = "steels/mine.csv" }
+[observation]
+quantity = "flux_density"
+positions = { kind = "circles", radius_m = 0.03, angles = 10 }
+"""
+
+
+@pytest.fixture
+def with_table(tmp_path, monkeypatch):
+    """A study with its H(B) file in a folder beside it, read from elsewhere; and that file."""
+    folder = tmp_path / "study"
+    (folder / "steels").mkdir(parents=True)
+    (folder / "study.toml").write_text(STUDY_WITH_TABLE)
+    table = folder / "steels" / "mine.csv"
+    table.write_text("# made up\nH_A_per_m,B_T\n" + "".join(
+        f"{h},{b}\n" for h, b in zip(H_B["H_A_per_m"], H_B["B_T"], strict=True)))
+    monkeypatch.chdir(tmp_path)
+    return folder / "study.toml", table
+
+
+def test_a_table_is_found_beside_its_study_and_kept_as_numbers(with_table, dipole):
+    """What is downstream depends on what the file holds, not on what it is called."""
+    path, table = with_table
+    study = read_study(path)
+    curve = study.iron_ring.curve
+    assert (curve.file, list(curve.H_A_per_m), list(curve.B_T)) == (None, *H_B.values())
+    inline = dipole(iron_ring=iron(kind="table", **H_B)).iron_ring.curve
+    assert curve == inline
+    table.rename(table.with_name("other.csv"))
+    path.write_text(STUDY_WITH_TABLE.replace("mine.csv", "other.csv"))
+    assert read_study(path) == study
+    other = table.with_name("other.csv")
+    other.write_text(other.read_text().replace("100.0,", "101.0,"))
+    assert read_study(path) != study
+
+
+def test_every_kind_of_curve_is_a_curve(dipole):
+    for kind in ({"kind": "table", **H_B}, {"kind": "steel", "name": "aisi_1008"},
+                 {"kind": "froehlich_kennelly", "initial_relative_permeability": 1000,
+                  "saturation_polarization_T": 2.1},
+                 {"kind": "brauer", "k1_m_per_H": 3.8, "k2_per_T2": 2.17, "k3_m_per_H": 396.2}):
+        curve = curve_of(dipole(iron_ring=iron(**kind)))
+        assert 1.3 < curve.B[-1] - MU_0 * curve.H[-1] < 2.2
+    assert curve_of(dipole()) is None
+
+
+def test_a_file_needs_a_folder(dipole):
+    """A study that was not read from a file does not know where its table is."""
+    with pytest.raises(StudyError, match=r"`iron_ring\.curve\.file` of study dipole .*read_study"):
+        curve_of(dipole(iron_ring=iron(kind="table", file="x.csv")))
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    (b"758.0", b"300.0", "H must rise from point to point"),
+    (b",1.3", b",0.9", "B must rise from point to point"),
+    (b"100.0,0.1\n160.0,0.25\n382.0,1.0\n", b"", "needs 4 to 10000 points"),
+    (b"1837.0,1.5", b"1837.0,1500", "is it in mT or gauss?"),
+    (b"1837.0,1.5", b"1837.0,-1.5", "is negative; give the first quadrant only"),
+    (b"1837.0,1.5", b"1837.0,nan", "line 7 must hold two numbers"),
+    (b"H_A_per_m,B_T", b"B_T,H_A_per_m", "H and B look exchanged"),
+    (b"H_A_per_m,B_T", b"H_kA_per_m,B_T", "its header must be H_A_per_m,B_T."),
+    (b"160.0,0.25", b"160.0,0.25 about", "line 4 must hold two numbers"),
+    (b"# made up", b"# Fr\xf6hlich", "it must be UTF-8 text"),
+    (None, b"", "it is empty"),
+    (None, None, "No such file")])
+def test_bad_tables_are_refused_with_their_place(with_table, old, new, said):
+    """Study, key and table are named."""
+    path, table = with_table
+    read_study(path)  # the control
+    content = table.read_bytes()
+    assert old is None or old in content
+    table.unlink()
+    if new is not None:
+        table.write_bytes(new if old is None else content.replace(old, new))
+    with pytest.raises(StudyError) as caught:
+        read_study(path)
+    sentence = str(caught.value)
+    assert said in sentence
+    assert sentence.startswith(f"Input `iron_ring.curve.file` of study file {path} must be")
+    assert str(table) in sentence
+
+
+@pytest.mark.parametrize("name", [".", "steels", "no\\u0000name", "two\\nlines"])
+def test_files_that_cannot_be_are_refused_in_one_line(with_table, name):
+    path, _ = with_table
+    path.write_text(STUDY_WITH_TABLE.replace("steels/mine.csv", name))
+    with pytest.raises(StudyError, match=r"^Input `iron_ring\.curve\.file` of .*\.$"):
+        read_study(path)
+
+
+def test_missing_file_and_folder_are_refused(tmp_path):
+    for path in (tmp_path / "none.toml", tmp_path):
+        with pytest.raises(StudyError, match="must be a readable file"):
+            read_study(path)
+
+
+def test_every_truncation_is_refused_or_complete(tmp_path):
+    """A study cut anywhere either still says everything that is required, or is refused."""
+    text = (ROOT / "studies/faser/study.toml").read_bytes()
+    path = tmp_path / "study.toml"
+    refused = 0
+    for cut in range(0, len(text), 97):
+        path.write_bytes(text[:cut])
+        try:
+            read_study(path)
+        except StudyError:
+            refused += 1
+    assert refused > 10
+
+
+@given(st.recursive(st.none() | st.booleans() | st.floats() | st.text() | st.integers(),
+                    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+                    max_leaves=8),
+       st.sampled_from(["array", "mesh", "observation", "noise", "name", "dimension", "iron_ring"]))
+def test_any_nonsense_gives_one_sentence(nonsense, key):
+    try:
+        parse_study(DIPOLE | {key: nonsense})
+    except HalbachError as error:
+        assert str(error).startswith("Input")
+
+
+def test_magnetization_convention(dipole):
+    """nu B = H + M: M = B_r / (mu_0 mu_r), not B_r / mu_0."""
+    block = blocks_of(dipole(array__recoil_permeability=1.25))[0]
+    assert math.hypot(*block.magnetization) == pytest.approx(1.06 / (MU_0 * 1.25), rel=1e-12)
+    assert math.hypot(*block.magnetization) != pytest.approx(1.06 / MU_0, rel=1e-2)
+
+
+def test_moment_gives_remanence(short_dipole):
+    """FASER's 330 A m2 in a full sector of 83.3 mm is 1.06 T."""
+    study = short_dipole(array__remanence_T=None, array__block_moment_A_m2=330.0,
+                         array__ring_length_m=1 / 12)
+    block = blocks_of(study)[0]
+    volume = math.pi * (0.1865**2 - 0.104**2) / 16 / 12
+    assert block.volume == pytest.approx(volume, rel=1e-12)
+    assert block.remanence == pytest.approx(MU_0 * 330 / volume, rel=1e-12)
+
+
+def test_moment_in_wrong_unit_is_refused(short_dipole):
+    study = short_dipole(array__remanence_T=None, array__block_moment_A_m2=330e3)
+    with pytest.raises(StudyError, match="block_moment_A_m2"):
+        blocks_of(study)
