@@ -98,6 +98,7 @@ def plane_size(study: Study, kind: str) -> tuple[float, float]:
     wanted = _equilateral(study, radius)
     coarser = max(1.0, (wanted / COUNTED) ** 0.5)
     mesh = study.mesh
+    # not validated: it may be coarser than anybody should ask for
     drawn = study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})})

@@ -197,8 +197,8 @@ def at_temperature(study: Study, material: Demagnetization) -> Study:
     """The study with the remanence that its blocks have at the material's temperature."""
     factor = float(remanence_factor(material, material.temperature_C))
     array = study.array
-    return study.model_copy(update={"array": array.model_copy(update={
-        "exceptions": (*array.exceptions, BlockException(magnetization_factor=factor))})})
+    return study.with_(array=array.with_(
+        exceptions=(*array.exceptions, BlockException(magnetization_factor=factor))))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
@@ -253,8 +253,7 @@ def _field_strength(
     points = cells.middles
     field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
     if not is_vacuum(study):
-        reacting = study.model_copy(update={"solver": study.solver.model_copy(
-            update={"method": "reaction"})})
+        reacting = study.with_(solver__method="reaction")
         formulation = CROSS_SECTION if study.dimension == 2 else SCALAR_POTENTIAL
         if is_nonlinear(study):
             field += solve_tangent(reacting, points, (), session, formulation, anywhere=True)[0]

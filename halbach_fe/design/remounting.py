@@ -155,8 +155,7 @@ def remounted(study: Study, moved: Iterable[tuple[int, int, Floats]]) -> Study |
             rotation_deg=rotation_deg(here.T @ total @ there)
             if np.isclose(np.linalg.det(total), 1.0) else (0.0, 0.0, 0.0)))
         expected[to] = source, meant, total
-    changed = study.model_copy(update={"array": array.model_copy(update={
-        "exceptions": array.exceptions + tuple(exceptions)})})
+    changed = study.with_(array=array.with_(exceptions=array.exceptions + tuple(exceptions)))
     after, new = mountings(changed), blocks_of(changed)
     for to, (source, meant, total) in expected.items():
         same = after[to][0] == meant and np.allclose(after[to][1], total, 0, EXACT)

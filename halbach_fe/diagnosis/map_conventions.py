@@ -119,8 +119,7 @@ class MapConvention:
             "radius_scale": (1 + old.radius_scale) * self.radius - 1,
             "radius_offset_m": old.radius_offset_m * self.radius + self.offset_m,
             "translation_m": tuple(np.add(old.translation_m, self.shift_m).tolist())}
-        return study.model_copy(
-            update={"instrument": Instrument.model_validate(old.model_dump() | changes)})
+        return study.with_(instrument=old.with_(**changes))
 
 
 def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
@@ -166,23 +165,22 @@ def turned_magnetizations(study: Study, angle_deg: float) -> Study:
         return tuple((turn @ vector).tolist())
 
     array, external = study.array, study.external
-    exceptions = tuple(one.model_copy(update={
-        "shift_m": around(one.shift_m),
-        "magnetization_angle_deg": None if one.magnetization_angle_deg is None
-        else _wrapped(one.magnetization_angle_deg + angle_deg)}) for one in array.exceptions)
-    dipoles = tuple(one.model_copy(update={
-        "position_m": around(one.position_m), "moment_A_m2": around(one.moment_A_m2)})
+    exceptions = tuple(one.with_(
+        shift_m=around(one.shift_m),
+        magnetization_angle_deg=None if one.magnetization_angle_deg is None
+        else _wrapped(one.magnetization_angle_deg + angle_deg)) for one in array.exceptions)
+    dipoles = tuple(
+        one.with_(position_m=around(one.position_m), moment_A_m2=around(one.moment_A_m2))
         for one in external.dipoles)
     return _with_array(
         study, exceptions=exceptions,
         first_block_angle_deg=_wrapped(array.first_block_angle_deg + angle_deg),
         first_magnetization_angle_deg=_wrapped(array.first_magnetization_angle_deg + angle_deg),
-    ).model_copy(update={"external": external.model_copy(update={
-        "background_T": around(external.background_T), "dipoles": dipoles})})
+    ).with_(external=external.with_(background_T=around(external.background_T), dipoles=dipoles))
 
 
 def _with_array(study: Study, **keys: object) -> Study:
-    return study.model_copy(update={"array": study.array.model_copy(update=keys)})
+    return study.with_(array=study.array.with_(**keys))
 
 
 def _wrapped(angle_deg: float) -> float:

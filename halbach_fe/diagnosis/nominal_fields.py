@@ -110,9 +110,9 @@ class NominalFields:
     def gradient_fields(self) -> Floats:
         """Change of B (blocks, n, 3) in T per unit of the magnetization gradient of each block."""
         array = self.study.array
-        uneven = array.model_copy(update={"exceptions": (
-            *array.exceptions, BlockException(magnetization_gradient=1.0))})
-        study = self.study.model_copy(update={"array": uneven})
+        uneven = array.with_(
+            exceptions=(*array.exceptions, BlockException(magnetization_gradient=1.0)))
+        study = self.study.with_(array=uneven)
         return np.asarray(self.block_fields_of(study) - self.block_fields)
 
     def moved(self, block: int, shift: Floats) -> Floats:

@@ -115,10 +115,10 @@ def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
     rows: dict[int, list[Component]] = {}
     for one in outliers:
         rows.setdefault(one.row, []).append(one.component)
-    inference = study.inference.model_copy(update={"excluded_readings": (
+    inference = study.inference.with_(excluded_readings=(
         *study.inference.excluded_readings,
-        *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items()))})
-    return study.model_copy(update={"inference": inference})
+        *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items())))
+    return study.with_(inference=inference)
 
 
 @dataclass(frozen=True)

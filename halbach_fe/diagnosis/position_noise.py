@@ -119,8 +119,7 @@ def with_position_noise(study: Study, vibration: PositionNoise | None) -> Study:
     settings = study.noise or NoiseSettings(position_sd_m=(vibration.sd_m,))
     old = settings.position_sd_m if study.noise else None
     more = tuple(float(np.hypot(one, vibration.sd_m)) for one in old or (0.0,))
-    return study.model_copy(update={
-        "noise": settings.model_copy(update={"position_sd_m": more})})
+    return study.with_(noise=settings.with_(position_sd_m=more))
 
 
 def judge_vibration(

@@ -28,6 +28,6 @@ def as_meant(study: Study) -> Study:
     """The study with every block as it was meant to be mounted."""
     meant = {"mounted_from": None, "magnetization_factor": 1.0, "rotation_deg": (0.0, 0.0, 0.0),
              "twist_deg": 0.0}
-    array = study.array.model_copy(update={"exceptions": tuple(
-        one.model_copy(update=meant) for one in study.array.exceptions)})
-    return study.model_copy(update={"array": array})
+    array = study.array.with_(
+        exceptions=tuple(one.with_(**meant) for one in study.array.exceptions))
+    return study.with_(array=array)

@@ -125,8 +125,8 @@ def observation_of(
     if blocks is not None:
         prior_from_blocks(study, blocks)
     if study.noise is not None:
-        study = study.model_copy(update={
-            "noise": study.noise.model_copy(update={"position_sd_m": None})})
+        study = study.with_(noise=study.noise.with_(position_sd_m=None)
+                            if study.noise.regions else None)
     return _read_maps(study, data, unseen)[0]
 
 

@@ -161,7 +161,7 @@ def without_remainder(instrument: Instrument, data: xr.Dataset) -> Floats:
     missing = np.isnan(shown)
     _check_components(instrument, missing)
     time = map_time(data)
-    linear = instrument.model_copy(update={"rotation_rad": (0.0, 0.0, 0.0)})
+    linear = instrument.with_(rotation_rad=(0.0, 0.0, 0.0))
     matrix, field = sensor_matrix(linear), np.nan_to_num(shown)
     for _ in range(ROUNDS):
         rest = remainder(instrument, field, time)

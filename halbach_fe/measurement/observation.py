@@ -169,8 +169,8 @@ def predicted_as(study: Study, data: xr.Dataset) -> Study:
         raise MeasurementError(must_be(
             "sigma_T", "map", "given, as the study's noise is that of Fourier coefficients and the "
             "map has points on none of its circles", "nothing", "Add the column sigma_T."))
-    return study.model_copy(update={"observation": FluxDensity(
-        quantity="flux_density", positions=observed.positions)})
+    return study.with_(
+        observation=FluxDensity(quantity="flux_density", positions=observed.positions))
 
 
 def circles(

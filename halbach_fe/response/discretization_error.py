@@ -22,7 +22,11 @@ DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"
 
 
 def refined(study: Study, factor: float) -> Study:
-    """The study with all elements smaller by a factor."""
+    """The study with all elements smaller by a factor.
+
+    It is not validated: the limits of a study file catch wrong units, and a coarser mesh than
+    anybody should ask for may well serve an error bar.
+    """
     mesh = study.mesh
     bore = mesh.bore_size_m or mesh.block_size_m
     return study.model_copy(update={"mesh": mesh.model_copy(update={
@@ -38,14 +42,12 @@ def farther(study: Study, mesh: str, factor: float) -> Study:
     update = {"radius_m": factor * boundary_radius(study, mesh)}
     if study.dimension == 3:
         update["half_length_m"] = end + factor * (boundary_half_length(study, mesh) - end)
-    return study.model_copy(update={
-        "open_boundary": study.open_boundary.model_copy(update=update)})
+    return study.with_(open_boundary=study.open_boundary.with_(**update))
 
 
 def dual(study: Study, route: str) -> Study:
     """The study by the other of two formulations that bracket the truth."""
-    return study.model_copy(update={
-        "solver": study.solver.model_copy(update={"route": DUAL[route]})})
+    return study.with_(solver__route=DUAL[route])
 
 
 def error_bar_session(session: Session) -> Session:

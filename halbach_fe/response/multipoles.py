@@ -247,7 +247,7 @@ def multipole_models(
                                      f"{one.z_m:g}"))
         wanted.append((orders, _radius(study, one), one.z_m))
         observations.append(_observation(study, wanted[-1][1], max(*orders, main), one.z_m))
-    bare = study.model_copy(update={"instrument": Instrument()})
+    bare = study.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(together, observations), session)
     found, first = [], 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
@@ -313,8 +313,8 @@ def solved_circles(
     observed = study.observation
     if observed.quantity == "flux_density":
         errors = np.repeat(errors.reshape(len(points), -1)[:, 0], len(COMPONENTS))
-        observed = observed.model_copy(update={"components": COMPONENTS})
-    bare = study.model_copy(update={"instrument": Instrument(), "observation": observed})
+        observed = observed.with_(components=COMPONENTS)
+    bare = study.with_(instrument=Instrument(), observation=observed)
     observation = observe(bare, points, np.ones_like(points, bool))
     readings = observation.apply(flux_density)
     # one parameter, the strength of the whole magnet

@@ -185,10 +185,9 @@ def compare_with_newton(
 def _with_vacuum_for_iron(study: Study, route: str) -> Study:
     """The study with nothing in the iron's place, on the same mesh, every block by itself."""
     assert study.iron_ring is not None  # a curve is the iron's
-    ring = study.iron_ring.model_copy(update={"curve": None, "relative_permeability": 1.0})
+    ring = study.iron_ring.with_(curve=None, relative_permeability=1.0)
     solver = {"symmetry": False} | ({} if study.dimension == 2 else {"route": route})
-    return study.model_copy(update={
-        "iron_ring": ring, "solver": study.solver.model_copy(update=solver)})
+    return study.with_(iron_ring=ring, solver=study.solver.with_(**solver))
 
 
 def _error(study: Study, observation: Observation, session: Session) -> Floats:

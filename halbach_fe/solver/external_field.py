@@ -33,7 +33,7 @@ def neighbour_field(
     """B (n, 3) in T of a magnet like the study's, in vacuum, by ``order`` Gauss points a panel."""
     turn = rotation_about_z(np.radians(neighbour.turn_deg))
     seen = (points - [0.0, 0.0, neighbour.z_m]) @ turn
-    alone = study.model_copy(update={"external": External()})
+    alone = study.with_(external=External())
     return np.asarray(neighbour.factor * field_of(blocks_of(alone), seen, order) @ turn.T)
 
 

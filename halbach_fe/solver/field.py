@@ -189,14 +189,13 @@ def axisymmetric_stand_in(study: Study, route: str, points: Floats) -> Study | N
 def without_gaps(study: Study) -> Study:
     """The study with blocks that are alike, without gaps between them."""
     array = study.array
-    exceptions = tuple(one.model_copy(update={
-        "recoil_permeability": None, "recoil_permeability_across": None})
+    exceptions = tuple(one.with_(recoil_permeability=None, recoil_permeability_across=None)
         for one in array.exceptions)
     block = array.block
     if block.shape == "sector":
-        block = block.model_copy(update={"angular_gap_deg": 0.0})
-    return study.model_copy(update={"array": array.model_copy(update={
-        "block": block, "exceptions": exceptions, "recoil_permeability_across": None})})
+        block = block.with_(angular_gap_deg=0.0)
+    return study.with_(
+        array=array.with_(block=block, exceptions=exceptions, recoil_permeability_across=None))
 
 
 def _about(

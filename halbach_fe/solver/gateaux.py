@@ -33,8 +33,7 @@ def gateaux_derivative(study: Study, block: int, points: Floats, session: Sessio
         raise StudyError(f"Input block of study {study.name} must be one of its {len(blocks)}; "
                          f"instead received {block + 1}.")
     # the field in materials has no exact form, and the scalar potential gives H there
-    direct = study.model_copy(update={
-        "solver": study.solver.model_copy(update={"method": "direct", "route": "auto"})})
+    direct = study.with_(solver__method="direct", solver__route="auto")
     formulation = formulation_of(direct, choose_route(direct, points))
     if is_nonlinear(study):
         fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]

@@ -91,7 +91,7 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
                   if isinstance(error, ValidationError) else error)
         raise StudyError(must_be("`iron_ring.curve.file`", where, "a table of H(B)",
                                  f"{str(path)!r}, which cannot be used: {reason}")) from None
-    return study.model_copy(update={"iron_ring": ring.model_copy(update={"curve": table})})
+    return study.with_(iron_ring=ring.with_(curve=table))
 
 
 def _sentence(error: ValidationError, where: str) -> str:

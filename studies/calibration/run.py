@@ -45,8 +45,7 @@ PASS, FAIL = 0.01, 1e-4
 def run(arguments: argparse.Namespace) -> int:
     """Run all three, write the ranks, print the table; CheckFailedError if one is off."""
     study = read_study(arguments.study)
-    study = study.model_copy(update={"mesh": study.mesh.model_copy(
-        update={"block_size_m": arguments.block_size_m})})
+    study = study.with_(mesh__block_size_m=arguments.block_size_m)
     points = points_from(study.observation.positions)[::2]
     measured = np.ones_like(points, bool)
     observation = observe(study, points, measured)

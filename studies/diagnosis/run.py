@@ -147,7 +147,7 @@ def run_case(
             session, folder=session.folder / f"fringe-{when}"), campaign.blocks)
             for when, one in (("before", found.read), ("after", found.study))]
     if not case.hidden and not case.outside and case.seed % 4 == 0:  # it takes long
-        sure = study.model_copy(update={"prior": study.prior.model_copy(update=NO_BLOCKS)})
+        sure = study.with_(prior=study.prior.with_(**NO_BLOCKS))
         alarm = diagnose(sure, readings, session, solver=solver)
         result["without_blocks"] = bool(alarm.anything or alarm.unknown)
     return result
@@ -178,8 +178,7 @@ def fringe(
     """
     end = magnet_half_length(study)
     kept = HeldOut(z_ranges_m=((-FAR_M, -end), (end, FAR_M)))
-    update = infer(study.model_copy(update={
-        "inference": study.inference.model_copy(update={"held_out": kept})}),
+    update = infer(study.with_(inference__held_out=kept),
         readings, session, blocks)
     truth = update.observation.read(exact["B_T"].values)[update.held_out]
     return float(np.sqrt(np.mean((update.prediction_posterior.mean[update.held_out] - truth)**2)))

@@ -26,7 +26,7 @@ def main() -> None:
     write_campaign(twin, HERE / "twin")
     axis = FluxDensity(quantity="flux_density", components=("x",), positions=LinePositions(
         kind="line", start_m=(0, 0, -0.775), end_m=(0, 0, 0.775), count=156))
-    profile = simulate_campaign(study.model_copy(update={"observation": axis}),
+    profile = simulate_campaign(study.with_(observation=axis),
                                 SEED)  # the same magnet
     write_map(profile.readings, HERE / "twin" / "axis.csv")
 

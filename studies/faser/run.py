@@ -47,11 +47,9 @@ def with_step(study: Study, z_step: float) -> Study:
     """The study with its regions at the same indices of the profile, for another step."""
     assert study.noise is not None
     scale = z_step / Z_STEP_M
-    regions = [region.model_copy(update={
-        key: limit * scale for key in ("z_min_m", "z_max_m")
-        if (limit := getattr(region, key)) is not None}) for region in study.noise.regions]
-    return study.model_copy(update={"noise": study.noise.model_copy(
-        update={"regions": tuple(regions)})})
+    regions = [region.with_(**{key: limit * scale for key in ("z_min_m", "z_max_m") if (
+        limit := getattr(region, key)) is not None}) for region in study.noise.regions]
+    return study.with_(noise__regions=tuple(regions))
 
 
 def width_at_half_maximum(z: Floats, field: Floats) -> float:

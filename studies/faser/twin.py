@@ -58,9 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
         update = infer(study, read_map(HERE / "twin" / "map.csv"), session,
                        read_blocks(HERE / "twin" / "blocks.csv"))
         points = points_of(axis)
-        line = study.model_copy(update={"observation": FluxDensity(
+        line = study.with_(observation=FluxDensity(
             quantity="flux_density", components=("x",), positions=PointPositions(
-                kind="points", points_m=tuple(map(tuple, points.tolist()))))})
+                kind="points", points_m=tuple(map(tuple, points.tolist())))))
         seen = observe(line, points, ~np.isnan(axis["B_T"].values))
         on_axis = response_matrix(line, seen, replace(session, folder=arguments.output / "axis"))
     write_inference(update, arguments.output)

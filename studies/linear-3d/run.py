@@ -61,9 +61,8 @@ def fourier(study: Study) -> Study:
     """The same study, observing Fourier coefficients."""
     positions = study.observation.positions
     assert positions.kind == "circles"
-    return study.model_copy(update={
-        "name": f"{study.name}-fourier", "observation": FourierCoefficients(
-            quantity="fourier_coefficients", harmonics=HARMONICS, positions=positions)})
+    return study.with_(name=f"{study.name}-fourier", observation=FourierCoefficients(
+        quantity="fourier_coefficients", harmonics=HARMONICS, positions=positions))
 
 
 def figures(prior: Gaussian, posterior: Gaussian, truth: Floats) -> dict[str, float]:

@@ -67,8 +67,7 @@ def printed_form_error(study: Study, model: Response, session: Session) -> float
     curve, ring = curve_of(study), study.iron_ring
     assert curve is not None
     assert ring is not None
-    initial = study.model_copy(update={"iron_ring": ring.model_copy(
-        update={"curve": None, "relative_permeability": curve.initial})})
+    initial = study.with_(iron_ring=ring.with_(curve=None, relative_permeability=curve.initial))
     points = points_from(study.observation.positions)
     other = response_matrix(initial, observe(study, points, np.ones_like(points, bool)),
                      replace(session, folder=session.folder / "printed-form"))
@@ -89,9 +88,9 @@ def run(options: argparse.Namespace) -> int:
 
         axis, size = plane(study, room("map"))
         model = response_matrix(study, observation, room("circle"))
-        on_circle = study.model_copy(update={"plan": study.plan.model_copy(
-            update={"candidates": tuple(one for one in study.plan.candidates
-                                        if one.radius_m == study.observation.positions.radius_m)})})
+        on_circle = study.with_(
+            plan__candidates=tuple(one for one in study.plan.candidates
+                                   if one.radius_m == study.observation.positions.radius_m))
         plans = {"on the circle": plan_measurement(on_circle, room("plan-circle")),
                  "wherever the probe can go": plan_measurement(study, room("plan"))}
         error = printed_form_error(study, model, session)

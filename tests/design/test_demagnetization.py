@@ -156,8 +156,7 @@ def test_needed_coercivity_is_just_enough(warm):
     found = warm(100.0)
     assert found.margin.min() < 0
     worst = max(found.by_block(), key=lambda row: row["needed_coercivity_A_per_m"])
-    enough = found.material.model_copy(
-        update={"intrinsic_coercivity_A_per_m": worst["needed_coercivity_A_per_m"]})
+    enough = found.material.with_(intrinsic_coercivity_A_per_m=worst["needed_coercivity_A_per_m"])
     assert found.along.min() + knee(enough, 100.0) == pytest.approx(0.0, abs=1e-3)
 
 

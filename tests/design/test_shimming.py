@@ -329,8 +329,7 @@ def test_a_bad_block_is_replaced(one_magnet, session, generator):
     weak[5] = weak[5].with_magnetization(0.9 * weak[5].magnetization)
     points = points_from(study.observation.positions)
     made = field_map(points, vacuum_field(weak, points))
-    wide = study.model_copy(update={"prior": study.prior.model_copy(update={
-        "magnitude_sd": 0.04})})
+    wide = study.with_(prior__magnitude_sd=0.04)
     update = infer(wide, made, session)
     table, _ = coil_table(study, nominal, nominal, 1e-3, generator)
     rows = [5, 5]

@@ -65,8 +65,8 @@ def test_impossible_amplitudes_are_no_explanation(session, generator, name):
     change = field_of(blocks_of(gap.apply(study, Place(), [3e-4])), CIRCLES) - nominal
     noise = NOISE_T * generator.standard_normal(CIRCLES.shape)
     wider, narrower = (field_map(CIRCLES, nominal + sign * change + noise) for sign in (-1, 1))
-    tight = study.model_copy(update={"prior": study.prior.model_copy(update={
-        "magnitude_sd": 1e-4, "direction_sd_deg": 0.01, "common_mode_sd": 1e-4})})
+    tight = study.with_(prior__magnitude_sd=1e-4, prior__direction_sd_deg=0.01,
+                        prior__common_mode_sd=1e-4)
     (named,) = diagnose(tight, narrower, session, effects=[gap]).named
     assert named.values == pytest.approx([3e-4], abs=4 * named.sd[0])
     assert diagnose(tight, wider, session, effects=[gap]).named == ()

@@ -176,9 +176,8 @@ def test_options_fit_the_study(case):
     radius = np.hypot(*found["second_radius"].points[:, :2].T)
     assert radius == pytest.approx(0.8 * 0.104)
     assert np.abs(found["far_field"].points[:, 2]).min() > 0.08  # the magnet's end
-    array = diagnosis.before.study.array.model_copy(update={"remanence_T": 0.01})
-    weak = replace(diagnosis.before, study=diagnosis.before.study.model_copy(
-        update={"array": array}))
+    array = diagnosis.before.study.array.with_(remanence_T=0.01)
+    weak = replace(diagnosis.before, study=diagnosis.before.study.with_(array=array))
     names = {one.name for one in candidate_measurements(replace(diagnosis, before=weak), data)}
     assert set(found) - names == {"nmr_point"}  # too weak for it
 

@@ -114,8 +114,7 @@ def test_several_errors(right):
 
 def test_what_the_study_knows_is_no_error(right):
     data = written(right, 1e3 * NONE)
-    study = STUDY.model_copy(update={"instrument": STUDY.instrument.model_copy(
-        update={"length_unit_m": 1e-3})})
+    study = STUDY.with_(instrument__length_unit_m=1e-3)
     assert find_gross_errors(study, data) == ()
 
 

@@ -244,10 +244,8 @@ def with_table(path: Path) -> Study:
 
 def changed_study(path: Path) -> tuple[str, Study]:
     study = read_study(path)
-    after = study.model_copy(update={
-        "array": study.array.model_copy(update={"inner_radius_m": study.array.inner_radius_m * 0.9,
-                                                "recoil_permeability": 1.0625}),
-        "external": study.external.model_copy(update={"background_T": (1e-5, 0.0, 0.0)})})
+    after = study.with_(array__inner_radius_m=study.array.inner_radius_m * 0.9,
+                        array__recoil_permeability=1.0625, external__background_T=(1e-5, 0.0, 0.0))
     try:
         parse_study(after.model_dump())
     except StudyError:

@@ -436,8 +436,7 @@ def test_calibration_of_the_coil_is_not_mistaken_for_a_discovery(dipole, generat
     and no block stands out; without, the blocks near the map move alone, and error bars fail.
     """
     study, data, table, truth = arc_campaign(dipole, generator, 1.005)
-    without = study.model_copy(update={"prior": study.prior.model_copy(
-        update={"common_mode_sd": 0.0})})
+    without = study.with_(prior__common_mode_sd=0.0)
     good, bad = (infer(one, data, session, table) for one in (study, without))
     nominal = good.response.nominal
     errors = [(update.posterior.mean - truth).reshape(16, 2) for update in (good, bad)]

@@ -238,7 +238,7 @@ def test_the_study_says_how_a_map_is_to_be_read(short_dipole, generator, session
         infer(study, field_map(points * [2.0, 2.0, 1.0], field), session)
     instrument = Instrument(length_unit_m=1e-3, radius_scale=1 / 3 - 1,
                             position_axes=("y", "x", "z"), field_axes=("x", "y", "-z"))
-    found = infer(study.model_copy(update={"instrument": instrument}), written, session)
+    found = infer(study.with_(instrument=instrument), written, session)
     # solvers of the response stop at 1e-10, and points are off by their rounding
     np.testing.assert_allclose(found.posterior.mean, right.posterior.mean, rtol=0,
                                atol=1e-5 * right.posterior.sd.min())

@@ -37,7 +37,7 @@ def test_units_and_axes_are_put_right(generator):
                             position_axes=("z", "x", "-y"), field_axes=("-y", "x", "z"))
     xr.testing.assert_allclose(as_read(instrument, written), right, rtol=1e-14)
     # the negative control: one sign less
-    wrong = instrument.model_copy(update={"field_axes": ("y", "x", "z")})
+    wrong = instrument.with_(field_axes=("y", "x", "z"))
     with pytest.raises(AssertionError):
         xr.testing.assert_allclose(as_read(wrong, written), right, rtol=0.5)
 

@@ -40,8 +40,7 @@ def test_fourier_coefficients_of_a_pure_multipole(dipole, order, generator):
 def test_circles_of_several_radii(dipole, generator):
     """Each reading tells its radius and z; the amplitude of each harmonic is its own circle's."""
     study = dipole(observation=changed(FOURIER, positions__radius_m=[0.075, 0.05]))
-    points = points_from(study.observation.positions.model_copy(update={
-        "z_min_m": -0.1, "z_max_m": 0.1, "count": 2}))
+    points = points_from(study.observation.positions.with_(z_min_m=-0.1, z_max_m=0.1, count=2))
     assert points.shape == (96, 3)
     field = multipole_field(points, 3, 0.3, -0.2) * np.hypot(*points[:, :2].T)[:, None]
     field *= 1 + points[:, 2:]

@@ -42,7 +42,7 @@ def test_a_perturbed_model_fails(name, change, session):
 @pytest.mark.parametrize("name", [name for name in CASES if name != "dipole_3d_direct"])
 def test_forgotten_iron_fails(name, session):
     """In 3D the direct field is not exact enough to show it; its reaction is."""
-    study = CASES[name].model_copy(update={"iron_ring": None})
+    study = CASES[name].with_(iron_ring=None)
     found = solve_nominal(study, points_of_case(study), session)
     assert difference(found, stored(name)) > tolerance(study)
 

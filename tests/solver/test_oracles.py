@@ -25,7 +25,7 @@ def test_full_array_against_the_vector_potential_in_3d(session, with_iron):
     """
     study = read_study(ROOT / "studies" / "faser" / "campaign.toml")
     if not with_iron:
-        study = study.model_copy(update={"iron_ring": None})
+        study = study.with_(iron_ring=None)
     points = points_from(study.observation.positions)[::29]
     ours = finite_element_part(study, points, session, columns=False).nominal
     with ngsolve.TaskManager():

@@ -145,7 +145,7 @@ def test_iron_in_place_of_none():
     study = parse_study(tomllib.loads(PLAIN))
     iron = IronRing(inner_radius_m=0.19, outer_radius_m=0.2,
                     curve=SteelCurve(kind="steel", name="aisi_1010"))
-    changed = edited_text(PLAIN, [(study.model_copy(update={"iron_ring": iron}), "a ring")])
+    changed = edited_text(PLAIN, [(study.with_(iron_ring=iron), "a ring")])
     assert changed.startswith(PLAIN.rstrip("\n"))
     assert "[iron_ring]  # a ring\n" in changed
 

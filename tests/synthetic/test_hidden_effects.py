@@ -441,8 +441,7 @@ def test_sizes_on_a_faser_dipole():
     dipole of 0.57 T at 66.7 mm; this one has 0.60 T and a few circles only, the last at the end.
     """
     study = read_study(ROOT / "studies" / "faser" / "study.toml")
-    study = study.model_copy(update={"array": study.array.model_copy(
-        update={"recoil_permeability": 1.0})})
+    study = study.with_(array__recoil_permeability=1.0)
     magnet = magnet_of(study)
     angle = 0.02 + 2 * np.pi * np.arange(4) / 4
     points = np.vstack([np.column_stack([0.0667 * np.cos(angle), 0.0667 * np.sin(angle),

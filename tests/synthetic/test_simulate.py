@@ -274,8 +274,8 @@ def test_noise_and_components(short_dipole):
     """Readings scatter about the field by the region's sigma; what is not observed is left out."""
     study = short_dipole(**RINGS, observation__components=["x", "z"])
     campaign, other = simulate_campaign(study, 1), simulate_campaign(
-        study.model_copy(update={"noise": study.noise.model_copy(update={"regions": tuple(
-            region.model_copy(update={"sigma_T": 1e-9}) for region in study.noise.regions)})}), 1)
+        study.with_(
+            noise__regions=tuple(region.with_(sigma_T=1e-9) for region in study.noise.regions)), 1)
     noise = (campaign.readings["B_T"] - other.readings["B_T"]).values
     assert np.isnan(noise[:, 1]).all()
     assert np.std(noise[:, [0, 2]]) == pytest.approx(1e-4, rel=0.23)  # 160 values, 4 sigma
@@ -303,8 +303,8 @@ def test_noise_of_fourier_coefficients(dipole):
     data = simulate_campaign(study, 1).readings
     observation = observe(study, points_of(data), ~np.isnan(data["B_T"].values))
     np.testing.assert_allclose(reading_noise(study, observation, data).sd, 1e-4)
-    quiet = simulate_campaign(study.model_copy(update={"noise": study.noise.model_copy(update={
-        "regions": (study.noise.regions[0].model_copy(update={"sigma_T": 1e-9}),)})}), 1).readings
+    quiet = simulate_campaign(
+        study.with_(noise__regions=(study.noise.regions[0].with_(sigma_T=1e-9),)), 1).readings
     noise = (data["B_T"] - quiet["B_T"]).values
     assert np.isnan(noise[:, 2]).all()
     assert np.std(noise[:, :2]) == pytest.approx(1e-4 * np.sqrt(12), rel=0.41)  # 48, 4 sigma
@@ -341,9 +341,8 @@ def test_held_out_points_are_between(short_dipole):
 
 def test_one_point_has_no_held_out_map(short_dipole, tmp_path):
     study = short_dipole(**RINGS, observation__components=["x"])
-    study = study.model_copy(update={"observation": study.observation.model_copy(update={
-        "positions": short_dipole(observation__positions={
-            "kind": "points", "points_m": [[0, 0, 0]]}).observation.positions})})
+    study = study.with_(observation__positions=short_dipole(
+        observation__positions={ "kind": "points", "points_m": [[0, 0, 0]]}).observation.positions)
     campaign = simulate_campaign(study, 1)
     assert campaign.held_out is None
     names = {path.name for path in write_campaign(campaign, tmp_path)}
@@ -382,8 +381,7 @@ def test_uncertain_positions_move_the_probe():
         DIPOLE, noise={"regions": [{"name": "all", "sigma_T": 1e-9}]},
         array__recoil_permeability=1.0,
         prior={"magnitude_sd": 1e-6, "direction_sd_deg": 1e-4}))  # the nominal gradient holds
-    loose = study.model_copy(update={"noise": study.noise.model_copy(
-        update={"position_sd_m": (1e-4, 1e-4, 1e-4)})})
+    loose = study.with_(noise__position_sd_m=(1e-4, 1e-4, 1e-4))
     points = points_from(study.observation.positions)
     moved = real_places(loose, points, np.random.default_rng(1)) - points
     assert np.std(moved) == pytest.approx(1e-4, rel=0.3)  # 72 draws

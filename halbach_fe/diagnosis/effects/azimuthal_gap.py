@@ -43,7 +43,7 @@ class AzimuthalGapEffect(Effect):
             change = {"side_gap_m": block.side_gap_m + gap}
         else:
             change = {"width_m": block.width_m - gap}
-        return with_array(study, block=block.model_copy(update=change))
+        return with_array(study, block=block.with_(**change))
 
 
 EFFECTS = (AzimuthalGapEffect(),)

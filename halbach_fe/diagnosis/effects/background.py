@@ -28,8 +28,7 @@ class BackgroundEffect(Effect):
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         total = tuple(added(study.external.background_T, values))
-        return study.model_copy(update={
-            "external": study.external.model_copy(update={"background_T": total})})
+        return study.with_(external__background_T=total)
 
 
 EFFECTS = (BackgroundEffect(),)

@@ -127,7 +127,7 @@ class InstrumentEffect(Effect):
         """See `Effect.apply`."""
         change = self.change(study.instrument, values)
         instrument = Instrument.model_validate(study.instrument.model_dump() | dict(change))
-        return study.model_copy(update={"instrument": instrument})
+        return study.with_(instrument=instrument)
 
     @abstractmethod
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
@@ -147,14 +147,13 @@ def along(axis: str, value: float) -> tuple[float, float, float]:
 
 def with_exceptions(study: Study, exceptions: Sequence[BlockException]) -> Study:
     """The study with more exceptions to its blocks."""
-    array = study.array.model_copy(
-        update={"exceptions": (*study.array.exceptions, *exceptions)})
-    return study.model_copy(update={"array": array})
+    array = study.array.with_(exceptions=(*study.array.exceptions, *exceptions))
+    return study.with_(array=array)
 
 
 def with_array(study: Study, **keys: Any) -> Study:
     """The study with other keys of its array."""
-    return study.model_copy(update={"array": study.array.model_copy(update=keys)})
+    return study.with_(array=study.array.with_(**keys))
 
 
 def blocks_at(scene: NominalFields, place: Place) -> list[int]:

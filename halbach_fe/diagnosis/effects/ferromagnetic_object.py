@@ -50,8 +50,7 @@ class FerromagneticObjectEffect(Effect):
         """See `Effect.apply`."""
         x, y, z = map(float, values)
         dipole = PointDipole(position_m=place.at_m, moment_A_m2=(x, y, z))
-        return study.model_copy(update={"external": study.external.model_copy(update={
-            "dipoles": (*study.external.dipoles, dipole)})})
+        return study.with_(external__dipoles=(*study.external.dipoles, dipole))
 
 
 EFFECTS = (FerromagneticObjectEffect(),)

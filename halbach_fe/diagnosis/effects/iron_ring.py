@@ -65,9 +65,9 @@ class IronRingEffect(Effect):
         farther, thicker = values[1:] or (0.0, 0.0)
         thickness = max(outer - inner + thicker, THINNEST_M)
         inner = max(inner + farther, array_outer_radius(study) + CLEARANCE_M)
-        return study.model_copy(update={"iron_ring": IronRing(
+        return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
-            relative_permeability=PERMEABILITY)})
+            relative_permeability=PERMEABILITY))
 
 
 EFFECTS = (IronRingEffect(),)

@@ -33,9 +33,8 @@ class IronSaturationEffect(Effect):
 
     def signature(self, scene: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`; both on the same mesh."""
-        solid = scene.study.solver.model_copy(update={"route": SOLID})
-        before = scene.study if scene.study.dimension == 2 else scene.study.model_copy(
-            update={"solver": solid})
+        solid = scene.study.solver.with_(route=SOLID)
+        before = scene.study if scene.study.dimension == 2 else scene.study.with_(solver=solid)
         return (scene.solve(self.apply(before, place, [1.0])) - scene.solve(before))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -43,9 +42,9 @@ class IronSaturationEffect(Effect):
         ring = study.iron_ring
         if ring is None:
             return study
-        return study.model_copy(update={"iron_ring": IronRing(
+        return study.with_(iron_ring=IronRing(
             inner_radius_m=ring.inner_radius_m, outer_radius_m=ring.outer_radius_m,
-            length_m=ring.length_m, curve=SteelCurve(kind="steel", name=STEEL))})
+            length_m=ring.length_m, curve=SteelCurve(kind="steel", name=STEEL)))
 
 
 EFFECTS = (IronSaturationEffect(),)

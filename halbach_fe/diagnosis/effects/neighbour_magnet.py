@@ -57,8 +57,7 @@ class NeighbourMagnetEffect(Effect):
         """See `Effect.apply`."""
         stronger, farther = values[1:] or (0.0, 0.0)
         neighbour = Neighbour(z_m=_middle(place, farther), factor=1 + float(stronger))
-        return study.model_copy(update={"external": study.external.model_copy(update={
-            "neighbours": (*study.external.neighbours, neighbour)})})
+        return study.with_(external__neighbours=(*study.external.neighbours, neighbour))
 
 
 def _middle(place: Place, farther: float) -> float:
