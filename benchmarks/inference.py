@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.note import Note
 from halbach_fe.cli import common
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior
 from halbach_fe.measurement.field_map import read_map
@@ -37,7 +37,7 @@ def posterior_time(note: Note) -> None:
     The time depends on sizes, not on numbers: these are random.
     """
     generator = np.random.default_rng(1)
-    blocks = blocks_of(read_study(STUDIES / "faser" / "campaign.toml"))
+    blocks = build_magnet(read_study(STUDIES / "faser" / "campaign.toml")).blocks
     nominal = np.concatenate([block.magnetization for block in blocks])
     matrix = 1e-9 * generator.standard_normal((28_080, len(nominal)))
     prior = nominal_prior(nominal, 3, 0.01, 1.0, 0.02)
@@ -65,7 +65,7 @@ def linear_errors(note: Note) -> None:
     noise = sigma * np.random.default_rng(1).standard_normal(field["B_T"].shape)
     truth = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1).ravel()
     with tempfile.TemporaryDirectory() as name:
-        update = infer(study, field.assign(B_T=field["B_T"] + noise),
+        update = infer(build_magnet(study), field.assign(B_T=field["B_T"] + noise),
                        Session(find_getdp(), Path(name), jobs=2))
     z = (update.posterior.mean - truth) / update.posterior.sd
     note("inference.linear_z_rms", float(np.sqrt(np.mean(z**2))), "",
@@ -77,7 +77,7 @@ def nonlinear(note: Note) -> None:
     folder = STUDIES / "nonlinear-2d"
     study = read_study(folder / "study.toml")
     table = np.genfromtxt(folder / "fig3_nonlinear_2d_dM.csv", delimiter=",", names=True)
-    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization[:2] for block in build_magnet(study).blocks])
     mean = table["prior_mean_A_per_m"].reshape(2, -1).T.ravel()
     sd = np.abs(table["prior_edge_1_A_per_m"] - table["prior_edge_2_A_per_m"]) / 2
     prior = Gaussian(nominal + mean, np.diag(sd.reshape(2, -1).T.ravel()))
@@ -85,7 +85,8 @@ def nonlinear(note: Note) -> None:
     with tempfile.TemporaryDirectory() as name:
         session = Session(find_getdp(), Path(name), jobs=2)
         started = time.monotonic()
-        update = infer(study, read_map(folder / "map-drawn.csv"), session, prior=prior)
+        update = infer(build_magnet(study), read_map(folder / "map-drawn.csv"), session,
+                       prior=prior)
         found = sample_posterior(update, session, DRAWS, say=common.say)
         note("inference.nonlinear_seconds", time.monotonic() - started, "s",
              f"all of it: 4 chains of {DRAWS} draws, {found.solves} solves")
@@ -94,7 +95,7 @@ def nonlinear(note: Note) -> None:
         note("inference.nonlinear_min_ess", float(found.diagnostics.bulk.min()),
              "effective samples", "worst of 32 parameters")
         note("inference.nonlinear_max_rhat", float(found.diagnostics.r_hat.max()), "", "")
-        model = nonlinear_model(study, update.observation, replace(
+        model = nonlinear_model(build_magnet(study), update.observation, replace(
             session, folder=session.folder / "pcn"), np.random.default_rng(1))
         target = Posterior(lambda p: model(p, 1e-7), update.readings,
                            update.noise.plus(model.error), prior)

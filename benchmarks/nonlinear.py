@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.cli import common
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
@@ -49,9 +50,10 @@ def getdp_seconds(study: Study, samples: np.ndarray, folder: Path) -> float:
     """Wall time of one GetDP process that solves samples (k, blocks, 3) in A/m, starting each from
     the one before with full Newton steps: the fastest way it has.
     """
-    mesh = verify_mesh(build_mesh(study, folder))
+    mesh = verify_mesh(build_mesh(build_magnet(study), folder))
     started = time.monotonic()
-    job = fill_run_folder(study, mesh, np.array([[0.0123, 0.0321, 0.0]]), folder / "run",
+    job = fill_run_folder(build_magnet(study), mesh, np.array([[0.0123, 0.0321, 0.0]]),
+                          folder / "run",
                           CROSS_SECTION,
                 samples=samples)
     runner.run(find_getdp(), replace(
@@ -70,17 +72,17 @@ def faser(note: Note) -> None:
         scales = Weighed.of(find_getdp(), Path(name))
         session = Session(scales.getdp, Path(name), jobs=2)
         started = time.monotonic()
-        parts = finite_element_part(study, points, session, columns=False)
+        parts = finite_element_part(build_magnet(study), points, session, columns=False)
         part = parts.nominal
         note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
              f"Newton's method, {len(newton_history(session.folder)) - 1} steps")
         started = time.monotonic()
-        stated = reading_errors(study, observation, parts, error_bar_session(session))
+        stated = reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
         note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
              "the dual formulation, Newton's method again")
         note("nonlinear.faser_3d_memory_GiB", own_peak() + 2 * scales.peak, "GiB",
              "peak of this process and of two of GetDP's")
-    main_field = float(np.abs(vacuum_part(study, points) + part).max())
+    main_field = float(np.abs(vacuum_part(build_magnet(study), points) + part).max())
     common.say("the same by NGSolve")
     assert study.iron_ring is not None
     dipole, iron = dipole_of(study), law_of(study.iron_ring)
@@ -110,10 +112,10 @@ def run(note: Note) -> None:
         session = Session(find_getdp(), folder / "model", jobs=2)
         common.say("condensed model of the cross-section")
         started = time.monotonic()
-        model = nonlinear_model(study, observation, session, generator)
+        model = nonlinear_model(build_magnet(study), observation, session, generator)
         note("nonlinear.build_seconds", time.monotonic() - started, "s",
              "error bars and verification included")
-        unknowns = verify_mesh(build_mesh(study, folder)).inner.nodes
+        unknowns = verify_mesh(build_mesh(build_magnet(study), folder)).inner.nodes
         note("nonlinear.unknowns", unknowns, "", f"of them {len(model.condensed.potential)} in "
              "the iron")
         prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
@@ -149,7 +151,7 @@ def run(note: Note) -> None:
         hard = size * generator.standard_normal((HARD, len(model.nominal)))
         worst = 0.0
         for part, cold in ((draws[:SAMPLES], False), (hard, True)):
-            theirs = newton_readings(study, observation, replace(
+            theirs = newton_readings(build_magnet(study), observation, replace(
                 session, folder=folder / "compared"), part, cold)
             worst = max(worst, float(np.abs(model(part) - theirs).max()))
         note("nonlinear.engine_error_T", worst, "T", f"largest difference at {len(observation)} "

@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.cli import common
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, refined
@@ -41,7 +42,7 @@ def built(study: Study, points: np.ndarray, session: Session) -> tuple[Response,
     """H from nothing, with permeability and iron, and the seconds it took."""
     observation = observe(study, points, np.ones_like(points, bool))
     started = time.monotonic()
-    found = response_matrix(study, observation, session)
+    found = response_matrix(build_magnet(study), observation, session)
     return found, time.monotonic() - started
 
 
@@ -49,7 +50,7 @@ def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
     """The full array: by refinement, and against NGSolve's vector potential of high order."""
     session = Session(find_getdp(), folder, jobs=2)
     common.say("error of the full array by refinement")
-    found = verify(study, session, common.say)
+    found = verify(build_magnet(study), session, common.say)
     note("response.error_pointwise", found.error_pointwise, "of the main field",
          "refinement and farther boundary, extrapolated")
     note("response.error_fourier", found.error_fourier or np.nan, "of the main field",
@@ -57,8 +58,8 @@ def errors(study: Study, points: np.ndarray, folder: Path, note: Note) -> None:
     common.say("error of the full array against NGSolve")
     dipole = dipole_of(study)
     some = points[::ORACLE_POINTS]
-    ours = finite_element_part(study, some, session, columns=False).nominal
-    main_field = float(np.abs(vacuum_part(study, some) + ours).max())
+    ours = finite_element_part(build_magnet(study), some, session, columns=False).nominal
+    main_field = float(np.abs(vacuum_part(build_magnet(study), some) + ours).max())
     with ngsolve.TaskManager():
         theirs = oracle.vector_potential(dipole, oracle.eighth(dipole, 0.02), 4, some)
     note("response.error_against_ngsolve",
@@ -72,7 +73,7 @@ def matrix_error(
     """Largest change of predicted readings by a finer mesh, over 20 draws of magnetizations (1 %,
     1 degree), relative to the main field.
     """
-    finer, _ = built(refined(study, 4 / 3), points, session)
+    finer, _ = built(refined(build_magnet(study), 4 / 3).study, points, session)
     draws = nominal_prior(base.nominal, 3, 0.01, 1.0).sample(20, np.random.default_rng(1)).T
     scale = np.abs(base.matrix @ base.nominal).max()
     return float(np.abs(finer.matrix @ draws - base.matrix @ draws).max() / scale)
@@ -107,7 +108,7 @@ def magpylib_seconds(study: Study, points: np.ndarray) -> float:
     One ring is measured; the others are the same work.
     """
     started = time.monotonic()
-    ring = [block for block in blocks_of(study) if block.ring == 1]
+    ring = [block for block in build_magnet(study).blocks if block.ring == 1]
     for block in ring:
         middle = position_angle_deg(study.array, block.slot)
         half = 180 / study.array.blocks_per_ring
@@ -131,8 +132,9 @@ def against_ngsolve(
     """
     dipole = dipole_of(study)
     number = study.array.blocks_per_ring * (study.array.rings // 2 - 1) + 3
-    block = blocks_of(study)[number]
-    ours = solve_modes(study, points, [number], Session(find_getdp(), folder, jobs=2))[1]
+    block = build_magnet(study).blocks[number]
+    ours = solve_modes(build_magnet(study), points, [number],
+                       Session(find_getdp(), folder, jobs=2))[1]
     started = time.monotonic()
     mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     meshing = time.monotonic() - started
@@ -145,7 +147,7 @@ def against_ngsolve(
     total = meshing + one.setup + one.solve
     note("response.time_over_ngsolve_one_column", alone / total, "ratio",
          f"one column each; NGSolve {total:.0f} s by conjugate gradients")
-    total = meshing + many.setup + many.solve * 3 * len(blocks_of(study))
+    total = meshing + many.setup + many.solve * 3 * len(build_magnet(study).blocks)
     note("response.time_over_ngsolve", seconds / total, "ratio",
          f"all columns; NGSolve {total:.0f} s, extrapolated from one: factorized once, "
          f"{many.solve:.1f} s each")
@@ -166,14 +168,14 @@ def symmetry(study: Study, folder: Path, note: Note) -> None:
     for used in (True, False):
         started = time.monotonic()
         variant = parse_study(changed(document, solver__symmetry=used))
-        parts = finite_element_part(variant, points, session)
+        parts = finite_element_part(build_magnet(variant), points, session)
         fields.append(sum(parts.block(n, slice(None)) @ (np.array(b.easy_axis) * b.remanence)
-                          for n, b in enumerate(blocks_of(short))))
+                          for n, b in enumerate(build_magnet(short).blocks)))
         seconds.append(time.monotonic() - started)
     note("response.symmetry_speedup", seconds[1] / seconds[0], "ratio",
-         f"all {3 * len(blocks_of(short))} columns of 2 rings on one 3D mesh, one by one")
+         f"all {3 * len(build_magnet(short).blocks)} columns of 2 rings on one 3D mesh, one by one")
     observation = observe(short, points, np.ones_like(points, bool))
-    stated = reading_errors(short, observation, parts, session).max()
+    stated = reading_errors(build_magnet(short), observation, parts, session).max()
     note("response.symmetry_difference", float(np.abs(fields[0] - fields[1]).max() / stated),
          "of the stated error", "the array's reaction, with and without symmetry")
 

@@ -28,7 +28,7 @@ from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.cli import main as halbach_fe
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -83,7 +83,7 @@ def write_campaign(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """A study and a map of it by magpylib, the truth being drawn from its prior."""
     generator = np.random.default_rng(1)
     study = parse_study(document)
-    nominal = np.concatenate([block.magnetization for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization for block in build_magnet(study).blocks])
     prior = study.prior
     truth = nominal_prior(nominal, 3, prior.magnitude_sd, prior.direction_sd_deg,
                         prior.common_mode_sd).sample(1, generator)[0]
@@ -103,12 +103,13 @@ def infer(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise RuntimeError("halbach-fe infer failed")
     study = parse_study(document)
     points = points_from(study.observation.positions)
-    foretold = estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1)
+    foretold = estimate_infer(build_magnet(study),
+                              observe(study, points, np.ones_like(points, bool)), 1)
     summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
     written = {path.name: path.stat().st_size / 2**20 for path in (folder / "out").iterdir()}
     unseen = next(one for one in summary["scores"] if one["part"] != "training")
     return {
-        "blocks": len(blocks_of(study)), "readings": summary["readings"],
+        "blocks": len(build_magnet(study).blocks), "readings": summary["readings"],
         "parameters": summary["parameters"], "learnt": summary["parameters_learnt"],
         "chi2_held_out": unseen["chi2_posterior"], "held_out": unseen["readings"],
         "foretold_GiB": foretold.memory_GiB, "foretold_s": foretold.seconds,
@@ -143,10 +144,12 @@ def modes(size: float, jobs: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_modes(study, points, range(0, 96, 16), Session(scales.getdp, Path(name), jobs=jobs))
+        solve_modes(build_magnet(study), points, range(0, 96, 16),
+                    Session(scales.getdp, Path(name), jobs=jobs))
         seconds, peak = time.monotonic() - started, scales.peak
     problem = max(
-        estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
+        estimate_infer(build_magnet(study), observe(study, points, np.ones_like(points, bool)),
+                       1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": jobs, "seconds": seconds,
             "getdp_GiB": peak}
@@ -164,10 +167,11 @@ def solid(size: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         scales = Weighed.of(find_getdp(), Path(name))
         started = time.monotonic()
-        solve_nominal(study, points, Session(scales.getdp, Path(name), jobs=1))
+        solve_nominal(build_magnet(study), points, Session(scales.getdp, Path(name), jobs=1))
         seconds, peak = time.monotonic() - started, scales.peak
     problem = max(
-        estimate_infer(study, observe(study, points, np.ones_like(points, bool)), 1).problems,
+        estimate_infer(build_magnet(study), observe(study, points, np.ones_like(points, bool)),
+                       1).problems,
                   key=lambda one: one.unknowns)
     return {"unknowns": problem.unknowns, "jobs": 1, "seconds": seconds,
             "getdp_GiB": peak}

@@ -11,6 +11,7 @@ import argparse
 
 from halbach_fe.cli import common
 from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.reader import read_study
 
 
@@ -30,8 +31,9 @@ def run(arguments: argparse.Namespace) -> int:
     )
 
     study = read_study(arguments.study)
+    magnet = build_magnet(study)
     with common.session(arguments) as session:
-        found = demagnetization_map(study, session, arguments.across)
+        found = demagnetization_map(magnet, session, arguments.across)
     write_demagnetization(found, arguments.output)
     summary = demagnetization_summary(found)
     if arguments.json:

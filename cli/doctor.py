@@ -13,6 +13,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.solver.getdp import GetDP, blas_of, find_getdp
@@ -89,5 +90,5 @@ def solve_error(getdp: GetDP, method: str) -> float:
     points = 0.07 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     exact = layered_bore_field(ideal_sectors(1, 16, 1.0), inner, outer, mu, points[:, :2], iron)
     with tempfile.TemporaryDirectory() as folder:
-        found = solve_nominal(study, points, Session(getdp, Path(folder)))[:, :2]
+        found = solve_nominal(build_magnet(study), points, Session(getdp, Path(folder)))[:, :2]
     return float(np.abs(found - exact).max() / np.abs(exact).max())

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer, observation_of
 from halbach_fe.inference.storage import inference_summary, write_inference
 from halbach_fe.measurement.block_table import read_blocks
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Infer, write everything, print the before/after table."""
     study, data = read_study(arguments.study), read_map(arguments.measurements)
+    magnet = build_magnet(study)
     if arguments.samples and not is_nonlinear(study):
         raise StudyError(
             f"Input --samples must go with iron that has an H(B) curve; study {study.name} is "
@@ -49,13 +51,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         if arguments.samples:
             common.say("The chains of --samples are not counted.")
-        found = estimate_infer(study, observation_of(study, data, blocks, unseen),
+        found = estimate_infer(magnet, observation_of(magnet, data, blocks, unseen),
                                common.jobs(arguments))
         return common.print_estimate(found, arguments.json)
     from halbach_fe.report.inference import score_table, write_inference_report
 
     with common.session(arguments) as session:
-        update = infer(study, data, session, blocks, linearized_only=bool(arguments.samples),
+        update = infer(magnet, data, session, blocks, linearized_only=bool(arguments.samples),
                        unseen=unseen)
         if arguments.samples:
             write_inference(update, arguments.output)  # should the chains not do

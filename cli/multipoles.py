@@ -13,6 +13,7 @@ from pathlib import Path
 
 from halbach_fe.cli import common
 from halbach_fe.design.tolerance import assembled_prior
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.storage import read_posterior
 from halbach_fe.response.multipoles import multipole_models, text_table
 from halbach_fe.study.reader import read_study
@@ -31,13 +32,15 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.multipoles import multipoles_summary, write_multipoles
 
     study, wanted = read_study(arguments.study), common.reference(arguments)
-    known = read_posterior(study, arguments.posterior) if arguments.posterior else None
+    magnet = build_magnet(study)
+    known = read_posterior(magnet,
+                           arguments.posterior) if arguments.posterior else None
     references = [wanted]
     if study.dimension == 3:
         references = [replace(wanted, z_m=None), replace(wanted, z_m=wanted.z_m or 0.0)]
     with common.session(arguments) as session:
-        models = multipole_models(study, references, session)
-    magnets = known or {"prior": assembled_prior(study, models[0].nominal)}
+        models = multipole_models(magnet, references, session)
+    magnets = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     tables = [(model, {name: model.of(one) for name, one in magnets.items()}) for model in models]
     limit = arguments.limit_units
     write_multipoles(study, tables, limit, arguments.output, {

@@ -10,6 +10,7 @@ import argparse
 
 from halbach_fe.cli import common
 from halbach_fe.design.measurement_plan import plan_measurement
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.reader import read_study
 
 
@@ -25,9 +26,10 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.plan import plan_summary, write_plan  # matplotlib loads when needed
 
     study = read_study(arguments.study)
+    magnet = build_magnet(study)
     with common.session(arguments) as session:
-        found = plan_measurement(study, session, arguments.points)
-    write_plan(study, found, arguments.output)
+        found = plan_measurement(magnet, session, arguments.points)
+    write_plan(magnet, found, arguments.output)
     if arguments.json:
         common.print_json(plan_summary(found))
     else:

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.study.reader import read_study
@@ -28,10 +29,11 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.prior import prior_summary, type_table, write_prior
 
     study = read_study(arguments.study)
-    prior = prior_from_blocks(study, read_blocks(arguments.blocks))
-    write_prior(study, prior, arguments.output)
+    magnet = build_magnet(study)
+    prior = prior_from_blocks(magnet, read_blocks(arguments.blocks))
+    write_prior(magnet, prior, arguments.output)
     if arguments.json:
-        common.print_json(prior_summary(study, prior))
+        common.print_json(prior_summary(magnet, prior))
     else:
         common.print_table(type_table(prior), "Measured blocks relative to the nominal, by type")
         common.say(f"Report: {arguments.output / 'prior.html'}")

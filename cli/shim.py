@@ -15,6 +15,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.shimming import shim
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import read_map
@@ -50,11 +51,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
                          "replaced; instead it is alone. Add --replace.")
     study, data = read_study(arguments.study), read_map(arguments.measurements)
+    magnet = build_magnet(study)
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     stock = read_blocks(arguments.stock) if arguments.stock else None
     with common.session(arguments) as session:
-        update = infer(study, data, session, blocks)
-        model = multipole_model(study, common.reference(arguments), replace(
+        update = infer(magnet, data, session, blocks)
+        model = multipole_model(magnet, common.reference(arguments), replace(
             session, folder=arguments.output / "multipoles"))
     found = shim(update, model, np.random.default_rng(arguments.seed), {
         "swap": arguments.swaps, "turn": arguments.turns, "replace": arguments.replace},

@@ -16,6 +16,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -36,21 +37,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write the maps, print a summary."""
     study = read_study(arguments.study)
+    magnet = build_magnet(study)
     points = points_from(study.observation.positions)
     started = time.monotonic()
     observation = observe(study, points, np.ones_like(points, bool))
     read_at = observation.points  # where the instrument's probe is then
     elsewhere = not np.array_equal(read_at, points)
     places = np.vstack([points, read_at]) if elsewhere else points
-    check_points(study, places)
+    check_points(magnet, places)
     if arguments.dry_run:
         return common.print_estimate(
-            estimate_solve(study, observation, common.jobs(arguments)), arguments.json)
+            estimate_solve(magnet, observation, common.jobs(arguments)),
+            arguments.json)
     from halbach_fe.report.solution import Solution, write_solution_report  # matplotlib when needed
 
     with common.session(arguments) as session:
-        part = finite_element_part(study, places, session, columns=False)
-        field = vacuum_part(study, places) + part.nominal
+        part = finite_element_part(magnet, places, session, columns=False)
+        field = vacuum_part(magnet, places) + part.nominal
         flux_density = field[:len(points)]
         data = field_map(points, flux_density, attributes={
             "study": study.name, "halbach_fe": metadata.version("halbach-fe"),
@@ -58,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         for suffix in (".h5", ".csv", ".vtu"):
             write_map(data, arguments.output / f"field_map{suffix}")
         last = slice(-len(read_at), None)
-        errors = reading_errors(study, observation, replace(
+        errors = reading_errors(magnet, observation, replace(
             part, nominal=part.nominal[last], error=None if part.error is None
             else part.error[last]), error_bar_session(session))
     readings = observation.apply(field[last])
@@ -77,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         "largest_error_T": float(errors.max()), "mean_B_T": flux_density.mean(axis=0).tolist(),
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output),
     }
-    write_solution_report(Solution(study, points, flux_density, observation, readings, errors, {
+    write_solution_report(Solution(magnet, points, flux_density, observation, readings, errors, {
         "study file": common.digest(arguments.study), "GetDP": session.getdp.version,
         "method": study.solver.method, "points, readings": f"{len(points)}, {len(readings)}",
         "solved in": f"{summary['seconds']} s"}), arguments.output)

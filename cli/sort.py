@@ -13,6 +13,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.design.sorting import sort_blocks
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.response.multipoles import multipole_model
 from halbach_fe.study.reader import read_study
@@ -32,10 +33,12 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.sorting import order_table, sort_summary, write_sorted
 
     study, table = read_study(arguments.study), read_blocks(arguments.blocks)
+    magnet = build_magnet(study)
     with common.session(arguments) as session:
-        model = multipole_model(study, common.reference(arguments), session)
+        model = multipole_model(magnet, common.reference(arguments), session)
     with common.progress_bar("sorting") as show:
-        found = sort_blocks(study, table, model, np.random.default_rng(arguments.seed), show)
+        found = sort_blocks(magnet, table, model,
+                            np.random.default_rng(arguments.seed), show)
     write_sorted(found, arguments.limit_units, arguments.output)
     if arguments.json:
         common.print_json(sort_summary(found, arguments.limit_units))

@@ -12,6 +12,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.design.tolerance import assembled_prior, predict_tolerance
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.response.multipoles import multipole_model
@@ -34,12 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.tolerance import quantile_table, tolerance_summary, write_tolerance
 
     study = read_study(arguments.study)
+    magnet = build_magnet(study)
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.session(arguments) as session:
-        model = multipole_model(study, common.reference(arguments), session)
-    prior = (prior_from_blocks(study, blocks).gaussian if blocks
-             else assembled_prior(study, model.nominal))
-    found = predict_tolerance(model, study, prior, arguments.draws,
+        model = multipole_model(magnet, common.reference(arguments), session)
+    prior = (prior_from_blocks(magnet, blocks).gaussian if blocks
+             else assembled_prior(magnet, model.nominal))
+    found = predict_tolerance(model, magnet, prior, arguments.draws,
                               np.random.default_rng(arguments.seed),
                       arguments.limit_units)
     write_tolerance(found, arguments.output)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.response.mesh_convergence import verify
 from halbach_fe.response.resource_estimate import estimate_verify
 from halbach_fe.study.reader import read_study
@@ -26,17 +27,19 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.verification import difference_table, verdict, write_verification
 
     study = read_study(arguments.study)
+    magnet = build_magnet(study)
     if arguments.dry_run:
-        return common.print_estimate(estimate_verify(study, common.jobs(arguments)), arguments.json)
+        return common.print_estimate(estimate_verify(magnet, common.jobs(arguments)),
+                                     arguments.json)
     with common.session(arguments) as session:
-        found = verify(study, session, say=lambda what: common.say(f"solving {what}"))
-    write_verification(study, found, arguments.output, {
+        found = verify(magnet, session, say=lambda what: common.say(f"solving {what}"))
+    write_verification(magnet, found, arguments.output, {
         "GetDP": session.getdp.version, "study file": common.digest(arguments.study)})
     if arguments.json:
         common.print_json(found.plain())
     else:
         common.print_table(difference_table(found),
                            f"Route {found.route}; relative to {found.main_field_T:.4g} T")
-        common.say(verdict(study, found))
+        common.say(verdict(magnet, found))
         common.say(f"Report: {arguments.output / 'verification.html'}")
     return 0

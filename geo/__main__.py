@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from halbach_fe.core.errors import HalbachError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.mesh import build_mesh
 from halbach_fe.study.reader import read_study
 
@@ -16,7 +17,7 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
     arguments = parser.parse_args()
     try:
-        mesh = build_mesh(read_study(arguments.study), arguments.output)
+        mesh = build_mesh(build_magnet(read_study(arguments.study)), arguments.output)
     except HalbachError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code

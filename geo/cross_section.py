@@ -11,11 +11,10 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.domain import boundary_radius, magnet_radius
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.domain import boundary_radius
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.geometry.regions import BlockRegion, Regions
-from halbach_fe.study.model import Study
 
 LINE, TRIANGLE = 1, 2  # Gmsh's element types
 COUNTED = 4000
@@ -30,23 +29,23 @@ that grows with this power of the refinement: measured 0.55 to 0.85 on four cros
 trapezoids, cubes and sectors, in steps of two; of a quarter of the triangles, an error of 3 %."""
 
 
-def mesh_2d(study: Study, mesh_path: Path) -> Regions:
+def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
     """Mesh the cross-section with curved second-order triangles and return its regions."""
-    blocks = blocks_of(study)
-    with gmsh_session(study.name):
-        radius = boundary_radius(study, "cross_section")
-        surfaces = draw(study, blocks, radius)
+    blocks = magnet.blocks
+    with gmsh_session(magnet.name):
+        radius = boundary_radius(magnet, "cross_section")
+        surfaces = draw(magnet, blocks, radius)
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(2)
         for tag, entities in surfaces.items():
             gmsh.model.addPhysicalGroup(2, entities, tag)
         gmsh.model.addPhysicalGroup(1, outer_curves(radius), tags.OUTER_BOUNDARY_TAG)
         write_mesh(mesh_path)
-    return regions_of(study, blocks)
+    return regions_of(magnet, blocks)
 
 
 def draw(
-    study: Study, blocks: tuple[MagnetBlock, ...], radius: float
+    magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float
 ) -> dict[int, list[int]]:
     """Draw the first ring's cross-section in a disk of ``radius`` (m); return physical tag ->
     surfaces (none empty).
@@ -57,9 +56,9 @@ def draw(
     disk = [(2, occ.addDisk(0, 0, 0, radius, radius))]
     drawn = [(tags.FIRST_BLOCK_TAG + i, (2, _surface(block.outline)))
              for i, block in enumerate(blocks) if block.ring == 1]
-    if study.iron_ring is not None:
+    if magnet.iron_ring is not None:
         loops = [occ.addCurveLoop([occ.addCircle(0, 0, 0, radius)])
-                 for radius in (study.iron_ring.outer_radius_m, study.iron_ring.inner_radius_m)]
+                 for radius in (magnet.iron_ring.outer_radius_m, magnet.iron_ring.inner_radius_m)]
         drawn.append((tags.IRON_TAG, (2, occ.addPlaneSurface(loops))))
     _, children = occ.fragment(disk, [entity for _, entity in drawn])
     occ.synchronize()
@@ -71,7 +70,7 @@ def draw(
     _check_shared(surfaces)
     solid = {entity for pieces in surfaces.values() for entity in pieces}
     surfaces[tags.AIR_TAG] = [entity for _, entity in children[0] if entity not in solid]
-    _set_sizes(study)
+    _set_sizes(magnet)
     return surfaces
 
 
@@ -86,22 +85,22 @@ def _check_shared(surfaces: dict[int, list[int]]) -> None:
                     f"{owner[piece]} and {tag} overlap. Reduce the block's width.")
 
 
-def plane_size(study: Study, kind: str) -> tuple[float, float]:
+def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     """About how many triangles, and edges on the outer circle, the plane mesh of a study has, for
     a kind of mesh (`extent.BOUNDARY_RATIO`).
 
     Fine meshes and large rings are not made: one with larger elements is, and one or two with some
     of the blocks, and nothing is written.
     """
-    blocks = blocks_of(study)[:study.array.blocks_per_ring]
-    radius = boundary_radius(study, kind)
-    wanted = _equilateral(study, radius)
+    blocks = magnet.blocks[:magnet.array.blocks_per_ring]
+    radius = boundary_radius(magnet, kind)
+    wanted = _equilateral(magnet, radius)
     coarser = max(1.0, (wanted / COUNTED) ** 0.5)
-    mesh = study.mesh
+    mesh = magnet.study.mesh
     # not validated: it may be coarser than anybody should ask for
-    drawn = study.model_copy(update={"mesh": mesh.model_copy(update={
+    drawn = magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m * coarser,
-        "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})})
+        "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})}))
     triangles, rim = _counted(drawn, blocks[:DRAWN], radius)
     more = triangles - _equilateral(drawn, radius)  # along curves
     if len(blocks) > DRAWN:  # every further one adds the same
@@ -110,22 +109,22 @@ def plane_size(study: Study, kind: str) -> tuple[float, float]:
     return wanted + more * coarser**ALONG_CURVES, rim
 
 
-def _counted(study: Study, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
+def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
     """Triangles, and edges on the outer circle, of a plane mesh with some of the blocks."""
-    with gmsh_session(study.name):
-        draw(study, blocks, radius)
+    with gmsh_session(magnet.name):
+        draw(magnet, blocks, radius)
         gmsh.model.mesh.generate(2)
         mesh = gmsh.model.mesh
         rim = sum(len(mesh.getElementsByType(LINE, curve)[0]) for curve in outer_curves(radius))
         return len(mesh.getElementsByType(TRIANGLE)[0]), rim
 
 
-def _equilateral(study: Study, radius: float) -> float:
+def _equilateral(magnet: Magnet, radius: float) -> float:
     """Equilateral triangles of the wanted size (see `_set_sizes`) that fill the disk."""
-    mesh, bore, magnet = study.mesh, study.array.inner_radius_m, magnet_radius(study)
+    mesh, bore = magnet.study.mesh, magnet.array.inner_radius_m
     r = np.concatenate([[0.0], np.geomspace(bore, radius, 2000)])
     middle = (r[1:] + r[:-1]) / 2
-    size = mesh.block_size_m + (mesh.growth - 1) * np.maximum(middle - magnet, 0)
+    size = mesh.block_size_m + (mesh.growth - 1) * np.maximum(middle - magnet.radius, 0)
     size[0] = mesh.bore_size_m or mesh.block_size_m
     return float(np.sum(np.pi * np.diff(r**2) / (np.sqrt(3) / 4 * size**2)))
 
@@ -141,11 +140,11 @@ def outer_curves(radius: float) -> list[int]:
     return found
 
 
-def regions_of(study: Study, blocks: tuple[MagnetBlock, ...]) -> Regions:
+def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
     """The region file's content; block tags count on from FIRST_BLOCK_TAG in block order."""
     return Regions(
-        study=study.name, dimension=study.dimension, air=tags.AIR_TAG,
-        iron=None if study.iron_ring is None else tags.IRON_TAG,
+        study=magnet.name, dimension=magnet.dimension, air=tags.AIR_TAG,
+        iron=None if magnet.iron_ring is None else tags.IRON_TAG,
         outer_boundary=tags.OUTER_BOUNDARY_TAG,
         blocks=tuple(
             BlockRegion(name=block.name, ring=block.ring, slot=block.slot,
@@ -169,23 +168,23 @@ def _surface(outline: Outline) -> int:
     return int(occ.addPlaneSurface([occ.addCurveLoop(curves)]))
 
 
-def _set_sizes(study: Study) -> None:
+def _set_sizes(magnet: Magnet) -> None:
     """Element size: the bore's, the blocks', then growing linearly towards the boundary.
 
     As fields of Gmsh's own: a Python callback would swallow Ctrl-C in the midst of meshing.
     """
-    block_size = study.mesh.block_size_m
-    bore_size = study.mesh.bore_size_m or block_size
-    rise, magnet = study.mesh.growth - 1, magnet_radius(study)
+    block_size = magnet.study.mesh.block_size_m
+    bore_size = magnet.study.mesh.bore_size_m or block_size
+    rise, outer_radius = magnet.study.mesh.growth - 1, magnet.radius
     field = gmsh.model.mesh.field
     constant, growing, bore = field.add("MathEval"), field.add("MathEval"), field.add("Cylinder")
     field.setString(constant, "F", f"{block_size:.17g}")
     field.setString(growing, "F",
-                    f"{block_size:.17g} + {rise:.17g} * (sqrt(x^2 + y^2) - {magnet:.17g})")
+                    f"{block_size:.17g} + {rise:.17g} * (sqrt(x^2 + y^2) - {outer_radius:.17g})")
     outside = field.add("Max")
     field.setNumbers(outside, "FieldsList", [constant, growing])
     finer = bore_size < block_size
-    for name, value in (("Radius", study.array.inner_radius_m * (1 - 1e-9)), ("ZAxis", 1.0),
+    for name, value in (("Radius", magnet.array.inner_radius_m * (1 - 1e-9)), ("ZAxis", 1.0),
                         ("VIn", bore_size), ("VOut", 1e22 if finer else 0.0)):
         field.setNumber(bore, name, value)
     size = field.add("Min" if finer else "Max")

@@ -19,9 +19,8 @@ from halbach_fe.geo.cross_section import draw, regions_of
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
-from halbach_fe.geometry.magnet import blocks_of, iron_half_length, ring_limits
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import Regions
-from halbach_fe.study.model import Study
 
 TRIANGLE6, TETRAHEDRON10 = 9, 11  # Gmsh's element types
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))
@@ -33,31 +32,31 @@ CUTS = (((0, 0), (1, 0), (2, 0), (2, 1)), ((0, 0), (1, 0), (1, 1), (2, 1)),
         ((0, 0), (0, 1), (1, 1), (2, 1)))
 
 
-def mesh_3d(study: Study, mesh_path: Path) -> Regions:
+def mesh_3d(magnet: Magnet, mesh_path: Path) -> Regions:
     """Mesh a 3D study with curved second-order tetrahedra and return its regions."""
-    blocks = blocks_of(study)
-    with gmsh_session(study.name):
-        surfaces = draw(study, blocks, boundary_radius(study, "extruded"))
+    blocks = magnet.blocks
+    with gmsh_session(magnet.name):
+        surfaces = draw(magnet, blocks, boundary_radius(magnet, "extruded"))
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(2)
         points, triangles, region = _plane_mesh(surfaces)
-        z = layers(study)
-        gmsh.model.add(f"{study.name}-3d")
-        _stack(study, points, triangles, region, z)
+        z = layers(magnet)
+        gmsh.model.add(f"{magnet.name}-3d")
+        _stack(magnet, points, triangles, region, z)
         write_mesh(mesh_path)
-    return regions_of(study, blocks)
+    return regions_of(magnet, blocks)
 
 
-def layers(study: Study) -> Floats:
+def layers(magnet: Magnet) -> Floats:
     """z of the layer limits in m, from boundary to boundary.
 
     Layers are uniform within rings and for one bore radius beyond the ends, where readings are
     dense; then they grow.
     """
-    assert study.array.ring_length_m is not None
-    iron_end = iron_half_length(study)
-    thickness = study.array.ring_length_m / study.mesh.layers_per_ring
-    limits = {limit for ring in ring_limits(study) for limit in ring} | {-iron_end, iron_end}
+    assert magnet.array.ring_length_m is not None
+    iron_end = magnet.iron_half_length
+    thickness = magnet.array.ring_length_m / magnet.study.mesh.layers_per_ring
+    limits = {limit for ring in magnet.ring_limits for limit in ring} | {-iron_end, iron_end}
     # Rounding must not leave slivers between limits that are meant to be equal.
     stops = sorted(limits)
     stops = [stops[0]] + [b for a, b in pairwise(stops) if b - a > 1e-9]
@@ -65,17 +64,17 @@ def layers(study: Study) -> Floats:
     for start, stop in pairwise(stops):
         count = max(1, int(np.ceil((stop - start) / thickness - 1e-6)))
         z += list(np.linspace(start, stop, count + 1)[1:])
-    outside = _outside_layers(z[-1], thickness, study)
+    outside = _outside_layers(z[-1], thickness, magnet)
     return np.array([-value for value in reversed(outside)] + z + outside)
 
 
-def _outside_layers(start: float, thickness: float, study: Study) -> list[float]:
-    boundary = boundary_half_length(study, "extruded")
+def _outside_layers(start: float, thickness: float, magnet: Magnet) -> list[float]:
+    boundary = boundary_half_length(magnet, "extruded")
     z, size = [], thickness
     position = start
     while position < boundary:
-        if position - start > study.array.inner_radius_m:
-            size *= study.mesh.growth
+        if position - start > magnet.array.inner_radius_m:
+            size *= magnet.study.mesh.growth
         position = boundary if boundary - position < 1.5 * size else position + size
         z.append(position)
     return z
@@ -104,7 +103,7 @@ def _plane_mesh(surfaces: dict[int, list[int]]) -> tuple[Floats, Ints, Ints]:
 
 
 def _stack(
-    study: Study, points: Floats, triangles: Ints, region: Ints, z: Floats
+    magnet: Magnet, points: Floats, triangles: Ints, region: Ints, z: Floats
 ) -> None:
     """Build the 3D mesh as discrete Gmsh entities, one per region, ready to be written.
 
@@ -116,10 +115,10 @@ def _stack(
     nodes = np.column_stack([np.tile(points, (len(heights), 1)), np.repeat(heights, count)])
     cells = _tetrahedra(triangles, count)
     faces = [triangles, triangles + 2 * (levels - 1) * count]
-    rim = _rim(points, triangles, boundary_radius(study, "extruded"))
+    rim = _rim(points, triangles, boundary_radius(magnet, "extruded"))
     volumes: dict[int, list[Ints]] = {}
     for level in range(levels - 1):
-        materials = np.repeat(_layer_tags(study, region, (z[level] + z[level + 1]) / 2), len(CUTS))
+        materials = np.repeat(_layer_tags(magnet, region, (z[level] + z[level + 1]) / 2), len(CUTS))
         shifted = cells + 2 * level * count
         for tag in np.unique(materials).tolist():
             volumes.setdefault(tag, []).append(shifted[materials == tag])
@@ -174,14 +173,14 @@ def _side_faces(rim: Ints, count: int) -> Ints:
     return np.vstack([lower, upper])
 
 
-def _layer_tags(study: Study, region: Ints, z: float) -> Ints:
+def _layer_tags(magnet: Magnet, region: Ints, z: float) -> Ints:
     """Physical tags of plane cells in the layer around height z."""
     result = np.full(len(region), tags.AIR_TAG)
-    for ring, (low, high) in enumerate(ring_limits(study)):
+    for ring, (low, high) in enumerate(magnet.ring_limits):
         if low < z < high:
             block = region >= tags.FIRST_BLOCK_TAG
-            result[block] = region[block] + ring * study.array.blocks_per_ring
-    if abs(z) < iron_half_length(study):
+            result[block] = region[block] + ring * magnet.array.blocks_per_ring
+    if abs(z) < magnet.iron_half_length:
         result[region == tags.IRON_TAG] = tags.IRON_TAG
     return result
 

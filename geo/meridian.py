@@ -15,57 +15,56 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius, magnet_half_length
-from halbach_fe.geometry.magnet import array_half_length, iron_half_length, ring_limits
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import BlockRegion, Regions
-from halbach_fe.study.model import Study
 
 LINE, QUADRANGLE = 1, 3  # Gmsh's element types
 _GROWTH = 1.35
 _GRADING, _LEVELS = 0.3, 2  # ratio of neighbours towards a corner, and how many of them
 
 
-def mesh_meridian(study: Study, size: float, mesh_path: Path) -> Regions:
+def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
     """Mesh the half-plane with elements of ``size`` (m) at the magnet; return its regions."""
-    r, z = _radii(study, size), _heights(study, size)
-    with gmsh_session(study.name):
-        _build(study, r, z)
+    r, z = _radii(magnet, size), _heights(magnet, size)
+    with gmsh_session(magnet.name):
+        _build(magnet, r, z)
         write_mesh(mesh_path)
     return Regions(
-        study=study.name, dimension=2, air=tags.AIR_TAG,
-        iron=None if study.iron_ring is None else tags.IRON_TAG,
+        study=magnet.name, dimension=2, air=tags.AIR_TAG,
+        iron=None if magnet.iron_ring is None else tags.IRON_TAG,
         outer_boundary=tags.OUTER_BOUNDARY_TAG, axis=tags.AXIS_TAG,
         blocks=tuple(BlockRegion(name=f"r{ring:02d}", ring=ring, slot=0,
                                  tag=tags.FIRST_BLOCK_TAG + ring - 1)
-                     for ring in range(1, study.array.rings + 1)))
+                     for ring in range(1, magnet.array.rings + 1)))
 
 
-def grid_size(study: Study, size: float) -> tuple[int, int]:
+def grid_size(magnet: Magnet, size: float) -> tuple[int, int]:
     """Numbers of nodes of the half-plane's mesh along r and z."""
-    return len(_radii(study, size)), len(_heights(study, size))
+    return len(_radii(magnet, size)), len(_heights(magnet, size))
 
 
-def _radii(study: Study, size: float) -> Floats:
-    array, iron = study.array, study.iron_ring
+def _radii(magnet: Magnet, size: float) -> Floats:
+    array, iron = magnet.array, magnet.iron_ring
     stops = [0.0, array.inner_radius_m, array.outer_radius_m]
     if iron is not None:
         stops += [iron.inner_radius_m, iron.outer_radius_m]
-    r = [*_uniform(stops, size), *_growing(stops[-1], size, boundary_radius(study, "meridian"))]
+    r = [*_uniform(stops, size), *_growing(stops[-1], size, boundary_radius(magnet, "meridian"))]
     return _graded(r, stops[1:])
 
 
-def _heights(study: Study, size: float) -> Floats:
-    end = magnet_half_length(study)
-    stops = {limit for ring in ring_limits(study) for limit in ring} | {-end, end}
-    stops |= {-iron_half_length(study), iron_half_length(study)} if study.iron_ring else set()
+def _heights(magnet: Magnet, size: float) -> Floats:
+    end = magnet.half_length
+    stops = {limit for ring in magnet.ring_limits for limit in ring} | {-end, end}
+    stops |= {-magnet.iron_half_length, magnet.iron_half_length} if magnet.iron_ring else set()
     # the fringe is as important as the body: one bore radius of uniform elements beyond the ends
-    boundary = boundary_half_length(study, "meridian")
-    uniform = min(end + 2 * study.array.inner_radius_m, 0.5 * (end + boundary))
+    boundary = boundary_half_length(magnet, "meridian")
+    uniform = min(end + 2 * magnet.array.inner_radius_m, 0.5 * (end + boundary))
     outside = _growing(uniform, size, boundary)
     inside = _uniform(sorted(stops | {-uniform, uniform}), size)
     z = [*(-value for value in reversed(outside)), *inside, *outside]
-    iron_end = iron_half_length(study) if study.iron_ring else end
-    ends = {array_half_length(study), iron_end}
+    iron_end = magnet.iron_half_length if magnet.iron_ring else end
+    ends = {magnet.array_half_length, iron_end}
     return _graded(z, [side * value for value in ends for side in (-1, 1)])
 
 
@@ -103,7 +102,7 @@ def _growing(start: float, size: float, stop: float) -> list[float]:
     return result
 
 
-def _build(study: Study, r: Floats, z: Floats) -> None:
+def _build(magnet: Magnet, r: Floats, z: Floats) -> None:
     """Tensor grid of rectangles as discrete Gmsh entities."""
     columns, rows = len(r), len(z)
     points = np.zeros((columns * rows, 3))
@@ -113,7 +112,7 @@ def _build(study: Study, r: Floats, z: Floats) -> None:
         np.arange(columns - 1), np.arange(rows - 1), indexing="ij"))
     corner = i * rows + j
     cells = np.column_stack([corner, corner + rows, corner + rows + 1, corner + 1])
-    material = _materials(study, (r[i] + r[i + 1]) / 2, (z[j] + z[j + 1]) / 2)
+    material = _materials(magnet, (r[i] + r[i + 1]) / 2, (z[j] + z[j + 1]) / 2)
 
     up, out = np.arange(rows - 1), np.arange(columns - 1) * rows
     axis = np.column_stack([up, up + 1])
@@ -133,13 +132,13 @@ def _build(study: Study, r: Floats, z: Floats) -> None:
         model.addPhysicalGroup(1, [tag], tag)
 
 
-def _materials(study: Study, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def _materials(magnet: Magnet, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     result = np.full(len(r), tags.AIR_TAG)
-    array, iron = study.array, study.iron_ring
-    magnet = (r > array.inner_radius_m) & (r < array.outer_radius_m)
-    for ring, (low, high) in enumerate(ring_limits(study)):
-        result[magnet & (z > low) & (z < high)] = tags.FIRST_BLOCK_TAG + ring
+    array, iron = magnet.array, magnet.iron_ring
+    inside = (r > array.inner_radius_m) & (r < array.outer_radius_m)
+    for ring, (low, high) in enumerate(magnet.ring_limits):
+        result[inside & (z > low) & (z < high)] = tags.FIRST_BLOCK_TAG + ring
     if iron is not None:
         result[(r > iron.inner_radius_m) & (r < iron.outer_radius_m)
-               & (np.abs(z) < iron_half_length(study))] = tags.IRON_TAG
+               & (np.abs(z) < magnet.iron_half_length)] = tags.IRON_TAG
     return result

@@ -18,17 +18,16 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import atomic
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import places_in
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.field import is_vacuum
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.magnet import BlockException, Demagnetization
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study, is_nonlinear
+from halbach_fe.study.model import Study
 
 ORDER = 6
 """Gauss points per panel, panels being no longer than half a cell: 1e-6 of the field."""
@@ -69,20 +68,26 @@ class DemagnetizationMap:
 
     Attributes
     ----------
-    study : Study
-        As it was given.
+    magnet : Magnet
+        As it was given, not at temperature.
     material : Demagnetization
     blocks : tuple of MagnetBlock
+        At temperature.
     cells : Cells
     along : ndarray, shape (cells,), in A/m
         H along the magnetization: negative where it is driven back.
     """
 
-    study: Study
+    magnet: Magnet
     material: Demagnetization
     blocks: tuple[MagnetBlock, ...]
     cells: Cells
     along: Floats
+
+    @property
+    def study(self) -> Study:
+        """The study whose magnet it is."""
+        return self.magnet.study
 
     @property
     def margin(self) -> Floats:
@@ -161,7 +166,8 @@ def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
                       * np.maximum(0.0, factor))
 
 
-def demagnetization_map(study: Study, session: Session, across: int = ACROSS) -> DemagnetizationMap:
+def demagnetization_map(magnet: Magnet, session: Session,
+                        across: int = ACROSS) -> DemagnetizationMap:
     """Compute H in all blocks of the nominal magnet, at the study's temperature.
 
     Parameters
@@ -174,31 +180,30 @@ def demagnetization_map(study: Study, session: Session, across: int = ACROSS) ->
     StudyError
         If the study does not say what its material withstands, or nothing is magnetized.
     """
-    material = study.demagnetization
+    material = magnet.study.demagnetization
     if material is None:
         raise StudyError(
-            f"Input `demagnetization` of study {study.name} must say what the material withstands; "
-            "instead it is missing. Add intrinsic_coercivity_A_per_m, remanence_coefficient_per_K "
+            f"Input `demagnetization` of study {magnet.name} must say what the material withstands;"
+            " instead it is missing. Add intrinsic_coercivity_A_per_m, remanence_coefficient_per_K "
             "and coercivity_coefficient_per_K from the data sheet, and temperature_C.")
-    warm = at_temperature(study, material)
-    blocks = blocks_of(warm)
+    warm = at_temperature(magnet, material)
+    blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]
     if not magnetized:
-        raise StudyError(f"Input `array` of study {study.name} must leave a block magnetized; "
+        raise StudyError(f"Input `array` of study {magnet.name} must leave a block magnetized; "
                          "instead every magnetization_factor is 0.")
     cells = cut(blocks, magnetized, across)
     field = _field_strength(warm, blocks, cells, session)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
-    return DemagnetizationMap(study, material, blocks, cells,
+    return DemagnetizationMap(magnet, material, blocks, cells,
                               np.einsum("nc,nc->n", field, easy[cells.block]))
 
 
-def at_temperature(study: Study, material: Demagnetization) -> Study:
-    """The study with the remanence that its blocks have at the material's temperature."""
+def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
+    """The magnet with the remanence that its blocks have at the material's temperature."""
     factor = float(remanence_factor(material, material.temperature_C))
-    array = study.array
-    return study.with_(array=array.with_(
-        exceptions=(*array.exceptions, BlockException(magnetization_factor=factor))))
+    return magnet.with_(array__exceptions=(
+        *magnet.array.exceptions, BlockException(magnetization_factor=factor)))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
@@ -247,24 +252,24 @@ def _count(length: float, size: float) -> int:
 
 
 def _field_strength(
-    study: Study, blocks: Sequence[MagnetBlock], cells: Cells, session: Session
+    magnet: Magnet, blocks: Sequence[MagnetBlock], cells: Cells, session: Session
 ) -> Floats:
     """H (cells, 3) in A/m."""
     points = cells.middles
     field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
-    if not is_vacuum(study):
-        reacting = study.with_(solver__method="reaction")
-        formulation = CROSS_SECTION if study.dimension == 2 else SCALAR_POTENTIAL
-        if is_nonlinear(study):
+    if not magnet.is_vacuum:
+        reacting = magnet.with_(solver__method="reaction")
+        formulation = CROSS_SECTION if magnet.dimension == 2 else SCALAR_POTENTIAL
+        if magnet.is_nonlinear:
             field += solve_tangent(reacting, points, (), session, formulation, anywhere=True)[0]
         else:
             field += solve_sources(reacting, points, (), session, formulation, anywhere=True)[0]
-        if study.dimension == 2:
+        if magnet.dimension == 2:
             # so far mu_0 H_vacuum + (mu_0 mu_r H + B_r) - (mu_0 H_vacuum + B_r); the scalar
             # potential gives mu_0 H itself
             tensors = np.array([block.recoil_tensor for block in blocks])[cells.block]
             field = np.linalg.solve(tensors, field[..., None])[..., 0]
-    return (field + external_field(study, points)) / MU_0
+    return (field + external_field(magnet, points)) / MU_0
 
 
 def write_vtu(found: DemagnetizationMap, path: Path) -> None:

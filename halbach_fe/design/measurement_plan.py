@@ -11,6 +11,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
@@ -21,7 +22,6 @@ from halbach_fe.stats.d_optimal import greedy, information
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import posterior
 from halbach_fe.stats.noise import NoiseCovariance
-from halbach_fe.study.model import Study
 
 CURVE_POINTS = 100
 """Numbers of points for which the study's own positions are judged."""
@@ -74,7 +74,7 @@ class MeasurementPlan:
         return float(np.exp(-difference / len(self.parameters)))
 
 
-def plan_measurement(study: Study, session: Session, count: int | None = None) -> MeasurementPlan:
+def plan_measurement(magnet: Magnet, session: Session, count: int | None = None) -> MeasurementPlan:
     """Choose positions for a study's next measurement.
 
     Parameters
@@ -88,31 +88,31 @@ def plan_measurement(study: Study, session: Session, count: int | None = None) -
     StudyError
         If there are fewer candidates, or the study does not observe flux densities.
     """
-    if study.observation.quantity != "flux_density":
+    if magnet.study.observation.quantity != "flux_density":
         raise StudyError(
-            f"Input `observation.quantity` of study {study.name} must be flux_density for a plan; "
-            f"instead it is {study.observation.quantity}. Plan the points first.")
-    baseline = points_from(study.observation.positions)
-    sets = study.plan.candidates or (study.observation.positions,)
+            f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
+            f"instead it is {magnet.study.observation.quantity}. Plan the points first.")
+    baseline = points_from(magnet.study.observation.positions)
+    sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
     places: list[Floats] = [points_from(one) for one in sets]
     candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
-    wanted = count or study.plan.points or len(baseline)
+    wanted = count or magnet.study.plan.points or len(baseline)
     if wanted > len(candidates):
         raise StudyError(
-            f"Input `plan.points` of study {study.name} must be at most the number of candidates, "
+            f"Input `plan.points` of study {magnet.name} must be at most the number of candidates, "
             f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
-    check_points(study, baseline)
+    check_points(magnet, baseline)
     try:
-        check_points(study, candidates)
+        check_points(magnet, candidates)
     except StudyError as error:
         raise StudyError(str(error).replace("observation.positions", "plan.candidates")) from None
     points = np.vstack([baseline, candidates])
-    observation = observe(study, points, np.ones_like(points, bool))
-    noise = reading_noise(study, observation, xr.Dataset())
-    model = response_matrix(study, observation, session)
+    observation = observe(magnet.study, points, np.ones_like(points, bool))
+    noise = reading_noise(magnet, observation, xr.Dataset())
+    model = response_matrix(magnet, observation, session)
     errors = noise.plus(model.error)
-    prior = nominal_prior(model.nominal, study.dimension, study.prior.magnitude_sd,
-                        study.prior.direction_sd_deg, study.prior.common_mode_sd)
+    prior = nominal_prior(model.nominal, magnet.dimension, magnet.study.prior.magnitude_sd,
+                        magnet.study.prior.direction_sd_deg, magnet.study.prior.common_mode_sd)
     size = len(observation) // len(points)  # readings at a point, which alone may be correlated
     whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.array_layout import facing_angle_deg, position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of, facing_angle_deg, position_angle_deg
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.magnet import BlockException
-from halbach_fe.study.model import Study
 
 DIRECTION = np.radians(2.0)
 """How far a nominal magnetization may be from where it should point. Exceptions of a study turn
@@ -75,16 +75,16 @@ class Mounts:
         return rotation_deg(self.turns[turn])
 
 
-def mounts_of(study: Study) -> Mounts:
+def mounts_of(magnet: Magnet) -> Mounts:
     """Slots of a study as its blocks stand in them."""
-    meant, built = blocks_of(as_meant(study)), blocks_of(study)
-    frames = np.array([rotation_about_z(np.radians(facing_angle_deg(study.array, block.slot)))
+    meant, built = as_meant(magnet).blocks, magnet.blocks
+    frames = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
                        for block in meant])
     kinds = _kinds(meant)
-    sources = np.array([source for source, _ in mountings(study)])
+    sources = np.array([source for source, _ in mountings(magnet)])
     return Mounts(
         tuple((block.ring, block.slot) for block in meant), frames,
-        shape_turns(_sides(study)), _directions(meant, frames), _directions(built, frames), kinds,
+        shape_turns(_sides(magnet)), _directions(meant, frames), _directions(built, frames), kinds,
         kinds[sources])
 
 
@@ -103,12 +103,12 @@ def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
     return np.asarray(turns[np.argsort(angle, kind="stable")])
 
 
-def _sides(study: Study) -> tuple[float, float, float] | None:
-    array = study.array
+def _sides(magnet: Magnet) -> tuple[float, float, float] | None:
+    array = magnet.array
     if array.block.shape != "cuboid":
         return None
     # in a cross-section no other side is as long as that along z
-    length = array.ring_length_m if study.dimension == 3 else None
+    length = array.ring_length_m if magnet.dimension == 3 else None
     return (array.outer_radius_m - array.inner_radius_m, array.block.width_m,
             length or 2 * array.outer_radius_m + array.block.width_m)
 
@@ -132,7 +132,7 @@ def rotation_deg(turn: Floats) -> tuple[float, float, float]:
     return x, y, z
 
 
-def remounted(study: Study, moved: Iterable[tuple[int, int, Floats]]) -> Study | None:
+def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magnet | None:
     """The study with blocks in other places, or None if its exceptions cannot express that.
 
     Parameters
@@ -141,7 +141,7 @@ def remounted(study: Study, moved: Iterable[tuple[int, int, Floats]]) -> Study |
         Where to and where from (slots counted from 0, ring by ring), and the matrix (3, 3) from
         the magnetization there to the one here, along the magnet's axes.
     """
-    array, before, old = study.array, mountings(study), blocks_of(study)
+    array, before, old = magnet.array, mountings(magnet), magnet.blocks
     moved = list(moved)
     exceptions, expected = [], {}
     for to, source, matrix in moved:
@@ -155,8 +155,8 @@ def remounted(study: Study, moved: Iterable[tuple[int, int, Floats]]) -> Study |
             rotation_deg=rotation_deg(here.T @ total @ there)
             if np.isclose(np.linalg.det(total), 1.0) else (0.0, 0.0, 0.0)))
         expected[to] = source, meant, total
-    changed = study.with_(array=array.with_(exceptions=array.exceptions + tuple(exceptions)))
-    after, new = mountings(changed), blocks_of(changed)
+    changed = magnet.with_(array__exceptions=array.exceptions + tuple(exceptions))
+    after, new = mountings(changed), changed.blocks
     for to, (source, meant, total) in expected.items():
         same = after[to][0] == meant and np.allclose(after[to][1], total, 0, EXACT)
         if not same or new[to].shift != old[to].shift or not np.allclose(

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.inference.block_prior import loose_blocks, types_of
 from halbach_fe.inference.result import InferenceResult
@@ -113,7 +113,7 @@ class Shim:
         Probability that all multipoles are within the limit, before and after.
     """
 
-    study: Study
+    magnet: Magnet
     model: MultipoleModel
     mounts: Mounts
     spares: tuple[str, ...]
@@ -129,6 +129,11 @@ class Shim:
         """Multipoles when all is done."""
         return self.steps[-1].after if self.steps else self.before
 
+    @property
+    def study(self) -> Study:
+        """The study whose magnet it is."""
+        return self.magnet.study
+
     @cached_property
     def shimmed_study(self) -> Study | None:
         """The study with the blocks that were moved, or None if it cannot say that: of a block
@@ -137,7 +142,8 @@ class Shim:
         slots = len(self.mounts.places)
         moved = [(one.to, one.block, self.matrix(one)) for step in self.steps
                  for one in step.move.placements if one.block < slots]
-        return remounted(self.study, moved) if moved else None
+        changed = remounted(self.magnet, moved) if moved else None
+        return None if changed is None else changed.study
 
     def matrix(self, placement: Placement) -> Floats:
         """From a block's magnetization where it stood to that where it goes, (3, 3)."""
@@ -311,9 +317,9 @@ def shim(
     MeasurementError
         If the stock does not fit the study.
     """
-    study = update.study
-    mounts = mounts_of(study)
-    spares = _stock(study, mounts, stock) if stock else _nominal(study, mounts)
+    magnet = update.magnet
+    mounts = mounts_of(magnet)
+    spares = _stock(magnet, mounts, stock) if stock else _nominal(magnet, mounts)
     if not budget.get("replace"):
         spares = _none()
     bench = _bench(update, model, mounts, spares)
@@ -326,7 +332,7 @@ def shim(
     within = None
     if limit is not None:
         within = goal.within(before), goal.within(steps[-1].after if steps else before)
-    return Shim(study, model, mounts, spares.names, before, steps, stop,
+    return Shim(magnet, model, mounts, spares.names, before, steps, stop,
                 {one.kind: len(one.parts) for one in candidates}, limit, within)
 
 
@@ -401,10 +407,10 @@ def _none() -> Spares:
                   np.zeros(0, int))
 
 
-def _nominal(study: Study, mounts: Mounts) -> Spares:
+def _nominal(magnet: Magnet, mounts: Mounts) -> Spares:
     """A new block for every slot, of which no more is known than the study's prior says."""
-    size, settings = study.dimension, study.prior
-    vectors = np.array([block.magnetization for block in blocks_of(as_meant(study))])
+    size, settings = magnet.dimension, magnet.study.prior
+    vectors = np.array([block.magnetization for block in as_meant(magnet).blocks])
     prior = nominal_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
                         settings.direction_sd_deg, settings.common_mode_sd)
     roots = np.asarray(prior.root).reshape(len(vectors), size, -1)
@@ -416,14 +422,15 @@ def _nominal(study: Study, mounts: Mounts) -> Spares:
                   mounts.wanted, mounts.kinds, np.arange(len(vectors)))
 
 
-def _stock(study: Study, mounts: Mounts, table: BlockTable) -> Spares:
+def _stock(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spares:
     """Measured blocks; the calibration of their coil counts as an error of each."""
-    size = study.dimension
-    mean, root = loose_blocks(study, table)
-    first = np.array([types_of(study)[label][0] - 1 for label in table.type])
+    size = magnet.dimension
+    mean, root = loose_blocks(magnet, table)
+    first = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
     own, spread = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     own[:, :size], spread[:, :size, :size] = mean, root
-    covariance = spread @ spread.transpose(0, 2, 1) + study.prior.common_mode_sd**2 * np.einsum(
+    covariance = spread @ spread.transpose(0, 2,
+                                           1) + magnet.study.prior.common_mode_sd**2 * np.einsum(
         "ni,nj->nij", own, own)
     return Spares(table.serial, own, covariance, mounts.wanted[first], mounts.kinds[first],
                   np.full(len(table), -1))

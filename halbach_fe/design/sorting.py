@@ -16,7 +16,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
-from halbach_fe.geometry.magnet import blocks_of, facing_angle_deg
+from halbach_fe.geometry.array_layout import facing_angle_deg
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import as_mounted, loose_blocks, types_of
 from halbach_fe.measurement.block_table import BlockTable
@@ -91,7 +92,7 @@ class _Bench:
 
 
 def sort_blocks(
-    study: Study, table: BlockTable, model: MultipoleModel, generator: np.random.Generator,
+    magnet: Magnet, table: BlockTable, model: MultipoleModel, generator: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sorted:
     """Assign blocks to slots within each type.
@@ -101,38 +102,38 @@ def sort_blocks(
     MeasurementError
         If the table does not fit the study, or has too few blocks of a type.
     """
-    bench = _bench(study, table, model)
-    _check_numbers(study, table)
+    bench = _bench(magnet, table, model)
+    _check_numbers(magnet, table)
     if len(set(table.type)) == len(table):
-        warnings.warn(f"Every block of study {study.name} is of a type of its own and fits one "
+        warnings.warn(f"Every block of study {magnet.name} is of a type of its own and fits one "
                       "slot only: there is nothing to sort. Say in prior.types which slots take "
                       "the same blocks, or measure spare ones.", HalbachWarning, stacklevel=2)
-    tolerance = ENOUGH * float(np.sum(_known(study, bench, _numbered(bench)).root ** 2))
+    tolerance = ENOUGH * float(np.sum(_known(magnet, bench, _numbered(bench)).root ** 2))
     best, least = _numbered(bench), np.inf
     for start in range(STARTS):
         order, square = _descent(bench, _random(bench, generator), tolerance)
         if square < least:
             best, least = order, square
         progress(start + 1, STARTS)
-    placed = _as_placed(table, study)
+    placed = _as_placed(table, magnet)
     own = _numbered(bench) if placed is None else placed
     totals = np.array([bench.total(_random(bench, generator)) for _ in range(RANDOM_ORDERS)])
     return Sorted(
-        study, model, _with_places(study, table, best), _known(study, bench, best),
-        _known(study, bench, own), np.sqrt(np.sum(totals**2, axis=1) / len(model.orders)),
+        magnet.study, model, _with_places(magnet, table, best), _known(magnet, bench, best),
+        _known(magnet, bench, own), np.sqrt(np.sum(totals**2, axis=1) / len(model.orders)),
         "as numbered" if placed is None else "as placed in the table")
 
 
-def _bench(study: Study, table: BlockTable, model: MultipoleModel) -> _Bench:
-    size, blocks = study.dimension, blocks_of(study)
-    vectors, roots = loose_blocks(study, table)
-    turns = np.array([rotation_about_z(np.radians(facing_angle_deg(study.array, block.slot)))
+def _bench(magnet: Magnet, table: BlockTable, model: MultipoleModel) -> _Bench:
+    size, blocks = magnet.dimension, magnet.blocks
+    vectors, roots = loose_blocks(magnet, table)
+    turns = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
                       for block in blocks])[:, :size, :size]
     columns = model.matrix.reshape(len(model.matrix), len(blocks), size)
     carried = np.einsum("ksi,sij->ksj", columns, turns)
     mean = np.einsum("ksj,bj->kbs", carried, vectors)
-    labels = {label: number for number, label in enumerate(types_of(study))}
-    of_slot = {slot: labels[label] for label, slots in types_of(study).items() for slot in slots}
+    labels = {label: number for number, label in enumerate(types_of(magnet))}
+    of_slot = {slot: labels[label] for label, slots in types_of(magnet).items() for slot in slots}
     # with the main multipole that the blocks have on average
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))
                                       / np.median(_sizes(model.nominal, size)))
@@ -149,9 +150,9 @@ def _sizes(vectors: Floats, size: int) -> Floats:
     return np.linalg.norm(vectors.reshape(-1, size), axis=1)
 
 
-def _check_numbers(study: Study, table: BlockTable) -> None:
-    for label, slots in types_of(study).items():
-        needed, there = len(slots) * study.array.rings, table.type.count(label)
+def _check_numbers(magnet: Magnet, table: BlockTable) -> None:
+    for label, slots in types_of(magnet).items():
+        needed, there = len(slots) * magnet.array.rings, table.type.count(label)
         if there < needed:
             raise MeasurementError(must_be(
                 f"blocks of type {label}", table.source, f"enough for the {needed} slots of that "
@@ -176,10 +177,10 @@ def _random(bench: _Bench, generator: np.random.Generator) -> Ints:
     return order
 
 
-def _as_placed(table: BlockTable, study: Study) -> Ints | None:
+def _as_placed(table: BlockTable, magnet: Magnet) -> Ints | None:
     """The order that the table itself has, if every slot has a block."""
     there = {place: row for row, place in enumerate(table.places) if place[0]}
-    places = [(block.ring, block.slot) for block in blocks_of(study)]
+    places = [(block.ring, block.slot) for block in magnet.blocks]
     if not all(place in there for place in places):
         return None
     return np.array([there[place] for place in places])
@@ -225,7 +226,7 @@ def _best_exchange(
     return float(falls[best]), int(spare[best - len(peers)]), None
 
 
-def _known(study: Study, bench: _Bench, order: Ints) -> Multipoles:
+def _known(magnet: Magnet, bench: _Bench, order: Ints) -> Multipoles:
     """Multipoles of an order, with what the table, the coil's calibration and the mounting leave
     open.
     """
@@ -235,17 +236,17 @@ def _known(study: Study, bench: _Bench, order: Ints) -> Multipoles:
     vectors = bench.vectors[order]
     mean = bench.model.offset + bench.mean[:, order, every].sum(axis=1)
     own = np.einsum("ksi,sij->ksj", carried, bench.roots[order]).reshape(len(mean), -1)
-    common = study.prior.common_mode_sd * np.einsum("ksi,si->k", carried, vectors)
+    common = magnet.study.prior.common_mode_sd * np.einsum("ksi,si->k", carried, vectors)
     turns = np.einsum("ksi,sia->ksa", carried, rotated(
-        vectors, np.radians(study.prior.mounting_sd_deg)))
+        vectors, np.radians(magnet.study.prior.mounting_sd_deg)))
     return bench.model.known(mean, np.hstack([
         own, common[:, None], turns.reshape(len(mean), -1)]))
 
 
-def _with_places(study: Study, table: BlockTable, order: Ints) -> BlockTable:
+def _with_places(magnet: Magnet, table: BlockTable, order: Ints) -> BlockTable:
     """The table with ring and slot; blocks left over have none, and the axes of the first slot."""
     ring, slot = np.zeros(len(table), int), np.zeros(len(table), int)
-    places = np.array([types_of(study)[label][0] - 1 for label in table.type])
-    for number, (row, block) in enumerate(zip(order, blocks_of(study), strict=True)):
+    places = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
+    for number, (row, block) in enumerate(zip(order, magnet.blocks, strict=True)):
         ring[row], slot[row], places[row] = block.ring, block.slot, number
-    return replace(table, ring=ring, slot=slot, moment=as_mounted(study, table, places))
+    return replace(table, ring=ring, slot=slot, moment=as_mounted(magnet, table, places))

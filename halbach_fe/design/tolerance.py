@@ -13,6 +13,7 @@ import numpy as np
 import scipy.linalg as linalg
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
 from halbach_fe.stats.gaussian import Gaussian, beside, by_block, nominal_prior, rotated
 from halbach_fe.study.model import Study
@@ -68,14 +69,14 @@ class Tolerance:
         return None if self.limit is None else np.mean(self.sizes <= self.limit, axis=0)
 
 
-def assembled_prior(study: Study, nominal: Floats) -> Gaussian:
+def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
     """The study's prior of magnets as they are assembled: blocks, calibration, and mounting.
 
     Parameters
     ----------
     nominal : ndarray, shape (parameters,), in A/m
     """
-    settings, size = study.prior, study.dimension
+    settings, size = magnet.study.prior, magnet.dimension
     blocks = nominal_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
                          settings.common_mode_sd)
     turns = rotated(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
@@ -83,7 +84,7 @@ def assembled_prior(study: Study, nominal: Floats) -> Gaussian:
 
 
 def predict_tolerance(
-    model: MultipoleModel, study: Study, prior: Gaussian, draws: int,
+    model: MultipoleModel, magnet: Magnet, prior: Gaussian, draws: int,
     generator: np.random.Generator, limit: float | None = None,
 ) -> Tolerance:
     """Draw magnets from a prior.
@@ -105,5 +106,6 @@ def predict_tolerance(
     count = len(mean)
     coefficients = mean + drawn[:, :count] + 1j * drawn[:, count:]
     sizes = np.hypot(*model.units(coefficients).reshape(draws, 2, -1).swapaxes(0, 1))
-    return Tolerance(study, model, model.known(mean, root), sizes, np.abs(coefficients[:, 0]),
+    return Tolerance(magnet.study, model, model.known(mean, root), sizes,
+                     np.abs(coefficients[:, 0]),
                      limit)

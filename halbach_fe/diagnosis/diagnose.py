@@ -47,6 +47,7 @@ from halbach_fe.diagnosis.search import (
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
 from halbach_fe.diagnosis.unknown_cause import find_unknown_cause
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
@@ -94,8 +95,8 @@ def diagnose(
     numerical: SolverErrorExplanation | None = None
 
     def updated(name: str) -> InferenceResult:
-        return infer(with_position_noise(apply_effects(read, named), vibration), data,
-                     _room(session, name), blocks,
+        changed = with_position_noise(apply_effects(read, named), vibration)
+        return infer(build_magnet(changed), data, _room(session, name), blocks,
                      unseen=unseen)
 
     for number in range(MOST_ROUNDS):

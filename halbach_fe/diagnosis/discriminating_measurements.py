@@ -33,7 +33,7 @@ from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
 from halbach_fe.geometry.domain import boundary_half_length
-from halbach_fe.geometry.magnet import array_half_length
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP
 from halbach_fe.measurement.instrument import map_time, probe_points
@@ -84,7 +84,7 @@ class ProposedScan:
         From B there to readings.
     noise : Noise
         Of the readings.
-    probe, magnet : ndarray, shape (3, 3)
+    probe_rotation, magnet_rotation : ndarray, shape (3, 3)
         How the probe stands in the mapper, and the magnet before it; the study has both straight.
     temperature_known : bool
     mapped : bool
@@ -95,8 +95,8 @@ class ProposedScan:
     time: Floats
     analysis: sparse.csr_array
     noise: NoiseCovariance
-    probe: Floats
-    magnet: Floats
+    probe_rotation: Floats
+    magnet_rotation: Floats
     temperature_known: bool = False
     mapped: bool = True
 
@@ -151,24 +151,25 @@ class Seen(NominalFields):
         The study's magnet at the points of all campaigns, in its own axes.
     part : slice
         Of these points.
-    magnet, probe : ndarray, shape (3, 3)
+    magnet_rotation, probe_rotation : ndarray, shape (3, 3)
     """
 
     straight: NominalFields
     part: slice
-    magnet: Floats
-    probe: Floats
+    magnet_rotation: Floats
+    probe_rotation: Floats
 
     @cached_property
     def field(self) -> Floats:
         """See `NominalFields.field`."""
-        own = self.straight.block_fields[:, self.part].sum(axis=0) @ self.magnet.T
-        return np.asarray((own + external_field(self.study, self.points)) @ self.probe)
+        own = self.straight.block_fields[:, self.part].sum(axis=0) @ self.magnet_rotation.T
+        return np.asarray((own + external_field(self.straight.magnet, self.points))
+                          @ self.probe_rotation)
 
     @cached_property
     def gradient(self) -> Floats:
         """See `NominalFields.gradient`."""
-        turn = self.probe.T @ self.magnet
+        turn = self.probe_rotation.T @ self.magnet_rotation
         return np.asarray(turn @ self.straight.gradient[self.part] @ turn.T)
 
 
@@ -216,9 +217,9 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
     size = float(np.linalg.norm(centre))
     found = [
         CandidateMeasurement("probe_rolled", "the same map with the probe turned by 180° about z",
-               replace(again, probe=np.diag([-1.0, -1.0, 1.0]))),
+               replace(again, probe_rotation=np.diag([-1.0, -1.0, 1.0]))),
         CandidateMeasurement("probe_reversed", "the same map with the probe turned by 180° about x",
-               replace(again, probe=np.diag([1.0, -1.0, -1.0])))]
+               replace(again, probe_rotation=np.diag([1.0, -1.0, -1.0])))]
     if size > NMR_LEAST_T:
         found.append(CandidateMeasurement("nmr_point", "one NMR reading in the middle of the bore",
                                           ProposedScan(
@@ -234,8 +235,9 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
         CandidateMeasurement("second_radius", f"circles of radius {1e3 * radius:.0f} mm", _points(
         np.vstack([_circle(radius, z) for z in heights]), sigma)))
     if study.dimension == 3:
-        half, reach = array_half_length(study), array.outer_radius_m
-        farthest = min(4 * reach, 0.4 * (boundary_half_length(study, "extruded") - half))
+        magnet = build_magnet(study)
+        half, reach = magnet.array_half_length, array.outer_radius_m
+        farthest = min(4 * reach, 0.4 * (boundary_half_length(magnet, "extruded") - half))
         beyond = [side * (half + farthest * step) for side in (-1, 1)
                   for step in np.linspace(0.2, 1, 5)]
         found.append(CandidateMeasurement(
@@ -245,7 +247,7 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
         *found,
         CandidateMeasurement("magnet_turned",
                              "the same map with the magnet turned by 90° about its axis",
-               replace(again, magnet=rotation_about_z(np.pi / 2))),
+               replace(again, magnet_rotation=rotation_about_z(np.pi / 2))),
         CandidateMeasurement("known_temperature",
                              "the same map at another temperature of the magnet, which is "
                "even and measured on it", replace(again, temperature_known=True))]
@@ -317,14 +319,14 @@ def _readings(
     first: dict[bytes, int] = {}
     stacked: list[Floats] = []
     for campaign in campaigns:
-        points = campaign.points @ campaign.magnet  # in the magnet's axes
+        points = campaign.points @ campaign.magnet_rotation  # in the magnet's axes
         if points.tobytes() not in first:
             first[points.tobytes()] = sum(map(len, stacked))
             stacked.append(points)
     places = np.vstack(stacked)
     magnet = _Magnet(NominalFields(study, places, np.zeros(len(places)),
-                           lambda other: solve_nominal(other, places, room)))
-    starts = [first[(one.points @ one.magnet).tobytes()] for one in campaigns]
+                           lambda other: solve_nominal(build_magnet(other), places, room)))
+    starts = [first[(one.points @ one.magnet_rotation).tobytes()] for one in campaigns]
     return [_Readings(diagnosis, one, magnet, slice(start, start + len(one.points)))
             for one, start in zip(campaigns, starts, strict=True)]
 
@@ -338,10 +340,10 @@ class _Readings:
         scene = magnet.scene
         self.campaign, self.magnet, self.part = campaign, magnet, part
         self.mapper = Seen(scene.study, campaign.points, campaign.time, scene.solve, scene, part,
-                           campaign.magnet, np.eye(3))
-        self.sensors = replace(self.mapper, probe=campaign.probe)
+                           campaign.magnet_rotation, np.eye(3))
+        self.sensors = replace(self.mapper, probe_rotation=campaign.probe_rotation)
         self.blocks = self._whitened(
-            magnet.response[:, part] @ campaign.magnet.T) @ diagnosis.before.prior.root
+            magnet.response[:, part] @ campaign.magnet_rotation.T) @ diagnosis.before.prior.root
 
     def of(self, hypothesis: Hypothesis) -> Floats:
         """Whitened readings (n, k) per unit of each parameter of an effect."""
@@ -355,10 +357,10 @@ class _Readings:
         if gone or (not campaign.mapped and owner in ("mapper", "sensors")):
             return np.zeros((len(effect.parameters), len(campaign.points), 3))
         if owner == "magnet":
-            return self.magnet.signature(hypothesis)[:, self.part] @ campaign.magnet.T
+            return self.magnet.signature(hypothesis)[:, self.part] @ campaign.magnet_rotation.T
         if owner != "sensors":
             return effect.signature(self.mapper, place)
-        return effect.signature(self.sensors, place) @ campaign.probe.T
+        return effect.signature(self.sensors, place) @ campaign.probe_rotation.T
 
     def _whitened(self, fields: Floats) -> Floats:
         """Fields (k, n, 3) to whitened readings (readings, k)."""

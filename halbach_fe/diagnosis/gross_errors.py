@@ -36,7 +36,7 @@ from halbach_fe.diagnosis.map_conventions import (
     then,
 )
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
@@ -347,14 +347,14 @@ class _Search:
         try:
             study = reading.apply(self.study)
             with warnings.catch_warnings(action="ignore", category=HalbachWarning):
-                measured = prior_from_blocks(study, self.table).gaussian.mean
+                measured = prior_from_blocks(build_magnet(study), self.table).gaussian.mean
         except (ValidationError, HalbachError):
             return nominal
-        blocks = blocks_of(study)
+        blocks = build_magnet(study).blocks
         mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
         points = _probe_points(study.instrument, self.points)
         panel = PANEL * study.array.inner_radius_m
-        total = external_field(study, points)
+        total = external_field(build_magnet(study), points)
         for block, one, unit in zip(blocks, mean, unit_fields(blocks, points, 4, panel),
                                     strict=True):
             total += unit @ (MU_0 * block.recoil_tensor @ one)
@@ -366,7 +366,7 @@ class _Search:
             try:
                 study = source.apply(self.study)
                 if source.magnet not in self.blocks:
-                    self.blocks[source.magnet] = blocks_of(study)
+                    self.blocks[source.magnet] = build_magnet(study).blocks
                 self.computed[source] = _Nominal.of(
                     study, self.blocks[source.magnet], self.points)
             except (ValidationError, HalbachError):
@@ -403,7 +403,7 @@ class _Nominal:
             variance += np.sum((BLOCK_SD * block.remanence * unit) ** 2, axis=2)
         sensors = sensor_matrix(study.instrument).T
         return cls(field @ sensors, across @ sensors,
-                   external_field(study, points) @ sensors, variance)
+                   external_field(build_magnet(study), points) @ sensors, variance)
 
     def field(self, turn: float) -> Floats:
         """B (n, 3) in T with the magnetization of all blocks turned by an angle in rad."""

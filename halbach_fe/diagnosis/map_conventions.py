@@ -12,7 +12,6 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.instrument import along_axes
-from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.vacuum_field import block_gradients, unit_fields
 from halbach_fe.study.magnet import BlockException
@@ -45,9 +45,14 @@ class NominalFields:
     known: Floats | None = field(default=None, kw_only=True)
 
     @cached_property
+    def magnet(self) -> Magnet:
+        """The study's magnet."""
+        return build_magnet(self.study)
+
+    @property
     def blocks(self) -> tuple[MagnetBlock, ...]:
         """The study's blocks."""
-        return blocks_of(self.study)
+        return self.magnet.blocks
 
     @cached_property
     def unit_fields(self) -> Floats:
@@ -68,7 +73,7 @@ class NominalFields:
     @cached_property
     def field(self) -> Floats:
         """B (n, 3) in T of the nominal magnet and of what else the study has."""
-        return np.asarray(self.block_fields.sum(axis=0) + external_field(self.study, self.points))
+        return np.asarray(self.block_fields.sum(axis=0) + external_field(self.magnet, self.points))
 
     @cached_property
     def gradient(self) -> Floats:
@@ -101,7 +106,7 @@ class NominalFields:
 
     def block_fields_of(self, study: Study) -> Floats:
         """B (blocks, n, 3) in T of each nominal block of another study."""
-        blocks = blocks_of(study)
+        blocks = build_magnet(study).blocks
         return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
                                                 strict=True)])

@@ -93,7 +93,7 @@ def estimate_position_noise(
     rows = np.arange(count)
     if count > MOST_READINGS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_READINGS, replace=False))
-    moved = noise.whitening @ displacement(update.study, observation, np.ones(3))[training]
+    moved = noise.whitening @ displacement(update.magnet, observation, np.ones(3))[training]
     scale, smooth = SMOOTH * float(np.median(noise.sd)), []
     points = probe_points(update.study.instrument, observation.map_points)
     for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):

@@ -24,7 +24,7 @@ from halbach_fe.diagnosis.smooth_discrepancy import (
     harmonic_fields,
     of_size,
 )
-from halbach_fe.geometry.magnet import points_in_material
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.solver.field import solve_nominal
@@ -167,7 +167,7 @@ def memoized_solver(session: Session) -> NominalSolver:
     def solve(study: Study, points: Floats) -> Floats:
         key = study.model_dump_json(include=FIELD_KEYS), points.tobytes()
         if key not in known:
-            known[key] = solve_nominal(study, points, session)
+            known[key] = solve_nominal(build_magnet(study), points, session)
         return known[key]
     return solve
 
@@ -194,7 +194,7 @@ def _possible(study: Study, named: Sequence[IdentifiedEffect], points: Floats) -
         return False
     try:
         changed = Study.model_validate(apply_effects(study, named).model_dump())
-        inside = points_in_material(changed, probe_points(changed.instrument, points))
+        inside = build_magnet(changed).contains(probe_points(changed.instrument, points))
     except (ValidationError, HalbachError):
         return False
     return not inside.any()

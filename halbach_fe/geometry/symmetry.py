@@ -14,9 +14,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.study.model import Study
 
 _ROUNDING = 1e-12  # m; coordinates nearer than this are one point
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -97,24 +96,24 @@ class Symmetry:
         return union, [index[p.turn, p.mirrored] for p in self.placements]
 
 
-def no_symmetry(study: Study) -> Symmetry:
+def no_symmetry(magnet: Magnet) -> Symmetry:
     """Every block is its own source."""
-    return Symmetry(tuple(SymmetryImage(number) for number in range(len(blocks_of(study)))))
+    return Symmetry(tuple(SymmetryImage(number) for number in range(len(magnet.blocks))))
 
 
-def symmetry_of(study: Study) -> Symmetry:
+def symmetry_of(magnet: Magnet) -> Symmetry:
     """Find the rotations by blocks, and the mirror in z = 0, that leave materials as they are.
 
     The iron ring and the boundary are symmetric always.
     """
-    blocks = blocks_of(study)
-    slots, rings = study.array.blocks_per_ring, study.array.rings
+    blocks = magnet.blocks
+    slots, rings = magnet.array.blocks_per_ring, magnet.array.rings
     tensors = np.array([b.recoil_tensor for b in blocks]).reshape(rings, slots, 3, 3)
     outlines = [block.outline for block in blocks[:slots]]
     pitch = 2 * np.pi / slots
     period = next(k for k in range(1, slots + 1) if slots % k == 0 and _turns(
         outlines, tensors, k, pitch))
-    mirror = study.dimension == 3 and _equal(tensors, tensors[::-1])
+    mirror = magnet.dimension == 3 and _equal(tensors, tensors[::-1])
     placements = []
     for number in range(len(blocks)):
         ring, slot = divmod(number, slots)

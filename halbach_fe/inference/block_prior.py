@@ -22,8 +22,9 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
+from halbach_fe.geometry.array_layout import facing_angle_deg, position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import blocks_of, facing_angle_deg, position_angle_deg
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.measurement.block_table import BlockTable
@@ -36,7 +37,6 @@ from halbach_fe.stats.small_samples import (
     predictive_covariance,
 )
 from halbach_fe.study.magnet import Array
-from halbach_fe.study.model import Study
 
 DIRECTIONS = ("along", "across", "z")
 """Axes of deviations: along the nominal magnetization, across it in the ring's plane, and z."""
@@ -102,7 +102,7 @@ class MeasuredPrior:
         return sum(len(one.deviations) for one in self.types)
 
 
-def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
+def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     """Turn a table of measured blocks into the prior of a study.
 
     Raises
@@ -117,26 +117,26 @@ def prior_from_blocks(study: Study, table: BlockTable) -> MeasuredPrior:
     HalbachWarning
         If a type's samples stand for its blocks, but do not look normal.
     """
-    meant = _prior_as_meant(as_meant(study), table)
-    size = study.dimension
-    moves = mountings(study)
+    meant = _prior_as_meant(as_meant(magnet), table)
+    size = magnet.dimension
+    moves = mountings(magnet)
     sources = np.array([source for source, _ in moves])
     turns = np.array([matrix for _, matrix in moves])[:, :size, :size]
     mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization[:size] for block in magnet.blocks])
     return replace(meant, nominal=nominal, gaussian=Gaussian(
         (turns @ mean).ravel(), mounted(meant.gaussian.root, turns, sources)))
 
 
-def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
+def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     """The same of a magnet whose blocks were mounted as meant."""
-    blocks, size = blocks_of(study), study.dimension
-    slots = types_of(study)
-    _check_types(study, table, slots)
-    _check_complete(study, table)
-    index = _block_of_rows(study, table, slots)
-    conversion = _conversions(study, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    blocks, size = magnet.blocks, magnet.dimension
+    slots = types_of(magnet)
+    _check_types(magnet, table, slots)
+    _check_complete(magnet, table)
+    index = _block_of_rows(magnet, table, slots)
+    conversion = _conversions(magnet, table, blocks, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])
     deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
     _check_near(table, deviations)
@@ -152,7 +152,7 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(study, slots, position_angle_deg,
+        _check_alike(magnet, slots, position_angle_deg,
                      "Give ring and slot of every measured block.")
         slot_of = np.array([block.slot for block in blocks])
         for label, samples in members.items():
@@ -163,7 +163,8 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
             own += frame @ covariance @ frame.transpose(0, 2, 1)
             shared.append(frame @ np.linalg.cholesky(covariance / len(samples)))  # of the mean
     gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
-                              np.radians(study.prior.mounting_sd_deg), study.prior.common_mode_sd)
+                              np.radians(magnet.study.prior.mounting_sd_deg),
+                              magnet.study.prior.common_mode_sd)
     types = _tested(members, intensities)
     odd = [one.label for one in types if not one.normal]
     if odd and not placed:
@@ -175,7 +176,7 @@ def _prior_as_meant(study: Study, table: BlockTable) -> MeasuredPrior:
     return MeasuredPrior(gaussian, nominal, placed, types)
 
 
-def loose_blocks(study: Study, table: BlockTable) -> tuple[Floats, Floats]:
+def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     """What a table tells of blocks that are not mounted yet, wherever in their type's slots.
 
     Returns
@@ -194,26 +195,26 @@ def loose_blocks(study: Study, table: BlockTable) -> tuple[Floats, Floats]:
     StudyError
         If the blocks of a type are not alike in the study.
     """
-    study = as_meant(study)
-    blocks, slots, size = blocks_of(study), types_of(study), study.dimension
-    _check_types(study, table, slots)
-    _check_alike(study, slots, facing_angle_deg, "Make them types of their own.")
-    index = _block_of_rows(study, table, slots)
-    conversion = _conversions(study, table, blocks, index)
-    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(study, table))
+    magnet = as_meant(magnet)
+    blocks, slots, size = magnet.blocks, types_of(magnet), magnet.dimension
+    _check_types(magnet, table, slots)
+    _check_alike(magnet, slots, facing_angle_deg, "Make them types of their own.")
+    index = _block_of_rows(magnet, table, slots)
+    conversion = _conversions(magnet, table, blocks, index)
+    measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])[index]
     _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([rotation_about_z(-np.radians(facing_angle_deg(study.array, blocks[i].slot)))
+    own = np.array([rotation_about_z(-np.radians(facing_angle_deg(magnet.array, blocks[i].slot)))
                     for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
 
 
-def as_mounted(study: Study, table: BlockTable, places: Ints) -> Floats:
+def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
     """Moments (rows, 3) in A m^2 in the own axes of slots (rows,), from 0, ring by ring, that are
     not those of the table: blocks keep their faces where a slot has them.
     """
-    array, index = study.array, _block_of_rows(study, table, types_of(study))
+    array, index = magnet.array, _block_of_rows(magnet, table, types_of(magnet))
 
     def aside(place: int) -> float:
         slot = place % array.blocks_per_ring + 1
@@ -234,10 +235,10 @@ def _tested(
                  for (label, samples), row in zip(members.items(), p, strict=True))
 
 
-def types_of(study: Study) -> dict[str, tuple[int, ...]]:
+def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
     """Slots of every type of block, by its label."""
-    return study.prior.types or {
-        str(slot): (slot,) for slot in range(1, study.array.blocks_per_ring + 1)}
+    return magnet.study.prior.types or {
+        str(slot): (slot,) for slot in range(1, magnet.array.blocks_per_ring + 1)}
 
 
 def _frame(block: MagnetBlock) -> Floats:
@@ -255,14 +256,14 @@ def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
 
 
 def _conversions(
-    study: Study, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
+    magnet: Magnet, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
 ) -> Floats:
     """From measured moments in A m^2 to M in A/m along the array's axes, (rows, 3, 3)."""
     real = []
     for row, number in enumerate(index):
         block, volume = blocks[number], table.volume[row]
-        if study.dimension == 2:
-            length = study.array.ring_length_m or volume / block.area
+        if magnet.dimension == 2:
+            length = magnet.array.ring_length_m or volume / block.area
             if np.isnan(length):
                 raise MeasurementError(must_be(
                     f"volume_m3 of block {table.serial[row]}", table.source,
@@ -277,14 +278,14 @@ def _conversions(
     volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
     tensors = demagnetizing_tensors(real)
     return np.array([
-        _of_block(block, tensor, position_angle_deg(study.array, block.slot)) / volume
+        _of_block(block, tensor, position_angle_deg(magnet.array, block.slot)) / volume
         for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
 
 
-def _at_reference_temperature(study: Study, table: BlockTable) -> Floats:
+def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
     """Moments (rows, 3) in A m^2 at the study's reference temperature, or as they are."""
-    coefficient = study.prior.temperature_coefficient_per_K
-    reference = study.prior.reference_temperature_C
+    coefficient = magnet.study.prior.temperature_coefficient_per_K
+    reference = magnet.study.prior.reference_temperature_C
     if coefficient is None or reference is None:  # the study has both or neither
         return table.moment
     for serial, temperature in zip(table.serial, table.temperature, strict=True):
@@ -296,9 +297,9 @@ def _at_reference_temperature(study: Study, table: BlockTable) -> Floats:
     return np.asarray(table.moment / factor[:, None])
 
 
-def _check_types(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
+def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
     """Types and places must be those of the study."""
-    array = study.array
+    array = magnet.array
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
         if label not in slots:
             raise MeasurementError(must_be(
@@ -316,9 +317,9 @@ def _check_types(study: Study, table: BlockTable, slots: dict[str, tuple[int, ..
                 f"'{label}', which belongs to slot {', '.join(map(str, slots[label]))}"))
 
 
-def _check_complete(study: Study, table: BlockTable) -> None:
+def _check_complete(magnet: Magnet, table: BlockTable) -> None:
     """If some blocks have a place, all must be there."""
-    array = study.array
+    array = magnet.array
     wanted = {(ring, slot) for ring in range(1, array.rings + 1)
               for slot in range(1, array.blocks_per_ring + 1)}
     missing = sorted(wanted - set(table.places))
@@ -328,10 +329,10 @@ def _check_complete(study: Study, table: BlockTable) -> None:
             f"none for ring {missing[0][0]}, slot {missing[0][1]} ({len(missing)} such places)"))
 
 
-def _block_of_rows(study: Study, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
+def _block_of_rows(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
     """Which of the study's blocks each row is, or, without a place, the first of its type."""
     return np.array([
-        max(ring - 1, 0) * study.array.blocks_per_ring + (slot or slots[label][0]) - 1
+        max(ring - 1, 0) * magnet.array.blocks_per_ring + (slot or slots[label][0]) - 1
         for label, (ring, slot) in zip(table.type, table.places, strict=True)])
 
 
@@ -370,24 +371,25 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    study: Study, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float], hint: str
+    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float],
+    hint: str
 ) -> None:
     """Blocks of one type must be the same block, as seen from their own axes, which are turned by
     ``axes`` of their slot: a moment must mean the same deviation from the nominal magnetization.
     """
-    blocks = blocks_of(study)
-    finite = [replace(block, z_min=0.0, z_max=1.0) if study.dimension == 2 else block
+    blocks = magnet.blocks
+    finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block
               for block in blocks]
     tensors = demagnetizing_tensors(finite)
     seen = np.array([
-        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(study.array, block.slot)))
+        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(magnet.array, block.slot)))
         / block.volume for block, tensor in zip(finite, tensors, strict=True)])
     for label, own in slots.items():
         first, *others = [number for number, block in enumerate(blocks) if block.slot in own]
         for number in others:
             if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():
                 raise StudyError(must_be(
-                    f"`prior.types.{label}`", f"study {study.name}",
+                    f"`prior.types.{label}`", f"study {magnet.name}",
                     "blocks that are alike from their own axes",
                     f"{blocks[first].name} and {blocks[number].name}, of another magnetization, "
                     "permeability or shape", hint))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
-from halbach_fe.geometry.magnet import points_in_material
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import (
     ALL_READINGS,
@@ -40,7 +40,6 @@ from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import predict
 from halbach_fe.stats.noise import NoiseCovariance
-from halbach_fe.study.model import Study, is_nonlinear
 
 LINEAR_ENOUGH = 0.3
 """Of the error bar: what linearizing the iron may move a reading without a word."""
@@ -50,14 +49,14 @@ LEFT_OUT = 0.02
 
 
 def infer(
-    study: Study, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
+    magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
     prior: Gaussian | None = None, linearized_only: bool = False, unseen: xr.Dataset | None = None,
 ) -> InferenceResult:
     """Update the block magnetizations of a study with a measured map.
 
     Parameters
     ----------
-    study : Study
+    magnet : Magnet
     data : Dataset
         As `halbach_fe.measurement.field_map.read_map` returns it.
     session : Session
@@ -76,8 +75,9 @@ def infer(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
-    of_blocks = None if blocks is None else prior_from_blocks(study, blocks)
-    observation, noise, readings, parts = _read_maps(study, data, unseen)
+    study = magnet.study
+    of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
+    observation, noise, readings, parts = _read_maps(magnet, data, unseen)
     keep = np.array(parts) != TRAINING
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
@@ -85,7 +85,7 @@ def infer(
         regions = tuple(names[i] for i in noise_regions(
             study.noise, observation.positions[:, 2], observation.components))
     try:
-        model = response_matrix(study, observation, session)
+        model = response_matrix(magnet, observation, session)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
     before = prior or (of_blocks.gaussian if of_blocks else nominal_prior(
@@ -101,21 +101,21 @@ def infer(
             f"Of so many parameters and readings of study {study.name} some combinations were left "
             f"out, which together may change a variance by {learnt.left_out:.1g} of itself.",
             HalbachWarning, stacklevel=2)
-    if is_nonlinear(study) and not linearized_only:
-        _check_linearization(study, observation, session, model, after.mean, errors.sd)
+    if magnet.is_nonlinear and not linearized_only:
+        _check_linearization(magnet, observation, session, model, after.mean, errors.sd)
     return InferenceResult(
-        study=study, observation=observation, readings=readings, noise=noise, parts=parts,
+        magnet=magnet, observation=observation, readings=readings, noise=noise, parts=parts,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
         prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
         log_evidence=learnt.log_evidence,
-        kind="linearized" if is_nonlinear(study) else "closed form",
+        kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None,
         left_out=learnt.left_out)
 
 
 def observation_of(
-    study: Study, data: xr.Dataset, blocks: BlockTable | None = None,
+    magnet: Magnet, data: xr.Dataset, blocks: BlockTable | None = None,
     unseen: xr.Dataset | None = None,
 ) -> Observation:
     """What `infer` would update with and predict, its inputs checked as there.
@@ -123,24 +123,26 @@ def observation_of(
     What uncertain positions add to the noise, the slow part of reading a map, is left out.
     """
     if blocks is not None:
-        prior_from_blocks(study, blocks)
-    if study.noise is not None:
-        study = study.with_(noise=study.noise.with_(position_sd_m=None)
-                            if study.noise.regions else None)
-    return _read_maps(study, data, unseen)[0]
+        prior_from_blocks(magnet, blocks)
+    noise = magnet.study.noise
+    if noise is not None:
+        magnet = magnet.with_(noise=noise.with_(position_sd_m=None) if noise.regions else None)
+    return _read_maps(magnet, data, unseen)[0]
 
 
 def _read_maps(
-    study: Study, data: xr.Dataset, unseen: xr.Dataset | None
+    magnet: Magnet, data: xr.Dataset, unseen: xr.Dataset | None
 ) -> tuple[Observation, NoiseCovariance, Floats, tuple[str, ...]]:
     """A map, and one that is only predicted: with noise, readings in T, and the part of each."""
-    observation, noise, readings = _read_map(study, data, excluded(study, data.sizes["point"]))
-    keep = held_out(study, observation)
+    observation, noise, readings = _read_map(magnet, data,
+                                             excluded(magnet.study, data.sizes["point"]))
+    keep = held_out(magnet.study, observation)
     parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
     if unseen is not None:
         try:
             other, its_noise, its_readings = _read_map(
-                predicted_as(study, unseen), unseen, np.zeros((unseen.sizes["point"], 3), bool))
+                magnet.with_study(predicted_as(magnet.study, unseen)), unseen,
+                np.zeros((unseen.sizes["point"], 3), bool))
         except MeasurementError as error:
             raise MeasurementError(
                 str(error).replace(" of map must", " of held-out map must")) from None
@@ -148,7 +150,7 @@ def _read_maps(
         readings = np.concatenate([readings, its_readings])
         parts += (HELD_OUT_MAP,) * len(other)
     heights = observation.points[:, 2]
-    if study.dimension == 2 and np.ptp(heights) > 0:
+    if magnet.dimension == 2 and np.ptp(heights) > 0:
         raise MeasurementError(must_be(
             "points", "map", "in one plane for a 2D study",
             f"z from {heights.min():g} to {heights.max():g} m",
@@ -157,15 +159,15 @@ def _read_maps(
 
 
 def _read_map(
-    study: Study, data: xr.Dataset, left_out: NDArray[np.bool_]
+    magnet: Magnet, data: xr.Dataset, left_out: NDArray[np.bool_]
 ) -> tuple[Observation, NoiseCovariance, Floats]:
     """A map as the study observes it but for components (n, 3) that are left out, with its noise
     and its readings in T.
     """
-    data = as_read(study.instrument, data)
+    data = as_read(magnet.study.instrument, data)
     observation = observe(
-        study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out)
-    inside = points_in_material(study, observation.points)
+        magnet.study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out)
+    inside = magnet.contains(observation.points)
     if inside.any():
         first = int(np.argmax(inside))
         x, y, z = observation.points[first]
@@ -175,8 +177,8 @@ def _read_map(
             f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
             f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
             "Check the study's radii and the map's axes and units."))
-    return (observation, reading_noise(study, observation, data),
-            observation.read(np.nan_to_num(without_remainder(study.instrument, data))))
+    return (observation, reading_noise(magnet, observation, data),
+            observation.read(np.nan_to_num(without_remainder(magnet.study.instrument, data))))
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
@@ -186,15 +188,15 @@ def _predict(model: Response, parameters: Gaussian) -> Prediction:
 
 
 def _check_linearization(
-    study: Study, observation: Observation, session: Session, model: Response, mean: Floats,
+    magnet: Magnet, observation: Observation, session: Session, model: Response, mean: Floats,
     sigma: Floats,
 ) -> None:
     """Warn if iron is so far from linear that the posterior's readings show it."""
     folder = replace(session, folder=session.folder / "posterior")
-    true = newton_readings(study, observation, folder, mean[None])[0]
+    true = newton_readings(magnet, observation, folder, mean[None])[0]
     worst = float((np.abs(model.offset + model.matrix @ mean - true) / sigma).max())
     if worst > LINEAR_ENOUGH:
         warnings.warn(
             f"The iron is linearized about the nominal magnet, which moves a reading of the updated"
-            f" one by {worst:.2g} of its error bar: study {study.name} needs the non-linear "
+            f" one by {worst:.2g} of its error bar: study {magnet.name} needs the non-linear "
             "posterior.", HalbachWarning, stacklevel=2)

@@ -124,7 +124,7 @@ def sample_posterior(
     if draws < MIN_DRAWS:
         raise SamplingError(f"Input draws must be at least {MIN_DRAWS} of each chain; instead "
                             f"received {draws}. Some 1500 are usual.")
-    model = nonlinear_model(update.study, update.observation, session,
+    model = nonlinear_model(update.magnet, update.observation, session,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
     errors = update.noise.plus(model.error).part(train)
@@ -159,7 +159,7 @@ def sample_posterior(
     predicted = model(chosen, tolerance)
     spread = (predicted - predicted.mean(axis=0)) / np.sqrt(len(predicted))
     some = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
-    agreement = compare_with_newton(model, update.study, update.observation, session, some)
+    agreement = compare_with_newton(model, update.magnet, update.observation, session, some)
     return SampledPosterior(
         kept, model.parameters, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,

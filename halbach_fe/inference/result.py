@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import (
     Observation,
 )
@@ -85,7 +86,7 @@ class InferenceResult:
     `halbach_fe.stats.linear_gaussian.LinearPosterior`.
     """
 
-    study: Study
+    magnet: Magnet
     observation: Observation
     readings: Floats
     noise: NoiseCovariance
@@ -102,6 +103,11 @@ class InferenceResult:
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
     left_out: float = 0.0
+
+    @property
+    def study(self) -> Study:
+        """The study that was updated."""
+        return self.magnet.study
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:

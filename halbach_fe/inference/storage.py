@@ -18,11 +18,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, Root, beside, entries
-from halbach_fe.study.model import Study
 
 WRITTEN_COVARIANCE = 2000
 """Parameters, at most, whose covariance is written too: 32 MB."""
@@ -66,7 +65,7 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
     write_text(folder / "summary.json", text + "\n")
 
 
-def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
+def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
     """Prior and posterior of the magnetizations in A/m, by these names, from a posterior.h5.
 
     Raises
@@ -74,7 +73,7 @@ def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
     MeasurementError
         If it is none, or not of this study's magnet.
     """
-    nominal = np.concatenate([block.magnetization[:study.dimension] for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization[:magnet.dimension] for block in magnet.blocks])
     found: dict[str, Gaussian] = {}
     try:
         data = untrusted.read_dataset(path)
@@ -88,7 +87,7 @@ def read_posterior(study: Study, path: Path) -> dict[str, Gaussian]:
             "none that can be read")) from None
     if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
         raise MeasurementError(must_be(
-            "--posterior", str(path), f"that of the magnet of study {study.name}",
+            "--posterior", str(path), f"that of the magnet of study {magnet.name}",
             "that of another nominal magnet", "Use the study that was inferred."))
     return found
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.vacuum_field import gradient_of
@@ -19,7 +19,6 @@ from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.measurement import (
     NoiseSettings,
 )
-from halbach_fe.study.model import Study
 
 ROUNDING = 1e-12
 """Correlations below it are none: sums over a circle's points cancel to 1e-15."""
@@ -50,7 +49,7 @@ def noise_regions(
     return region
 
 
-def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> NoiseCovariance:
+def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) -> NoiseCovariance:
     """Noise of the readings: of the map's points where it says, else by region; and in both cases
     what uncertain positions add.
 
@@ -58,34 +57,34 @@ def reading_noise(study: Study, observation: Observation, data: xr.Dataset) -> N
     leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
     coefficients themselves.
     """
-    settings = study.noise
+    settings = magnet.study.noise
     if "sigma_T" in data:
         points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
         analysis = observation.analysis
         covariance = analysis @ sparse.diags_array(points) @ analysis.T
     elif settings is None or not settings.regions:
         raise StudyError(
-            f"Input `noise` of study {study.name} must say how noisy the readings are, since the "
+            f"Input `noise` of study {magnet.name} must say how noisy the readings are, since the "
             "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
     else:
         sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
             settings, observation.positions[:, 2], observation.components)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
-        moved = displacement(study, observation, np.array(settings.position_sd_m))
+        moved = displacement(magnet, observation, np.array(settings.position_sd_m))
         covariance = covariance + moved @ moved.T
     return NoiseCovariance(_without_rounding(sparse.csr_array(covariance)))
 
 
-def displacement(study: Study, observation: Observation, sd: Floats) -> sparse.csr_array:
+def displacement(magnet: Magnet, observation: Observation, sd: Floats) -> sparse.csr_array:
     """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
     (3,) in m along each axis.
 
     The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
     the bore some per cent of the field, is left out of this scale of the noise.
     """
-    points = probe_points(study.instrument, observation.map_points)
-    gradient = gradient_of(blocks_of(study), points) * sd
+    points = probe_points(magnet.study.instrument, observation.map_points)
+    gradient = gradient_of(magnet.blocks, points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
         observation.analysis @ sparse.bsr_array((gradient, number[:-1], number)))

@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.report.page import (
@@ -42,7 +43,8 @@ def write_campaign_page(
                                "and at those held out (crosses), and the standard deviation of the "
                                "noise"),
         "campaign_geometry.png": (geometry(
-            study, points, None if held_out is None else points_of(held_out)), "The blocks of a "
+            build_magnet(study), points, None if held_out is None else points_of(held_out)),
+                                  "The blocks of a "
             "ring as ordered, the iron of the study if there is any, and the points of the map "
             "and those held out")}
     size = np.linalg.norm(np.nan_to_num(readings["B_T"].values), axis=1)
@@ -50,7 +52,7 @@ def write_campaign_page(
         folder / "campaign.html", "campaign.html.j2", save(figures, folder), study=study,
         provenance={"source": "simulated", "SHA-256 of the truth": readings.attrs["truth_sha256"]},
         rows=[_row(study, name, data) for name, data in maps.items()], blocks=len(blocks),
-        files=files, view=of_nominal(study, Points(
+        files=files, view=of_nominal(build_magnet(study), Points(
             points, size, "points of the map", "size of the<br>reading in T",
             "reading of %{customdata:.5g} T", (float(size.min()), float(size.max())))))
 

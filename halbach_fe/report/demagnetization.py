@@ -154,6 +154,6 @@ def _view(found: DemagnetizationMap, rows: list[dict[str, float | int]]) -> Mark
     for number, row in zip(np.unique(found.cells.block), rows, strict=True):
         margin[number] = 1e-3 * row["margin_A_per_m"]
         words[number] = f"least margin {margin[number]:+.0f} kA/m"
-    return magnet_view(found.study, Known(magnetization, Colours(
+    return magnet_view(found.magnet, Known(magnetization, Colours(
         margin, "least margin<br>to the knee in kA/m", words,
         (min(0.0, float(margin.min())), max(0.0, float(margin.max()))))))

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
@@ -81,7 +80,7 @@ def write_inference_report(
     }
     multipoles: list[Table] = [
         (model, {"prior": model.of(update.prior), "posterior": model.of(update.posterior)})
-        for model in circle_models(update.study, update.observation, update.response)]
+        for model in circle_models(update.magnet, update.observation, update.response)]
     if multipoles:
         table_csv(update.study, multipoles, folder / "multipoles.csv")
     array = update.study.array
@@ -89,7 +88,7 @@ def write_inference_report(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=update.study,
         provenance=provenance, update=update, multipoles=middle_table(multipoles),
         rows=score_table(update, published), assumptions=assumptions, array=array,
-        remanence=blocks_of(update.study)[0].remanence, conflict=_conflict(update),
+        remanence=update.magnet.blocks[0].remanence, conflict=_conflict(update),
         view=of_update(update))
 
 

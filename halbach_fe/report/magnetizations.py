@@ -9,10 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, save, write_page
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 
@@ -25,7 +24,7 @@ def scores(one: Gaussian, truth: Floats) -> dict[str, float]:
 
 
 def write_magnetizations(
-    study: Study, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
+    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
     files: str, figures: Mapping[str, object] | None = None, ring: int = 1,
 ) -> None:
     """Write magnetizations.html, and magnetizations.png of a ring.
@@ -45,18 +44,18 @@ def write_magnetizations(
         Whose magnetizations are drawn.
     """
     pictures = save({"magnetizations.png": (
-        _figure(study, known, truth, ring), f"Deviation of the magnetizations of ring {ring} from "
+        _figure(magnet, known, truth, ring), f"Deviation of the magnetizations of ring {ring} from "
         f"nominal: truth, {', '.join(known)}, with their standard deviations")}, folder)
     rows = [(name, *scores(one, truth).values()) for name, one in known.items()]
     write_page(folder / "magnetizations.html", "magnetizations.html.j2", pictures,
-               study=study, rows=rows, figures=figures or {}, what=what, machine_files=files)
+               study=magnet.study, rows=rows, figures=figures or {}, what=what, machine_files=files)
 
 
-def _figure(study: Study, known: Mapping[str, Gaussian], truth: Floats, ring: int) -> Figure:
-    size = study.dimension
-    slots = study.array.blocks_per_ring
+def _figure(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, ring: int) -> Figure:
+    size = magnet.dimension
+    slots = magnet.array.blocks_per_ring
     part = slice((ring - 1) * slots * size, ring * slots * size)
-    blocks = blocks_of(study)[(ring - 1) * slots:ring * slots]
+    blocks = magnet.blocks[(ring - 1) * slots:ring * slots]
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     figure = Figure(figsize=(8, 1 + 2.4 * size), layout="constrained")
     axes = figure.subplots(size, 1, sharex=True)

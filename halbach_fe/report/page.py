@@ -18,7 +18,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study
 
 # Okabe and Ito's colours, told apart by every kind of colour vision
@@ -83,36 +83,36 @@ def places(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
-def draw_magnet(axis: Axes, study: Study) -> None:
+def draw_magnet(axis: Axes, magnet: Magnet) -> None:
     """Outlines of a ring's blocks with arrows of their magnetization, and the iron; in mm."""
     t = np.linspace(0, 1, 9)
-    for block in blocks_of(study)[:study.array.blocks_per_ring]:
+    for block in magnet.blocks[:magnet.array.blocks_per_ring]:
         outline = 1e3 * np.vstack([edge.at(t)[0] for edge in block.outline])
         axis.plot(*outline.T, color="#777777", lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
-        length = 150 * (study.array.outer_radius_m - study.array.inner_radius_m)
+        length = 150 * (magnet.array.outer_radius_m - magnet.array.inner_radius_m)
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})
-    if study.iron_ring is not None:
-        for radius in (study.iron_ring.inner_radius_m, study.iron_ring.outer_radius_m):
+    if magnet.iron_ring is not None:
+        for radius in (magnet.iron_ring.inner_radius_m, magnet.iron_ring.outer_radius_m):
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
 
 
-def geometry(study: Study, points: Floats, others: Floats | None = None) -> Figure:
+def geometry(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
     """A ring with its magnetization, and where points (n, 3) in m are; beside it, if they are not
     in one plane, by z and distance from the axis. ``others`` are held out.
     """
     flat = np.ptp(points[:, 2]) == 0
     figure = Figure(figsize=(5.5, 5.8) if flat else (10, 5.4), layout="constrained")
     left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
-    draw_magnet(left, study)
+    draw_magnet(left, magnet)
     left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
         axis.grid(alpha=0.3)
-        low, high = 1e3 * study.array.inner_radius_m, 1e3 * study.array.outer_radius_m
-        for block in blocks_of(study)[::study.array.blocks_per_ring]:
+        low, high = 1e3 * magnet.array.inner_radius_m, 1e3 * magnet.array.outer_radius_m
+        for block in magnet.blocks[::magnet.array.blocks_per_ring]:
             axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
                                      high - low, fill=False, color="#777777", lw=0.6))
     for one, marker, colour, name in ((points, ".", POSTERIOR, "positions"),

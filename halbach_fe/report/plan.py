@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
-from halbach_fe.study.model import Study
 
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
@@ -35,7 +34,7 @@ def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
     }
 
 
-def write_plan(study: Study, plan: MeasurementPlan, folder: Path) -> None:
+def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
     """Write plan.csv, plan.json, plan.html and its figures."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
@@ -46,15 +45,16 @@ def write_plan(study: Study, plan: MeasurementPlan, folder: Path) -> None:
     summary = plan_summary(plan)
     write_text(folder / "plan.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        "plan_positions.png": (_positions(study, plan), "Candidates, chosen positions coloured by "
+        "plan_positions.png": (_positions(magnet, plan), "Candidates, chosen positions coloured by "
                                "their order, and the study's own positions as rings"),
         "plan_information.png": (_information(plan), "Expected information against the number of "
                                  "points, for the plan and for as many of the study's positions"),
-        "plan_blocks.png": (_blocks(study, plan), "Standard deviation of the blocks' magnetizations"
+        "plan_blocks.png": (_blocks(magnet, plan),
+                            "Standard deviation of the blocks' magnetizations"
                             " after the measurement over that before, by slot, for the plan and "
                             "for as many of the study's positions"),
     }, folder)
-    write_page(folder / "plan.html", "plan.html.j2", pictures, study=study, plan=plan,
+    write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
                summary=summary)
 
 
@@ -62,11 +62,11 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _positions(study: Study, plan: MeasurementPlan) -> Figure:
+def _positions(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     flat = np.ptp(plan.candidates[:, 2]) == 0
     figure = Figure(figsize=(6.4, 5.2) if flat else (10, 5.2), layout="constrained")
     left, *others = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
-    draw_magnet(left, study)
+    draw_magnet(left, magnet)
     shown = _show(left, plan, lambda points: 1e3 * points[:, :2])
     reach = 1.15e3 * float(np.hypot(*np.vstack([plan.candidates, plan.baseline])[:, :2].T).max())
     left.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x in mm",
@@ -103,11 +103,11 @@ def _information(plan: MeasurementPlan) -> Figure:
     return figure
 
 
-def _blocks(study: Study, plan: MeasurementPlan) -> Figure:
+def _blocks(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
-    slots = np.array([block.slot for block in blocks_of(study)])
-    places = np.arange(1, study.array.blocks_per_ring + 1)
+    slots = np.array([block.slot for block in magnet.blocks])
+    places = np.arange(1, magnet.array.blocks_per_ring + 1)
 
     def by_slot(sd: Floats) -> Floats:
         variance = (sd**2).reshape(len(slots), -1).sum(axis=1)

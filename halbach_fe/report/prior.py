@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.page import MEASURED, PUBLISHED, save, write_page
-from halbach_fe.response.matrix import parameter_names
-from halbach_fe.study.model import Study
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """From relative deviations to percent along the magnetization and degrees across it."""
@@ -37,17 +36,17 @@ def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
         for one in prior.types]
 
 
-def prior_summary(study: Study, prior: MeasuredPrior) -> dict[str, object]:
+def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     """What a script wants to know of a prior; percent along the nominal magnetization, degrees
     across it.
     """
     return {
-        "study": study.name, "blocks": prior.count, "placed": prior.placed,
+        "study": magnet.name, "blocks": prior.count, "placed": prior.placed,
         "parameters": len(prior.nominal),
         "rms_sd_A_per_m": float(np.sqrt(np.mean(prior.gaussian.sd**2))),
         "rms_shift_A_per_m": float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))),
-        "common_mode_sd": study.prior.common_mode_sd,
-        "mounting_sd_deg": study.prior.mounting_sd_deg,
+        "common_mode_sd": magnet.study.prior.common_mode_sd,
+        "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
         "not_normal": [one.label for one in prior.types if not one.normal],
         "types": [
             {"type": one.label, "n": len(one.deviations),
@@ -57,24 +56,24 @@ def prior_summary(study: Study, prior: MeasuredPrior) -> dict[str, object]:
     }
 
 
-def write_prior(study: Study, prior: MeasuredPrior, folder: Path) -> None:
+def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
     """Write prior.h5, prior.json, prior.html and its figure."""
     data = xr.Dataset(
         {name: ("parameter", values, {"units": "A/m"}) for name, values in (
             ("nominal", prior.nominal), ("prior_mean", prior.gaussian.mean),
             ("prior_sd", prior.gaussian.sd))},
-        coords={"parameter": list(parameter_names(study))},
-        attrs={"study": study.model_dump_json()})
+        coords={"parameter": list(magnet.parameter_names)},
+        attrs={"study": magnet.study.model_dump_json()})
     data["prior_covariance"] = (("parameter", "parameter_2"), prior.gaussian.covariance,
                                 {"units": "A2/m2"})
     write_hdf5(data, folder / "prior.h5")
-    summary = prior_summary(study, prior)
+    summary = prior_summary(magnet, prior)
     write_text(folder / "prior.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({"prior_qq.png": (
         _quantiles(prior), "Standardized deviations of all blocks from the mean of their type "
         "against normal quantiles; each point of normal samples of the same numbers lies between "
         "the dashed lines 95 times in 100")}, folder)
-    write_page(folder / "prior.html", "prior.html.j2", pictures, study=study, prior=prior,
+    write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
                summary=summary, rows=type_table(prior), level=NOT_NORMAL)
 
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.page import IRON, POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
-from halbach_fe.study.model import Study
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Sensitivity:
 
 
 def write_sensitivity(
-    study: Study, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, object]],
+    magnet: Magnet, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, object]],
 ) -> None:
     """Write sensitivity.html, its figures, sensitivity.json and readings.csv.
 
@@ -68,30 +68,30 @@ def write_sensitivity(
         for row, angle in enumerate(found.angle.tolist()) for slot in range(found.along.shape[1]))
     write_text(folder / "readings.csv", table.getvalue())
     summary = {
-        "study": study.name, "block": found.block, "printed_form_error": found.printed_form,
+        "study": magnet.name, "block": found.block, "printed_form_error": found.printed_form,
         "largest_one_percent_T": float(found.along.max()),
         "smallest_one_percent_T": float(found.along.min()),
         "largest_one_degree_T": float(found.across.max()), "plans": plans}
     write_text(folder / "sensitivity.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        "derivative.png": (_map(study, found), f"Size of the derivative of B along the nominal "
+        "derivative.png": (_map(magnet, found), f"Size of the derivative of B along the nominal "
                            f"magnetization of block {found.block}, in T per A/m, logarithmic"),
         "readings.png": (_readings(found), "Change of B at every reading of the circle for every "
                          "block: 1 % more magnetization, and a turn by 1 degree"),
         "information.png": (_information(found), "Expected information about all magnetizations "
                             "against the number of points"),
     }, folder)
-    write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=study,
+    write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=magnet.study,
                found=found, plans=plans)
 
 
-def _map(study: Study, found: Sensitivity) -> Figure:
+def _map(magnet: Magnet, found: Sensitivity) -> Figure:
     figure = Figure(figsize=(7.4, 6), layout="constrained")
     axis = figure.subplots()
     largest = float(np.nanmax(found.size))
     shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, found.size, shading="nearest",
                             norm=LogNorm(largest * 1e-5, largest), cmap="cividis", rasterized=True)
-    draw_magnet(axis, study)
+    draw_magnet(axis, magnet)
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     figure.colorbar(shown, label="|B'| in T m/A", extend="min")
     return figure

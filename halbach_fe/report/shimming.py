@@ -13,7 +13,6 @@ from matplotlib.ticker import MaxNLocator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
-from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, SECOND, draw_magnet, save, write_page
@@ -119,8 +118,8 @@ def _moves(shim: Shim) -> Figure:
     figure = Figure(figsize=(6, 6) if flat else (9, 4.6), layout="constrained")
     axis = figure.subplots()
     if flat:
-        draw_magnet(axis, shim.study)
-        where = 1e3 * np.array([block.middle[:2] for block in blocks_of(shim.study)])
+        draw_magnet(axis, shim.magnet)
+        where = 1e3 * np.array([block.middle[:2] for block in shim.magnet.blocks])
         axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     else:
         where = np.array(shim.mounts.places, float)

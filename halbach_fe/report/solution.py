@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.report.multipoles import Table, middle_table, table_csv
 from halbach_fe.report.page import (
@@ -26,7 +26,6 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.view import field_points, of_nominal
 from halbach_fe.response.multipoles import solved_circles
-from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
@@ -38,7 +37,7 @@ class Solution:
 
     Attributes
     ----------
-    study : Study
+    magnet : Magnet
     points, flux_density : ndarray, shape (n, 3), in m and T
     observation : Observation
     readings, errors : ndarray, shape (readings,), in T
@@ -47,7 +46,7 @@ class Solution:
         Words by key: versions, method, run time.
     """
 
-    study: Study
+    magnet: Magnet
     points: Floats
     flux_density: Floats
     observation: Observation
@@ -61,23 +60,24 @@ def write_solution_report(solution: Solution, folder: Path) -> None:
     multipoles.csv, if the positions are full circles.
     """
     figures = {
-        "geometry.png": (geometry(solution.study, solution.points), "The blocks of a ring with "
+        "geometry.png": (geometry(solution.magnet, solution.points), "The blocks of a ring with "
                          "their magnetization, the iron if there is any, and the study's "
                          "positions"),
         "field.png": (_field(solution), "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
     multipoles: list[Table] = [
         (model, {"nominal": known}) for model, known in solved_circles(
-            solution.study, solution.points, solution.flux_density, solution.errors)]
+            solution.magnet, solution.points, solution.flux_density, solution.errors)]
     if multipoles:
-        table_csv(solution.study, multipoles, folder / "multipoles.csv")
+        table_csv(solution.magnet.study, multipoles, folder / "multipoles.csv")
     write_page(
-        folder / "report.html", "solution.html.j2", save(figures, folder), study=solution.study,
-        array=solution.study.array, remanence=blocks_of(solution.study)[0].remanence,
+        folder / "report.html", "solution.html.j2", save(figures, folder),
+        study=solution.magnet.study,
+        array=solution.magnet.study.array, remanence=solution.magnet.blocks[0].remanence,
         multipoles=middle_table(multipoles), provenance=solution.provenance,
         strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
         error=float(solution.errors.max()),
-        view=of_nominal(solution.study, field_points(solution.points, solution.flux_density)))
+        view=of_nominal(solution.magnet, field_points(solution.points, solution.flux_density)))
 
 
 def _field(solution: Solution) -> Figure:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.page import (
     MEASURED,
@@ -27,7 +28,6 @@ from halbach_fe.report.page import (
 from halbach_fe.report.view import Points, of_nominal
 from halbach_fe.response.discretization_error import REFINEMENT
 from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, Verification
-from halbach_fe.study.model import Study
 
 COLOURS = (PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("^", "o", ".", "s", "x")
@@ -47,7 +47,7 @@ def difference_table(found: Verification) -> list[dict[str, str]]:
     return rows
 
 
-def verdict(study: Study, found: Verification) -> str:
+def verdict(magnet: Magnet, found: Verification) -> str:
     """How exact the field is, relative to what, in words."""
     error = found.error_pointwise * found.main_field_T
     if not error:
@@ -56,9 +56,9 @@ def verdict(study: Study, found: Verification) -> str:
     text = (f"At the study's positions B is off by about {error:.1e} T at most, "
             f"{found.error_pointwise:.1e} of the largest field there "
             f"({found.main_field_T:.4g} T).")
-    if study.noise is not None and study.noise.regions:
-        sigma = min(region.sigma_T for region in study.noise.regions)
-        fourier = study.observation.quantity == "fourier_coefficients"
+    if magnet.study.noise is not None and magnet.study.noise.regions:
+        sigma = min(region.sigma_T for region in magnet.study.noise.regions)
+        fourier = magnet.study.observation.quantity == "fourier_coefficients"
         own = found.error_fourier if fourier else found.error_pointwise
         if own is not None:
             text += (f" For a {'Fourier coefficient' if fourier else 'reading'} that is "
@@ -85,7 +85,7 @@ def basis(found: Verification) -> str:
 
 
 def write_verification(
-    study: Study, found: Verification, folder: Path, provenance: Mapping[str, str]
+    magnet: Magnet, found: Verification, folder: Path, provenance: Mapping[str, str]
 ) -> None:
     """Write verification.json, verification.csv, verification.html and its figures."""
     write_text(folder / "verification.json",
@@ -93,7 +93,7 @@ def write_verification(
     columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
     with atomic(folder / "verification.csv") as temporary:
         write_csv(columns | {f"{one.what} in T": change for one, change in zip(
-            found.differences, found.changes, strict=True)}, {"study": study.name}, temporary)
+            found.differences, found.changes, strict=True)}, {"study": magnet.name}, temporary)
     figures = {}
     if found.changes[:2].any():
         figures["verification_convergence.png"] = _convergence(found), (
@@ -102,15 +102,16 @@ def write_verification(
             "comparison what a farther boundary and another formulation change")
         figures["verification_along.png"] = _along(found), (
             "Change of B at every position of the study, for each change of the model")
-    figures["verification_geometry.png"] = geometry(study, found.points), (
+    figures["verification_geometry.png"] = geometry(magnet, found.points), (
         "The blocks of a ring with their magnetization, the iron if there is any, and the study's "
         "positions")
     change = found.changes[1]
     write_page(
-        folder / "verification.html", "verification.html.j2", save(figures, folder), study=study,
+        folder / "verification.html", "verification.html.j2", save(figures, folder),
+        study=magnet.study,
         provenance=provenance, found=found, rows=difference_table(found), basis=basis(found),
-        verdict=verdict(study, found), refinement=REFINEMENT, flattest=FLATTEST,
-        view=of_nominal(study, Points(
+        verdict=verdict(magnet, found), refinement=REFINEMENT, flattest=FLATTEST,
+        view=of_nominal(magnet, Points(
             found.points, change, "positions", "changed by a<br>finer mesh, in T",
             "a finer mesh changes B by %{customdata:.1e} T",
             (float(change.min()), float(change.max())))))

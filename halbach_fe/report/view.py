@@ -15,11 +15,10 @@ from scipy.spatial import Delaunay
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import outline_contains
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.page import IRON, MEASURED
-from halbach_fe.study.model import Study
 
 ARC_POINTS = 5
 SIGNED, UNSIGNED = "RdBu_r", "Cividis"
@@ -119,12 +118,12 @@ def field_points(positions: Floats, flux_density: Floats) -> Points:
                   (float(size.min()), float(size.max())))
 
 
-def of_nominal(study: Study, points: Points) -> Markup:
+def of_nominal(magnet: Magnet, points: Points) -> Markup:
     """The view of a nominal magnet, and points of a map."""
-    known = Known(np.array([block.magnetization[:study.dimension] for block in blocks_of(study)]))
+    known = Known(np.array([block.magnetization[:magnet.dimension] for block in magnet.blocks]))
     count = len(points.positions)
     few = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
-    return magnet_view(study, known, replace(
+    return magnet_view(magnet, known, replace(
         points, positions=points.positions[few], values=points.values[few]))
 
 
@@ -143,7 +142,7 @@ def of_update(update: InferenceResult) -> Markup:
         f"{one:+.2f} ± {error:.2f} % along the easy axis"
         for one, error in zip(change, sd, strict=True)]))
     scores = update.standardized(update.prediction_posterior)
-    return magnet_view(update.study, known, _by_point(update.observation.positions, scores))
+    return magnet_view(update.magnet, known, _by_point(update.observation.positions, scores))
 
 
 def _by_point(positions: Floats, scores: Floats) -> Points:
@@ -160,36 +159,36 @@ def _by_point(positions: Floats, scores: Floats) -> Points:
     return residuals(points, worst)
 
 
-def magnet_view(study: Study, known: Known, points: Points | None = None) -> Markup:
+def magnet_view(magnet: Magnet, known: Known, points: Points | None = None) -> Markup:
     """A part of a page, with all that it needs."""
-    blocks, known = _few(study, known)
-    figure = go.Figure([_blocks(study, blocks, known), *_arrows(study, blocks, known)])
-    if study.iron_ring is not None:
-        figure.add_trace(_iron(study))
+    blocks, known = _few(magnet, known)
+    figure = go.Figure([_blocks(magnet, blocks, known), *_arrows(magnet, blocks, known)])
+    if magnet.iron_ring is not None:
+        figure.add_trace(_iron(magnet))
     if points is not None:
         figure.add_trace(_markers(points))
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
         scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
                "yaxis": {"title": {"text": "y in m"}}, "zaxis": {"title": {"text": "z in m"}},
-               "camera": {"eye": FROM_AHEAD if study.dimension == 2 else FROM_ASIDE,
+               "camera": {"eye": FROM_AHEAD if magnet.dimension == 2 else FROM_ASIDE,
                           "up": {"x": 0, "y": 1, "z": 0}}})
     return Markup(plotly.io.to_html(
         figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY,
         config={"displaylogo": False, "responsive": True}))
 
 
-def _rings_in_one(study: Study) -> int:
+def _rings_in_one(magnet: Magnet) -> int:
     """How many rings are drawn as one."""
-    return math.ceil(study.array.rings * study.array.blocks_per_ring / MOST_BLOCKS)
+    return math.ceil(magnet.array.rings * magnet.array.blocks_per_ring / MOST_BLOCKS)
 
 
-def _few(study: Study, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
+def _few(magnet: Magnet, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
     """The blocks to draw, and what is known of them: of too many, one for each slot of several
     rings, with their mean magnetization and the number of that which has the largest.
     """
-    blocks, slots = blocks_of(study), study.array.blocks_per_ring
-    step = _rings_in_one(study)
+    blocks, slots = magnet.blocks, magnet.array.blocks_per_ring
+    step = _rings_in_one(magnet)
     if step == 1:
         return blocks, known
     groups = [range(first + slot, min(first + step * slots, len(blocks)), slots)
@@ -204,19 +203,19 @@ def _few(study: Study, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
             Known(np.array([known.magnetization[group].mean(axis=0) for group in groups]), colours))
 
 
-def _blocks(study: Study, blocks: Sequence[MagnetBlock], known: Known) -> go.Mesh3d:
+def _blocks(magnet: Magnet, blocks: Sequence[MagnetBlock], known: Known) -> go.Mesh3d:
     """All blocks as one surface, each with vertices of its own, which carry its words."""
     vertices, triangles, owner = [], [], []
     first = 0
     for number, block in enumerate(blocks):
-        corners, faces = prism(block, _height(study))
+        corners, faces = prism(block, _height(magnet))
         vertices.append(corners)
         triangles.append(faces + first)
         owner += [number] * len(corners)
         first += len(corners)
     points, faces = np.vstack(vertices), np.vstack(triangles)
-    more = _rings_in_one(study) - 1
-    words = [_words(block, min(more, study.array.rings - block.ring), known, number)
+    more = _rings_in_one(magnet) - 1
+    words = [_words(block, min(more, magnet.array.rings - block.ring), known, number)
              for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
     if known.colours is not None:
@@ -265,19 +264,19 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     return corners, np.vstack([face, face + count, sides])
 
 
-def _height(study: Study) -> float:
-    return FLAT * study.array.outer_radius_m
+def _height(magnet: Magnet) -> float:
+    return FLAT * magnet.array.outer_radius_m
 
 
 def _arrows(
-    study: Study, blocks: Sequence[MagnetBlock], known: Known
+    magnet: Magnet, blocks: Sequence[MagnetBlock], known: Known
 ) -> list[go.Scatter3d | go.Cone]:
     """Directions of magnetization, on the upper faces of the blocks."""
     middles = np.array([[*(block.middle + block.shift)[:2],
-                         prism(block, _height(study))[0][:, 2].max()] for block in blocks])
+                         prism(block, _height(magnet))[0][:, 2].max()] for block in blocks])
     vectors = np.zeros((len(blocks), 3))
     vectors[:, :known.magnetization.shape[1]] = known.magnetization
-    vectors *= (ARROW * (study.array.outer_radius_m - study.array.inner_radius_m)
+    vectors *= (ARROW * (magnet.array.outer_radius_m - magnet.array.inner_radius_m)
                 / np.linalg.norm(vectors, axis=1).max())
     gap = np.full_like(middles, np.nan)  # no line from one arrow to the next
     x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
@@ -290,12 +289,12 @@ def _arrows(
     return [shafts, heads]
 
 
-def _iron(study: Study) -> go.Surface:
-    ring = study.iron_ring
+def _iron(magnet: Magnet) -> go.Surface:
+    ring = magnet.iron_ring
     assert ring is not None
-    blocks = blocks_of(study)
+    blocks = magnet.blocks
     length = ring.length_m or (blocks[-1].z_max - blocks[0].z_min)
-    half = (length if np.isfinite(length) else _height(study)) / 2
+    half = (length if np.isfinite(length) else _height(magnet)) / 2
     angle = np.linspace(0, 2 * np.pi, 97)
     radius = np.array([ring.inner_radius_m, ring.outer_radius_m, ring.outer_radius_m,
                        ring.inner_radius_m, ring.inner_radius_m])[:, None]

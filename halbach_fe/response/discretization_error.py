@@ -10,44 +10,44 @@ from dataclasses import replace
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius, magnet_half_length
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.field import MESHES, ElementFields, choose_route, finite_element_part
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
-from halbach_fe.study.model import Study
 
 REFINEMENT = 1.5
 DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
 
 
-def refined(study: Study, factor: float) -> Study:
-    """The study with all elements smaller by a factor.
+def refined(magnet: Magnet, factor: float) -> Magnet:
+    """The magnet with all elements smaller by a factor.
 
     It is not validated: the limits of a study file catch wrong units, and a coarser mesh than
     anybody should ask for may well serve an error bar.
     """
-    mesh = study.mesh
+    mesh = magnet.study.mesh
     bore = mesh.bore_size_m or mesh.block_size_m
-    return study.model_copy(update={"mesh": mesh.model_copy(update={
+    return magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m / factor, "bore_size_m": bore / factor,
-        "meridian_size_m": meridian_size(study) / factor,
+        "meridian_size_m": meridian_size(magnet) / factor,
         "layers_per_ring": max(1, round(mesh.layers_per_ring * factor)),
-        "growth": 1 + (mesh.growth - 1) / factor})})
+        "growth": 1 + (mesh.growth - 1) / factor})}))
 
 
-def farther(study: Study, mesh: str, factor: float) -> Study:
-    """The study with the boundary of a kind of mesh farther by a factor."""
-    end = magnet_half_length(study)
-    update = {"radius_m": factor * boundary_radius(study, mesh)}
-    if study.dimension == 3:
-        update["half_length_m"] = end + factor * (boundary_half_length(study, mesh) - end)
-    return study.with_(open_boundary=study.open_boundary.with_(**update))
+def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
+    """The magnet with the boundary of a kind of mesh farther by a factor."""
+    end = magnet.half_length
+    update = {"radius_m": factor * boundary_radius(magnet, mesh)}
+    if magnet.dimension == 3:
+        update["half_length_m"] = end + factor * (boundary_half_length(magnet, mesh) - end)
+    return magnet.with_(open_boundary=magnet.study.open_boundary.with_(**update))
 
 
-def dual(study: Study, route: str) -> Study:
-    """The study by the other of two formulations that bracket the truth."""
-    return study.with_(solver__route=DUAL[route])
+def dual(magnet: Magnet, route: str) -> Magnet:
+    """The magnet solved by the other of two formulations that bracket the truth."""
+    return magnet.with_(solver__route=DUAL[route])
 
 
 def error_bar_session(session: Session) -> Session:
@@ -56,7 +56,7 @@ def error_bar_session(session: Session) -> Session:
 
 
 def reading_errors(
-    study: Study, observation: Observation, parts: ElementFields, session: Session
+    magnet: Magnet, observation: Observation, parts: ElementFields, session: Session
 ) -> Floats:
     """Error bar of every reading, (readings,) in T, by what another discretization says.
 
@@ -74,13 +74,13 @@ def reading_errors(
         return observation.magnitude(parts.error)
     if not nominal.any():  # nothing is left to finite elements
         return np.zeros(len(observation))
-    route = choose_route(study, observation.points)
+    route = choose_route(magnet, observation.points)
 
-    def change(variant: Study) -> Floats:
+    def change(variant: Magnet) -> Floats:
         other = finite_element_part(variant, observation.points, session, columns=False).nominal
         return observation.magnitude(other - nominal)
 
     if route in DUAL:
-        return change(dual(study, route))
-    return change(refined(study, 1 / REFINEMENT)) + change(
-        farther(study, MESHES[route], REFINEMENT))
+        return change(dual(magnet, route))
+    return change(refined(magnet, 1 / REFINEMENT)) + change(
+        farther(magnet, MESHES[route], REFINEMENT))

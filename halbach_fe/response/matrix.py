@@ -27,7 +27,7 @@ from halbach_fe.core.code_digest import code_digest
 from halbach_fe.core.errors import GetDPError, OutputError
 from halbach_fe.core.files import atomic
 from halbach_fe.core.hdf5 import write_hdf5
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.solver.external_field import external_field
@@ -43,7 +43,7 @@ from halbach_fe.solver.vacuum_field import unit_fields
 from halbach_fe.stats.linear_gaussian import parts_of
 from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import FIELD_KEYS, Study, curve_of
+from halbach_fe.study.model import FIELD_KEYS
 from halbach_fe.study.types import COMPONENTS
 
 LOADED_BYTES = 2**30
@@ -141,28 +141,28 @@ class Response:
         return self.matrix[np.arange(len(self.matrix))]
 
 
-def parameter_names(study: Study) -> tuple[str, ...]:
+def parameter_names(magnet: Magnet) -> tuple[str, ...]:
     """Names of the parameters p, block by block; the cross-section has no M_z."""
-    components = COMPONENTS[: study.dimension]
-    return tuple(f"{block.name}.M{c}" for block in blocks_of(study) for c in components)
+    components = COMPONENTS[: magnet.dimension]
+    return tuple(f"{block.name}.M{c}" for block in magnet.blocks for c in components)
 
 
-def response_matrix(study: Study, observation: Observation, session: Session) -> Response:
+def response_matrix(magnet: Magnet, observation: Observation, session: Session) -> Response:
     """Build H, or take it from the session's folder if it is there for the same inputs."""
-    check_points(study, observation.points)
-    key = _key(study, observation, session)
+    check_points(magnet, observation.points)
+    key = _key(magnet, observation, session)
     path = session.folder / "response.h5"
     stored = _read(path, key)
     if stored is not None:
         return stored
-    blocks, dimension = blocks_of(study), study.dimension
-    parts = finite_element_part(study, observation.points, session)
+    blocks, dimension = magnet.blocks, magnet.dimension
+    parts = finite_element_part(magnet, observation.points, session)
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
     def rows() -> Iterator[Floats]:
         # as many at once as memory takes: they share integrals
         for some in parts_of(len(observation), dimension * len(blocks), len(observation)):
-            matrix, total[some], magnitude[some] = _rows(study, observation, parts, some)
+            matrix, total[some], magnitude[some] = _rows(magnet, observation, parts, some)
             yield matrix
 
     shape = len(observation), dimension * len(blocks)
@@ -170,29 +170,29 @@ def response_matrix(study: Study, observation: Observation, session: Session) ->
         rows(), shape, _beside(path, key))
     nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
     direct = observation.apply(parts.along_nominal)
-    error = reading_errors(study, observation, parts, error_bar_session(session))
+    error = reading_errors(magnet, observation, parts, error_bar_session(session))
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
-    offset = observation.apply(external_field(study, observation.points))
+    offset = observation.apply(external_field(magnet, observation.points))
     if parts.linearized:
-        field = vacuum_part(study, observation.points) + parts.nominal
+        field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
-    built = Response(matrix, parameter_names(study), nominal, offset,
+    built = Response(matrix, magnet.parameter_names, nominal, offset,
                      np.hypot(error, total - direct), superposition)
     _write(path, key, built)
     return built
 
 
 def _rows(
-    study: Study, observation: Observation, parts: ElementFields, some: slice
+    magnet: Magnet, observation: Observation, parts: ElementFields, some: slice
 ) -> tuple[Floats, Floats, Floats]:
     """Some rows (k, parameters) of H; and of what finite elements contribute to these readings of
     the nominal array, block by block, the sum and that of magnitudes (k,), in T.
     """
-    blocks, dimension = blocks_of(study), study.dimension
+    blocks, dimension = magnet.blocks, magnet.dimension
     seen, operator = observation.part(some)
     points = observation.points[seen]
-    vacuum = unit_fields(blocks, points) if study.solver.method == "reaction" else None
+    vacuum = unit_fields(blocks, points) if magnet.study.solver.method == "reaction" else None
     total, magnitude = np.zeros(operator.shape[0]), np.zeros(operator.shape[0])
     matrix = np.empty((operator.shape[0], dimension * len(blocks)))
     for number, block in enumerate(blocks):
@@ -238,11 +238,11 @@ def verify_superposition(
     return error
 
 
-def _key(study: Study, observation: Observation, session: Session) -> str:
+def _key(magnet: Magnet, observation: Observation, session: Session) -> str:
     """Digest of all that the matrix depends on."""
-    relevant = study.model_dump(mode="json", include=FIELD_KEYS)
+    relevant = magnet.study.model_dump(mode="json", include=FIELD_KEYS)
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
-    curve = curve_of(study)  # a steel's name says nothing of its numbers
+    curve = magnet.curve  # a steel's name says nothing of its numbers
     if curve is not None:
         digest.update(np.array([curve.H, curve.B]).tobytes())
     versions = [metadata.version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]

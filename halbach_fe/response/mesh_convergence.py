@@ -12,17 +12,16 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import fourier_analysis
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
-from halbach_fe.solver.field import MESHES, choose_route, is_vacuum, solve_nominal
+from halbach_fe.solver.field import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.measurement import FourierCoefficients
-from halbach_fe.study.model import Study
 
 HARMONICS = 8
 
@@ -97,31 +96,31 @@ class Verification:
 
 
 def verify(
-    study: Study, session: Session, say: Callable[[str], None] = lambda _: None
+    magnet: Magnet, session: Session, say: Callable[[str], None] = lambda _: None
 ) -> Verification:
     """Solve the study on three meshes, with a farther boundary, and by the dual route if any.
 
     ``say`` is told what is solved next.
     """
-    points = points_from(study.observation.positions)
-    route = choose_route(study, points)
+    points = points_from(magnet.study.observation.positions)
+    route = choose_route(magnet, points)
 
-    def solve(what: str, variant: Study) -> Floats:
+    def solve(what: str, variant: Magnet) -> Floats:
         say(what)
         return solve_nominal(variant, points, session)
 
-    base = solve("the study's mesh", study)
-    coarse = solve("a coarser mesh", refined(study, 1 / REFINEMENT))
-    fine = solve("a finer mesh", refined(study, REFINEMENT))
-    far = solve("a farther boundary", farther(study, MESHES[route], REFINEMENT))
-    compare = _Comparison(study, points, base)
+    base = solve("the study's mesh", magnet)
+    coarse = solve("a coarser mesh", refined(magnet, 1 / REFINEMENT))
+    fine = solve("a finer mesh", refined(magnet, REFINEMENT))
+    far = solve("a farther boundary", farther(magnet, MESHES[route], REFINEMENT))
+    compare = _Comparison(magnet, points, base)
     pairs = {"coarser mesh to the study's": (coarse, base),
              "the study's mesh to a finer": (base, fine), "boundary farther away": (base, far)}
     if route in DUAL:
         pairs[f"dual route, {DUAL[route]}"] = (
-            base, solve(f"the dual route, {DUAL[route]}", dual(study, route)))
-    if study.solver.method == "direct" and is_vacuum(study):
-        pairs[EXACT] = base, field_of(blocks_of(study), points)
+            base, solve(f"the dual route, {DUAL[route]}", dual(magnet, route)))
+    if magnet.study.solver.method == "direct" and magnet.is_vacuum:
+        pairs[EXACT] = base, field_of(magnet.blocks, points)
     steps = [compare(what, *pair) for what, pair in pairs.items()]
     order = observed_order(steps[0].pointwise, steps[1].pointwise)
     if EXACT in pairs:
@@ -134,8 +133,8 @@ def verify(
     return Verification(
         route=route, differences=tuple(steps), order=order, error_pointwise=error,
         error_fourier=fourier, main_field_T=compare.scale,
-        element_size_m=(meridian_size(study) if route == "azimuthal_modes"
-                        else study.mesh.block_size_m),
+        element_size_m=(meridian_size(magnet) if route == "azimuthal_modes"
+                        else magnet.study.mesh.block_size_m),
         points=points, field=base, changes=np.array(
             [np.linalg.norm(one - other, axis=1) for one, other in pairs.values()]))
 
@@ -154,21 +153,21 @@ def observed_order(first: float, second: float) -> float:
 class _Comparison:
     """Differences of fields at a study's points."""
 
-    def __init__(self, study: Study, points: Floats, field: Floats) -> None:
+    def __init__(self, magnet: Magnet, points: Floats, field: Floats) -> None:
         self.scale = float(np.linalg.norm(field, axis=1).max())
         self._circles = None
-        positions = study.observation.positions
+        positions = magnet.study.observation.positions
         if positions.kind == "circles" and positions.angles > 2:
-            wanted = getattr(study.observation, "harmonics", HARMONICS)
+            wanted = getattr(magnet.study.observation, "harmonics", HARMONICS)
             self._circles, *_ = fourier_analysis(points, FourierCoefficients(
                 quantity="fourier_coefficients", positions=positions,
                 harmonics=min(wanted, (positions.angles - 1) // 2)))
         self._regions = {"all": np.ones(len(points), bool)}
-        if study.noise is not None and study.noise.regions:
-            names = getattr(study.observation, "components", ("",))
-            index = noise_regions(study.noise, np.repeat(points[:, 2], len(names)),
+        if magnet.study.noise is not None and magnet.study.noise.regions:
+            names = getattr(magnet.study.observation, "components", ("",))
+            index = noise_regions(magnet.study.noise, np.repeat(points[:, 2], len(names)),
                                   names * len(points)).reshape(len(points), -1)
-            regions = np.array([region.name for region in study.noise.regions])[index]
+            regions = np.array([region.name for region in magnet.study.noise.regions])[index]
             self._regions = {name: (regions == name).any(axis=1) for name in np.unique(regions)}
 
     def __call__(self, what: str, one: Floats, two: Floats) -> Difference:

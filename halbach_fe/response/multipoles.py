@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.geometry.domain import magnet_half_length, magnet_radius
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, fourier_analysis, observe, together
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
@@ -33,7 +32,6 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
-from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 Complexes = NDArray[np.complex128]
@@ -218,7 +216,7 @@ class MultipoleModel:
         return np.concatenate([relative.real, relative.imag], axis=-1)
 
 
-def multipole_model(study: Study, reference: MultipoleReference,
+def multipole_model(magnet: Magnet, reference: MultipoleReference,
                     session: Session) -> MultipoleModel:
     """Build the matrix from block magnetizations to multipoles, as `response_matrix` does for
     readings.
@@ -228,37 +226,37 @@ def multipole_model(study: Study, reference: MultipoleReference,
     StudyError
         If the reference is none for this study, or the nominal magnet has no main multipole.
     """
-    return multipole_models(study, (reference,), session)[0]
+    return multipole_models(magnet, (reference,), session)[0]
 
 
 def multipole_models(
-    study: Study, references: Sequence[MultipoleReference], session: Session
+    magnet: Magnet, references: Sequence[MultipoleReference], session: Session
 ) -> list[MultipoleModel]:
     """`multipole_model` of several references, solved for together."""
-    main = study.array.multipole_order
+    main = magnet.array.multipole_order
     wanted, observations = [], []
     for one in references:
         orders = tuple(sorted(set(one.orders) - {main}))
         if not orders:
-            raise StudyError(must_be("--orders", f"study {study.name}",
+            raise StudyError(must_be("--orders", f"study {magnet.name}",
                                      "those of unwanted multipoles", "the main one only"))
-        if study.dimension == 2 and one.z_m is not None:
-            raise StudyError(must_be("--at-z-m", f"study {study.name}", "left out, since it is 2D",
+        if magnet.dimension == 2 and one.z_m is not None:
+            raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
                                      f"{one.z_m:g}"))
-        wanted.append((orders, _radius(study, one), one.z_m))
-        observations.append(_observation(study, wanted[-1][1], max(*orders, main), one.z_m))
-    bare = study.with_(instrument=Instrument())
+        wanted.append((orders, _radius(magnet, one), one.z_m))
+        observations.append(_observation(magnet, wanted[-1][1], max(*orders, main), one.z_m))
+    bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(together, observations), session)
     found, first = [], 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
         part = slice(first, first + len(observation))
         first = part.stop
-        integrated = study.dimension == 3 and z is None
+        integrated = magnet.dimension == 3 and z is None
         matrix = _complexes(model.matrix[part])
         if integrated:
-            matrix[0] += beyond(study, _reach(study))
+            matrix[0] += beyond(magnet, _reach(magnet))
         index = np.array([main, *orders]) - 1
-        turn = _turn(study, matrix[main - 1], model)
+        turn = _turn(magnet, matrix[main - 1], model)
         phases = np.exp(-1j * turn * (index + 1))
         found.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
@@ -268,7 +266,7 @@ def multipole_models(
 
 
 def circle_models(
-    study: Study, observation: Observation, model: Response
+    magnet: Magnet, observation: Observation, model: Response
 ) -> list[MultipoleModel]:
     """Multipoles on the circles that a study reads, without another solve: all orders that the
     readings tell, the main one too, in units of the main one on the circle of that radius that is
@@ -277,8 +275,8 @@ def circle_models(
     They are Fourier coefficients of B_r at the study's own angles: of m angles, order n has what
     there is of order m - n too. `multipole_models` takes as many angles as are needed.
     """
-    main, found = study.array.multipole_order, []
-    circles = _read_circles(study, observation)
+    main, found = magnet.array.multipole_order, []
+    circles = _read_circles(magnet, observation)
     for radius in sorted({radius for radius, _, _ in circles}):
         own = sorted((z, analysis) for one, z, analysis in circles if one == radius)
         _, middle = min(own, key=lambda pair: abs(pair[0]))
@@ -288,7 +286,7 @@ def circle_models(
         reference, fixed = (_complexes(_seen(middle, one))[main - 1:main]
                             for one in (model.matrix, model.offset))
         try:
-            turn = _turn(study, reference[0], model)
+            turn = _turn(magnet, reference[0], model)
         except StudyError:
             continue
         order = np.array([main, *orders])
@@ -297,7 +295,7 @@ def circle_models(
             matrix, offset = (_complexes(_seen(analysis, one))[:len(orders)]
                               for one in (model.matrix, model.offset))
             found.append(MultipoleModel(
-                orders, main, radius, z if study.dimension == 3 else None, False,
+                orders, main, radius, z if magnet.dimension == 3 else None, False,
                 phases[:, None] * np.vstack([reference, matrix]),
                 phases * np.concatenate([fixed, offset]),
                 _circle_error(analysis, model.error)[order - 1], model.nominal, -turn))
@@ -305,17 +303,17 @@ def circle_models(
 
 
 def solved_circles(
-    study: Study, points: Floats, flux_density: Floats, errors: Floats
+    magnet: Magnet, points: Floats, flux_density: Floats, errors: Floats
 ) -> list[tuple[MultipoleModel, Multipoles]]:
     """Multipoles of a solved field B (n, 3) in T on the study's circles, with the solver's errors
     (readings,) in T of the study's readings.
     """
-    observed = study.observation
+    observed = magnet.study.observation
     if observed.quantity == "flux_density":
         errors = np.repeat(errors.reshape(len(points), -1)[:, 0], len(COMPONENTS))
         observed = observed.with_(components=COMPONENTS)
-    bare = study.with_(instrument=Instrument(), observation=observed)
-    observation = observe(bare, points, np.ones_like(points, bool))
+    bare = magnet.with_(instrument=Instrument(), observation=observed)
+    observation = observe(bare.study, points, np.ones_like(points, bool))
     readings = observation.apply(flux_density)
     # one parameter, the strength of the whole magnet
     whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
@@ -335,30 +333,30 @@ def _complexes(values: Floats) -> Complexes:
     return values[half:] + 1j * values[:half]
 
 
-def _turn(study: Study, row: Complexes, model: Response) -> float:
+def _turn(magnet: Magnet, row: Complexes, model: Response) -> float:
     """Angle of the nominal main multipole, whose row of the matrix is (parameters,)."""
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
     if not abs(own) > NOTHING_THERE * scale:
         raise StudyError(must_be(
-            "`array`", f"study {study.name}",
-            f"that of a magnet with a multipole of order {study.array.multipole_order}",
+            "`array`", f"study {magnet.name}",
+            f"that of a magnet with a multipole of order {magnet.array.multipole_order}",
             "one without", "Check multipole_order and its exceptions."))
-    return float(np.angle(own)) / study.array.multipole_order
+    return float(np.angle(own)) / magnet.array.multipole_order
 
 
 def _read_circles(
-    study: Study, observation: Observation
+    magnet: Magnet, observation: Observation
 ) -> list[tuple[float, float, sparse.csr_array]]:
     """Radius and z in m of each circle, and the matrix (2 K, readings) of A_1 ... B_K there."""
     positions, labels = observation.positions, np.array(observation.labels)
-    settings, size = study.observation.positions, len(labels)
+    settings, size = magnet.study.observation.positions, len(labels)
     plain = (observation.operator.shape == observation.analysis.shape
              and (observation.operator != observation.analysis).nnz == 0)
     if not isinstance(settings, CirclePositions) or not plain:
         return []
     pick = sparse.eye_array(size, format="csr")
-    if study.observation.quantity == "fourier_coefficients":
+    if magnet.study.observation.quantity == "fourier_coefficients":
         rows = np.array([label[1:].isdigit() for label in observation.labels])
         circles = dict.fromkeys((float(x), float(z)) for x, _, z in positions[rows])
         return [(radius, z, pick[np.flatnonzero(
@@ -387,14 +385,14 @@ def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
     return np.full(analysis.shape[0] // 2, np.sqrt(2 * np.mean(own**2)))
 
 
-def beyond(study: Study, reach: float) -> Complexes:
+def beyond(magnet: Magnet, reach: float) -> Complexes:
     """Integral of B_y + i B_x on the axis, beyond |z| = reach in m, per A/m of every block as a
     point dipole in vacuum: (parameters,) in T m.
 
     ``B = mu_0 / 4 pi (3 (m R) R / R^5 - m / R^3)``, integrated along z by hand.
     """
     found = []
-    for block in blocks_of(study):
+    for block in magnet.blocks:
         middle, total = block.middle, np.zeros((2, 3))
         aside = -middle[:2]
         square = float(aside @ aside)
@@ -410,32 +408,32 @@ def beyond(study: Study, reach: float) -> Complexes:
     return np.concatenate(found)
 
 
-def _reach(study: Study) -> float:
+def _reach(magnet: Magnet) -> float:
     """Where sums along z end, in m from the middle."""
-    return magnet_half_length(study) + BEYOND_ENDS * magnet_radius(study)
+    return magnet.half_length + BEYOND_ENDS * magnet.radius
 
 
-def _radius(study: Study, reference: MultipoleReference) -> float:
-    positions = study.observation.positions
-    bore = study.array.inner_radius_m
+def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
+    positions = magnet.study.observation.positions
+    bore = magnet.array.inner_radius_m
     radius = reference.radius_m
     if radius is None:
         own = positions.radius_m if isinstance(positions, CirclePositions) else ()
         radius = own[0] if len(own) == 1 else DEFAULT_RADIUS * bore
     if not 0 < radius < bore:
-        raise StudyError(must_be("--reference-radius-m", f"study {study.name}",
+        raise StudyError(must_be("--reference-radius-m", f"study {magnet.name}",
                                  f"between 0 and the blocks' inner radius of {bore:g} m",
                                  f"{radius:g}", "Was it meant in millimetres?"))
     return radius
 
 
-def _observation(study: Study, radius: float, highest: int, z: float | None) -> Observation:
+def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -> Observation:
     """Fourier coefficients of B_r, of one circle or integrated along z."""
-    bore = study.array.inner_radius_m
+    bore = magnet.array.inner_radius_m
     angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
-    if study.dimension == 3 and z is None:
-        end = _reach(study)
+    if magnet.dimension == 3 and z is None:
+        end = _reach(magnet)
         step = 2 * np.pi * (bore - radius) / -np.log(SUM_ERROR)
         limits = (-end, end, int(np.ceil(2 * end / step)) + 1)
     settings = FourierCoefficients(

@@ -15,10 +15,10 @@ import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import GetDPError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
-from halbach_fe.response.matrix import Response, parameter_names, response_matrix
+from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.condensed_newton import Condensed, condense
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.field import check_points, choose_route, finite_element_part, formulation_of
@@ -28,7 +28,6 @@ from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import unit_fields
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study, curve_of
 
 AGREEMENT_T = 1e-8
 """How well readings must agree with GetDP's Newton method. Its residual of 1e-10 is some 1e-10 T,
@@ -79,7 +78,7 @@ class NonlinearModel:
 
 
 def nonlinear_model(
-    study: Study, observation: Observation, session: Session, generator: np.random.Generator,
+    magnet: Magnet, observation: Observation, session: Session, generator: np.random.Generator,
     prior: Gaussian | None = None,
 ) -> NonlinearModel:
     """Build the model of a study whose iron ring has an H(B) curve, and verify it.
@@ -92,34 +91,34 @@ def nonlinear_model(
     GetDPError
         If it does not agree with GetDP.
     """
-    if curve_of(study) is None:
-        raise StudyError(f"Input `iron_ring.curve` of study {study.name} must be given for a "
+    if magnet.curve is None:
+        raise StudyError(f"Input `iron_ring.curve` of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
-    check_points(study, observation.points)
-    base = _with_vacuum_for_iron(study, choose_route(study, observation.points))
+    check_points(magnet, observation.points)
+    base = _with_vacuum_for_iron(magnet, choose_route(magnet, observation.points))
     linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))
-    condensed = condense_to_iron(study, observation, session, linear)
-    error = _error(study, observation, session)
-    model = NonlinearModel(condensed, linear.offset, parameter_names(study), linear.nominal, error,
+    condensed = condense_to_iron(magnet, observation, session, linear)
+    error = _error(magnet, observation, session)
+    model = NonlinearModel(condensed, linear.offset, magnet.parameter_names, linear.nominal, error,
                            np.nan)
-    prior = prior or nominal_prior(
-        linear.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
-        study.prior.common_mode_sd)
+    known = magnet.study.prior
+    prior = prior or nominal_prior(linear.nominal, magnet.dimension, known.magnitude_sd,
+                                   known.direction_sd_deg, known.common_mode_sd)
     samples = prior.sample(VERIFIED_SAMPLES, generator)
     return replace(model,
-                   agreement_T=compare_with_newton(model, study, observation, session, samples))
+                   agreement_T=compare_with_newton(model, magnet, observation, session, samples))
 
 
 def condense_to_iron(
-    study: Study, observation: Observation, session: Session, linear: Response
+    magnet: Magnet, observation: Observation, session: Session, linear: Response
 ) -> Condensed:
     """Condense a study to its iron; ``linear`` are the readings with vacuum in its place."""
-    curve = curve_of(study)
+    curve = magnet.curve
     assert curve is not None  # the caller's
-    route = choose_route(study, observation.points)
-    formulation = formulation_of(study, route)
-    assembly = assemble(_with_vacuum_for_iron(study, route), session, formulation)
-    mesh, unknowns, size = assembly.mesh, assembly.unknowns, study.dimension
+    route = choose_route(magnet, observation.points)
+    formulation = formulation_of(magnet, route)
+    assembly = assemble(_with_vacuum_for_iron(magnet, route), session, formulation)
+    mesh, unknowns, size = assembly.mesh, assembly.unknowns, magnet.dimension
     gauss, weights = quadrature(mesh, np.flatnonzero(mesh.in_iron))
     gradient = sparse.csr_array(
         sparse.vstack(formulation.flux_density(mesh, gauss, unknowns)[:size]))
@@ -135,33 +134,33 @@ def condense_to_iron(
     potential = np.hstack([
         assembly.solutions[1 + size * number:1 + size * (number + 1), iron].T
         @ (MU_0 * block.recoil_tensor[:size, :size])
-        for number, block in enumerate(blocks_of(study))])
+        for number, block in enumerate(magnet.blocks)])
     return Condensed(law, gradient, weights, stiffness, potential, linear.whole, surface,
                      readings, linear.nominal)
 
 
 def newton_readings(
-    study: Study, observation: Observation, session: Session, magnetizations: Floats,
+    magnet: Magnet, observation: Observation, session: Session, magnetizations: Floats,
     cold: bool = False,
 ) -> Floats:
     """Readings (k, readings) in T of magnetizations (k, parameters) in A/m by GetDP's Newton."""
-    size = study.dimension
-    samples = np.zeros((len(magnetizations), len(blocks_of(study)), 3))
+    size = magnet.dimension
+    samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
     samples[..., :size] = magnetizations.reshape(len(magnetizations), -1, size)
-    route = choose_route(study, observation.points)
-    fields = solve_samples(study, observation.points, samples, session,
-                           formulation_of(study, route), cold=cold)
-    if study.solver.method == "reaction":
+    route = choose_route(magnet, observation.points)
+    fields = solve_samples(magnet, observation.points, samples, session,
+                           formulation_of(magnet, route), cold=cold)
+    if magnet.study.solver.method == "reaction":
         remanence = [samples[:, number] @ (MU_0 * block.recoil_tensor)
-                     for number, block in enumerate(blocks_of(study))]
-        units = unit_fields(blocks_of(study), observation.points)
+                     for number, block in enumerate(magnet.blocks)]
+        units = unit_fields(magnet.blocks, observation.points)
         for unit, vectors in zip(units, remanence, strict=True):
             fields = fields + np.einsum("nck,sk->snc", unit, vectors)
-    return observation.apply(fields + external_field(study, observation.points))
+    return observation.apply(fields + external_field(magnet, observation.points))
 
 
 def compare_with_newton(
-    model: NonlinearModel, study: Study, observation: Observation, session: Session,
+    model: NonlinearModel, magnet: Magnet, observation: Observation, session: Session,
     magnetizations: Floats, cold: bool = False,
 ) -> float:
     """Largest difference in T between the model and GetDP's Newton method at any reading.
@@ -172,28 +171,28 @@ def compare_with_newton(
         If it is larger than AGREEMENT_T.
     """
     folder = replace(session, folder=session.folder / "verified", progress=None)
-    theirs = newton_readings(study, observation, folder, magnetizations, cold)
+    theirs = newton_readings(magnet, observation, folder, magnetizations, cold)
     difference = float(np.abs(model(magnetizations) - theirs).max())
     if not difference <= AGREEMENT_T:
         raise GetDPError(
-            f"The condensed model of study {study.name} is {difference:.1e} T from GetDP's own "
+            f"The condensed model of study {magnet.name} is {difference:.1e} T from GetDP's own "
             f"Newton method, where {AGREEMENT_T:.0e} T is allowed. Please report this with the "
             "study.")
     return difference
 
 
-def _with_vacuum_for_iron(study: Study, route: str) -> Study:
-    """The study with nothing in the iron's place, on the same mesh, every block by itself."""
-    assert study.iron_ring is not None  # a curve is the iron's
-    ring = study.iron_ring.with_(curve=None, relative_permeability=1.0)
-    solver = {"symmetry": False} | ({} if study.dimension == 2 else {"route": route})
-    return study.with_(iron_ring=ring, solver=study.solver.with_(**solver))
+def _with_vacuum_for_iron(magnet: Magnet, route: str) -> Magnet:
+    """The magnet with nothing in the iron's place, on the same mesh, every block by itself."""
+    assert magnet.iron_ring is not None  # a curve is the iron's
+    ring = magnet.iron_ring.with_(curve=None, relative_permeability=1.0)
+    solver = {"symmetry": False} | ({} if magnet.dimension == 2 else {"route": route})
+    return magnet.with_(iron_ring=ring, solver=magnet.study.solver.with_(**solver))
 
 
-def _error(study: Study, observation: Observation, session: Session) -> Floats:
-    parts = finite_element_part(study, observation.points, replace(
+def _error(magnet: Magnet, observation: Observation, session: Session) -> Floats:
+    parts = finite_element_part(magnet, observation.points, replace(
         session, folder=session.folder / "nominal"), columns=False)
-    return reading_errors(study, observation, parts, error_bar_session(session))
+    return reading_errors(magnet, observation, parts, error_bar_session(session))
 
 
 def _check_iron(

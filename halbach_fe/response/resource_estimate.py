@@ -24,8 +24,9 @@ from scipy.sparse.linalg import splu
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
+from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import Symmetry, no_symmetry, symmetry_of, unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
@@ -44,13 +45,11 @@ from halbach_fe.solver.field import (
     check_points,
     choose_route,
     formulation_of,
-    is_vacuum,
     uses_symmetry,
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.mesh import Entities, meridian_size
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
-from halbach_fe.study.model import Study, is_nonlinear
 
 GIB = 2.0**30
 EXACT_FIELD_ONLY = "exact_field_only"
@@ -252,78 +251,78 @@ class CountedMesh:
     axis: Entities
 
 
-def estimate_solve(study: Study, observation: Observation, jobs: int) -> Estimate:
+def estimate_solve(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
     """What the field of the nominal array takes, with error bars."""
-    check_points(study, observation.points)
-    problems = [*nominal(study, observation.points, jobs), *error_bars(study, observation, jobs)]
-    return _estimate(study, observation.points, len(observation), problems, jobs)
+    check_points(magnet, observation.points)
+    problems = [*nominal(magnet, observation.points, jobs), *error_bars(magnet, observation, jobs)]
+    return _estimate(magnet, observation.points, len(observation), problems, jobs)
 
 
-def estimate_infer(study: Study, observation: Observation, jobs: int) -> Estimate:
+def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
     """What the matrix H takes, with error bars, and the update."""
     points = observation.points
-    check_points(study, points)
+    check_points(magnet, points)
     try:
-        problems = field_of_blocks(study, points, jobs)
+        problems = field_of_blocks(magnet, points, jobs)
     except PointsOutsideError as error:
         raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
-    if axisymmetric_stand_in(study, choose_route(study, points), points) is None:
-        problems += error_bars(study, observation, jobs)
-    if is_nonlinear(study):  # is the iron linear enough?
-        problems += nominal(study, points, jobs, "the updated magnet")
-    return _estimate(study, points, len(observation), problems, jobs,
-                     study.dimension * len(blocks_of(study)))
+    if axisymmetric_stand_in(magnet, choose_route(magnet, points), points) is None:
+        problems += error_bars(magnet, observation, jobs)
+    if magnet.is_nonlinear:  # is the iron linear enough?
+        problems += nominal(magnet, points, jobs, "the updated magnet")
+    return _estimate(magnet, points, len(observation), problems, jobs,
+                     magnet.dimension * len(magnet.blocks))
 
 
-def estimate_verify(study: Study, jobs: int) -> Estimate:
+def estimate_verify(magnet: Magnet, jobs: int) -> Estimate:
     """What refinement, a farther boundary and the dual route take."""
-    points = points_from(study.observation.positions)
-    check_points(study, points)
-    route = choose_route(study, points)
-    variants = {"the study's mesh": study, "a coarser mesh": refined(study, 1 / REFINEMENT),
-                "a finer mesh": refined(study, REFINEMENT),
-                "a farther boundary": farther(study, MESHES[route], REFINEMENT)}
+    points = points_from(magnet.study.observation.positions)
+    check_points(magnet, points)
+    route = choose_route(magnet, points)
+    variants = {"the study's mesh": magnet, "a coarser mesh": refined(magnet, 1 / REFINEMENT),
+                "a finer mesh": refined(magnet, REFINEMENT),
+                "a farther boundary": farther(magnet, MESHES[route], REFINEMENT)}
     if route in DUAL:
-        variants["the dual route"] = dual(study, route)
+        variants["the dual route"] = dual(magnet, route)
     problems = [problem for what, variant in variants.items()
                 for problem in nominal(variant, points, jobs, what)]
-    return _estimate(study, points, 3 * len(points), problems, jobs)
+    return _estimate(magnet, points, 3 * len(points), problems, jobs)
 
 
 def nominal(
-    study: Study, points: Floats, jobs: int, what: str = "the study's mesh"
+    magnet: Magnet, points: Floats, jobs: int, what: str = "the study's mesh"
 ) -> list[Problem]:
     """What `routes.finite_element_part` solves without single blocks."""
-    if study.solver.method == "reaction" and is_vacuum(study):
+    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return []
-    return runs_of(study, choose_route(study, points), points, (), jobs, what)
+    return runs_of(magnet, choose_route(magnet, points), points, (), jobs, what)
 
 
-def field_of_blocks(study: Study, points: Floats, jobs: int) -> list[Problem]:
+def field_of_blocks(magnet: Magnet, points: Floats, jobs: int) -> list[Problem]:
     """What `routes.finite_element_part` solves with single blocks."""
-    if study.solver.method == "reaction" and is_vacuum(study):
+    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return []
-    route = choose_route(study, points)
-    near = axisymmetric_stand_in(study, route, points)
+    route = choose_route(magnet, points)
+    near = axisymmetric_stand_in(magnet, route, points)
     if near is not None:
         return field_of_blocks(near, points, jobs) + [
-            problem for one, what in ((study, "as it is"), (near, "simpler"))
+            problem for one, what in ((magnet, "as it is"), (near, "simpler"))
             for problem in runs_of(one, "scalar_potential", points, (), jobs, what)]
-    return runs_of(study, route, points, _symmetry(study).sources, jobs, "the study's mesh")
+    return runs_of(magnet, route, points, _symmetry(magnet).sources, jobs, "the study's mesh")
 
 
-def error_bars(study: Study, observation: Observation, jobs: int) -> list[Problem]:
+def error_bars(magnet: Magnet, observation: Observation, jobs: int) -> list[Problem]:
     """What `discretization.reading_errors` solves."""
-    route = choose_route(study, observation.points)
+    route = choose_route(magnet, observation.points)
     if route in DUAL:
-        return nominal(dual(study, route), observation.points, jobs, "error bars, dual route")
-    coarser, far = refined(study, 1 / REFINEMENT), farther(study, MESHES[route], REFINEMENT)
+        return nominal(dual(magnet, route), observation.points, jobs, "error bars, dual route")
+    coarser, far = refined(magnet, 1 / REFINEMENT), farther(magnet, MESHES[route], REFINEMENT)
     return [*nominal(coarser, observation.points, jobs, "error bars, coarser mesh"),
             *nominal(far, observation.points, jobs, "error bars, farther boundary")]
 
 
 def runs_of(
-    study: Study, route: str, points: Floats, blocks: Sequence[int], jobs: int, what: str
+    magnet: Magnet, route: str, points: Floats, blocks: Sequence[int], jobs: int, what: str
 ) -> list[Problem]:
     """The runs for the nominal array, and for blocks with 1 T along each axis.
 
@@ -331,11 +330,11 @@ def runs_of(
     `azimuthal.solve_modes` start.
     """
     kind = MESHES[route]
-    half = boundary_half_length(study, kind) if study.dimension == 3 else np.inf
-    check_inside(study.name, boundary_radius(study, kind), half, points)
-    mesh = counted(study, kind)
-    variants = 1 if study.solver.method == "direct" else 2
-    sources = 1 + study.dimension * len(blocks)
+    half = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
+    check_inside(magnet.name, boundary_radius(magnet, kind), half, points)
+    mesh = counted(magnet, kind)
+    variants = 1 if magnet.study.solver.method == "direct" else 2
+    sources = 1 + magnet.dimension * len(blocks)
 
     def problem(unknowns: int, law: CostLaw, processes: int, matrices: int, solves: int) -> Problem:
         each = law.bytes_each + law.fill * unknowns ** (1 / 3)
@@ -347,21 +346,21 @@ def runs_of(
                        (GETDP_BYTES + unknowns * each) / GIB, seconds, disk / GIB)
 
     if route == "azimuthal_modes":
-        weights = nominal_waves(study, modes_needed(study, points))
-        rings = len({number // study.array.blocks_per_ring for number in blocks})
+        weights = nominal_waves(magnet, modes_needed(magnet, points))
+        rings = len({number // magnet.array.blocks_per_ring for number in blocks})
         each = (NOMINAL_SOURCES - 1 + 3 * rings) * unknowns_of(mesh.inner, mesh.axis, 1)
         spans = [(first, last - first + 1) for first, last in spans_of(
             weights, bool(blocks), each)]
         return [problem(unknowns_of(mesh.inner, mesh.axis, first), PLANE, variants, modes,
                         modes * (NOMINAL_SOURCES + 3 * rings)) for first, modes in spans]
-    formulation = formulation_of(study, route)
+    formulation = formulation_of(magnet, route)
     unknowns = formulation.unknowns(mesh.inner)
-    law = PLANE if route == "cross_section" else EDGES[study.solver.edge_order]
+    law = PLANE if route == "cross_section" else EDGES[magnet.study.solver.edge_order]
     if route == "scalar_potential":
         law = FACTORIZED if unknowns <= formulation.factorized else ITERATED
-        if law is ITERATED and study.iron_ring is not None:
+        if law is ITERATED and magnet.iron_ring is not None:
             law = replace(law, solve_s=IRON_ITERATIONS * law.solve_s)
-    if not is_nonlinear(study):
+    if not magnet.is_nonlinear:
         parts = min(sources, max(1, jobs // variants))
         return [problem(unknowns, law, variants * parts, 1, math.ceil(sources / parts))]
     linear = [problem(unknowns, law, 1, 1, sources)] if blocks and variants == 2 else []
@@ -372,21 +371,21 @@ def runs_of(
                     NEWTON_STEPS + (sources if blocks else 0)), *linear]
 
 
-def _symmetry(study: Study) -> Symmetry:
-    return symmetry_of(study) if uses_symmetry(study) else no_symmetry(study)
+def _symmetry(magnet: Magnet) -> Symmetry:
+    return symmetry_of(magnet) if uses_symmetry(magnet) else no_symmetry(magnet)
 
 
-def counted(study: Study, kind: str) -> CountedMesh:
+def counted(magnet: Magnet, kind: str) -> CountedMesh:
     """Count the parts of a kind of mesh (a value of `routes.MESHES`), without making it."""
     from halbach_fe import geo  # Gmsh loads only when something is meshed
 
     if kind == "meridian":
-        columns, rows = geo.grid_size(study, meridian_size(study))
+        columns, rows = geo.grid_size(magnet, meridian_size(magnet))
         cells = (columns - 1) * (rows - 1)
         nodes = (columns - 1) * (rows - 2)  # the outer boundary is three sides of the half-plane
         return CountedMesh(cells, Entities(nodes, nodes, nodes + cells, cells),
                            Entities(rows - 2, rows - 2, rows - 1, 0))
-    triangles, rim = (round(number) for number in geo.plane_size(study, kind))
+    triangles, rim = (round(number) for number in geo.plane_size(magnet, kind))
     # Euler: a disk of T triangles with R edges on its rim has E edges and V corners
     edges = (3 * triangles + rim) // 2
     corners = 1 + edges - triangles
@@ -395,7 +394,7 @@ def counted(study: Study, kind: str) -> CountedMesh:
         inner = Entities(corners + edges - 2 * rim, corners - rim, edges - rim, triangles)
         return CountedMesh(triangles, inner, none)
     # every prism on a triangle is cut into three, every rectangle on an edge into two
-    layers = len(geo.layers(study)) - 1
+    layers = len(geo.layers(magnet)) - 1
     inner_corners = (corners - rim) * (layers - 1)
     inner_edges = ((corners - rim) * layers + (edges - rim) * (layers - 1)  # upright, level
                    + (edges - rim) * layers)  # and across the rectangles
@@ -405,14 +404,14 @@ def counted(study: Study, kind: str) -> CountedMesh:
 
 
 def _estimate(
-    study: Study, points: Floats, readings: int, problems: Sequence[Problem], jobs: int,
+    magnet: Magnet, points: Floats, readings: int, problems: Sequence[Problem], jobs: int,
     parameters: int = 0,
 ) -> Estimate:
     """Add what this program itself takes: for elements, for fields of sources at points, for H."""
-    blocks, speed = blocks_of(study), machine_speed()
+    blocks, speed = magnet.blocks, machine_speed()
     elements = max((one.elements for one in problems), default=0)
     matrix = readings * parameters
-    places = 0.0 if study.solver.method == "direct" else _places(study, points)
+    places = 0.0 if magnet.study.solver.method == "direct" else _places(magnet, points)
     fields = parameters * len(points) * 3 if problems else 0
     known = parameters * min(readings, parameters)
     # the fields of blocks are gone when the posterior is found
@@ -436,7 +435,7 @@ def _estimate(
         seconds += max(max(one.seconds for one in runs),
                        sum(one.seconds for one in runs) / at_once)
     return Estimate(
-        study=study.name, blocks=len(blocks), readings=readings, parameters=parameters, jobs=jobs,
+        study=magnet.name, blocks=len(blocks), readings=readings, parameters=parameters, jobs=jobs,
         route=problems[0].route if problems else EXACT_FIELD_ONLY,
         problems=tuple(replace(one, seconds=one.seconds / speed) for one in problems),
         own_memory_GiB=own, memory_GiB=own + side_by_side,
@@ -445,20 +444,20 @@ def _estimate(
         seconds=seconds / speed, available_GiB=available_memory())
 
 
-def _places(study: Study, points: Floats) -> float:
+def _places(magnet: Magnet, points: Floats) -> float:
     """From how many places blocks see points: those on circles are seen by many from the same, and
     share integrals (`exact_field.unit_fields`). Counted for the blocks of one ring.
     """
-    slots = np.arange(1, study.array.blocks_per_ring + 1)
+    slots = np.arange(1, magnet.array.blocks_per_ring + 1)
     some = points[:COUNTED_PLACES // len(slots) + 1]
-    middles = np.radians([position_angle_deg(study.array, slot) for slot in slots.tolist()])
+    middles = np.radians([position_angle_deg(magnet.array, slot) for slot in slots.tolist()])
     turn = np.arctan2(some[:, 1], some[:, 0])[:, None] - middles
     turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
     r = np.hypot(some[:, 0], some[:, 1])[:, None]
     z = np.broadcast_to(some[:, 2:], turn.shape)
     different, _ = unique_points(np.column_stack(
         [x.ravel() for x in (r * np.cos(turn), r * np.sin(turn), z)]).round(9))
-    return study.array.rings * len(different) * len(points) / len(some)
+    return magnet.array.rings * len(different) * len(points) / len(some)
 
 
 def machine_speed() -> float:

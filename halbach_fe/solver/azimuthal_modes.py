@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import make_folder
+from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import array_half_length, blocks_of, position_angle_deg
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import Job
@@ -37,7 +38,6 @@ from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, check_inside, rende
 from halbach_fe.solver.mesh import Entities, VerifiedMesh, build_meridian, verify_mesh
 from halbach_fe.solver.runs import Task, run_tasks
 from halbach_fe.solver.session import Session
-from halbach_fe.study.model import Study, is_nonlinear
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
@@ -59,23 +59,23 @@ NO_REMANENCE = 1e-12
 """Of the largest mode: a mode of the nominal array below it is excluded by symmetry."""
 
 
-def is_axisymmetric(study: Study, points: Floats) -> bool:
+def is_axisymmetric(magnet: Magnet, points: Floats) -> bool:
     """Tell whether materials are rotationally symmetric and the points need few modes."""
-    block = study.array.block
-    if study.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
+    block = magnet.array.block
+    if magnet.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
         return False
-    if is_nonlinear(study) or not all(block.isotropic for block in blocks_of(study)):
+    if magnet.is_nonlinear or not all(block.isotropic for block in magnet.blocks):
         return False
-    permeability = np.array([b.recoil_permeability for b in blocks_of(study)])
-    by_ring = permeability.reshape(study.array.rings, -1)
-    return bool((by_ring == by_ring[:, :1]).all()) and modes_needed(study, points) <= MAX_MODES
+    permeability = np.array([b.recoil_permeability for b in magnet.blocks])
+    by_ring = permeability.reshape(magnet.array.rings, -1)
+    return bool((by_ring == by_ring[:, :1]).all()) and modes_needed(magnet, points) <= MAX_MODES
 
 
-def modes_needed(study: Study, points: Floats) -> int:
+def modes_needed(magnet: Magnet, points: Floats) -> int:
     """Highest mode that matters at any of the points (n, 3)."""
-    array = study.array
+    array = magnet.array
     r, z = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
-    beyond = np.maximum(z - array_half_length(study), 0)
+    beyond = np.maximum(z - magnet.array_half_length, 0)
     # decay per mode: r/ri in the bore, ro/r outside, and with the distance beyond the ends
     decay = np.where(r < array.inner_radius_m, r / array.inner_radius_m,
                      np.where(r > array.outer_radius_m, array.outer_radius_m / np.maximum(r, 1e-9),
@@ -111,7 +111,7 @@ class _Case:
         Of the probes.
     """
 
-    study: Study
+    magnet: Magnet
     mesh: VerifiedMesh
     weights: Floats
     solved: tuple[int, ...]
@@ -125,7 +125,7 @@ class _Case:
 
 
 def solve_modes(
-    study: Study, points: Floats, blocks: Sequence[int], session: Session
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session
 ) -> Floats:
     """Finite-element part of the field of the nominal array and of single blocks, as
     `halbach_fe.solver.magnetostatics.solve_sources` returns it: the reaction, or B itself, by the
@@ -142,20 +142,20 @@ def solve_modes(
     -------
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
     """
-    array = study.array
+    array = magnet.array
     r = np.hypot(points[:, 0], points[:, 1])
     r[r < AXIS_RADIUS * array.inner_radius_m] = 0.0
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
-    highest = modes_needed(study, points)
-    mesh = verify_mesh(build_meridian(study, make_folder(session.folder)))
-    check_inside(study.name, mesh.radius, mesh.half_length, points)
+    highest = modes_needed(magnet, points)
+    mesh = verify_mesh(build_meridian(magnet, make_folder(session.folder)))
+    check_inside(magnet.name, mesh.radius, mesh.half_length, points)
     located = locate(mesh, meridian)
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
-    weights = nominal_waves(study, highest)
-    case = _Case(study, mesh, weights, solved, located, *probes_of(mesh, located))
+    weights = nominal_waves(magnet, highest)
+    case = _Case(magnet, mesh, weights, solved, located, *probes_of(mesh, located))
     spans = spans_of(weights, bool(blocks),
                      case.last_source * unknowns_of(mesh.inner, mesh.axis, 1))
-    variants = [False] if study.solver.method == "direct" else [False, True]
+    variants = [False] if magnet.study.solver.method == "direct" else [False, True]
     tasks = [_task(case, span, vacuum, session)
              for span in reversed(spans) for vacuum in variants]
     results = run_tasks(tasks, session)
@@ -190,7 +190,7 @@ def _runs(modes: Sequence[int], most: int) -> list[tuple[int, int]]:
     return found
 
 
-def nominal_waves(study: Study, highest: int) -> Floats:
+def nominal_waves(magnet: Magnet, highest: int) -> Floats:
     """Nominal remanence as waves, (modes, 2, rings, 3) in T: by what goes into cos(m theta) and
     sin(m theta), ring, and along or across the blocks' middles, or along z.
 
@@ -198,9 +198,9 @@ def nominal_waves(study: Study, highest: int) -> Floats:
     potential (A psi_along + Z psi_axial) cos(m (theta - t)) + C psi_across sin(m (theta - t)).
     """
     m = np.arange(highest + 1)
-    found = np.zeros((highest + 1, 2, study.array.rings, 3))
-    for block in blocks_of(study):
-        middle = _middle(study, block)
+    found = np.zeros((highest + 1, 2, magnet.array.rings, 3))
+    for block in magnet.blocks:
+        middle = _middle(magnet, block)
         x, y, axial = block.remanence * np.array(block.easy_axis)
         along = np.cos(middle) * x + np.sin(middle) * y
         across = np.cos(middle) * y - np.sin(middle) * x
@@ -215,12 +215,12 @@ def nominal_waves(study: Study, highest: int) -> Floats:
     return found
 
 
-def _middle(study: Study, block: MagnetBlock) -> float:
-    return float(np.radians(position_angle_deg(study.array, block.slot)))
+def _middle(magnet: Magnet, block: MagnetBlock) -> float:
+    return float(np.radians(position_angle_deg(magnet.array, block.slot)))
 
 
 def _rings(case: _Case) -> list[_Ring]:
-    blocks = blocks_of(case.study)[::case.study.array.blocks_per_ring]
+    blocks = case.magnet.blocks[::case.magnet.array.blocks_per_ring]
     return [_Ring(block.recoil_permeability,
                   case.solved.index(ring) + 1 if ring in case.solved else 0,
                   *(case.weights[:, :, ring, component].ravel().tolist()
@@ -257,7 +257,7 @@ def fill_run_folder(
     """
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
-    text = render("case_modes.pro.j2", study=case.study, regions=case.mesh.regions,
+    text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.mesh.regions,
                   points=case.places.tolist(), rings=_rings(case), solved=max(1, len(case.solved)))
     (folder / "case.pro").write_text(text, encoding="utf-8")
     (folder / case.mesh.path.name).write_bytes(case.mesh.path.read_bytes())
@@ -285,7 +285,7 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     def gradients(located: Located, chosen: NDArray[np.floating]) -> Floats:
         value, (along_r, along_z) = nodal_operators(case.mesh, located, unknowns)
         r = coordinates(case.mesh, located)[:, 0]
-        r[r < AXIS_RADIUS * case.study.array.inner_radius_m] = np.inf  # see _limit_on_axis
+        r[r < AXIS_RADIUS * case.magnet.array.inner_radius_m] = np.inf  # see _limit_on_axis
         return np.stack([apply_operator(along_r, chosen), apply_operator(value, chosen) / r,
                          apply_operator(along_z, chosen)], axis=2)
 
@@ -313,13 +313,13 @@ def _superpose(
 ) -> Floats:
     """Sum modes into the fields at the points, each block turned to its place."""
     phi = np.arctan2(points[:, 1], points[:, 0])
-    everything = blocks_of(case.study)
+    everything = case.magnet.blocks
     result = np.zeros((1 + 3 * len(blocks), len(points), 3))
     for part in range(NOMINAL_SOURCES):
         result[0] += _field({m: g[part, where] for m, g in modes.items()}, phi, sine=part == 1)
     rings = len(case.solved)
     for number, block in enumerate(blocks):
-        middle = _middle(case.study, everything[block])
+        middle = _middle(case.magnet, everything[block])
         rank = case.solved.index(everything[block].ring - 1)
         along, across, axial = (
             _field({m: g[NOMINAL_SOURCES + component * rings + rank, where]

@@ -5,36 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.solver.vacuum_field import field_of
-from halbach_fe.study.magnet import External, Neighbour
+from halbach_fe.study.magnet import Neighbour
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study
 
 EXACT = 12
 """Gauss points per panel for the field as exact as it is computed anywhere."""
 
 
-def external_field(study: Study, points: Floats) -> Floats:
+def external_field(magnet: Magnet, points: Floats) -> Floats:
     """B (n, 3) in T at points (n, 3) in m of what the study has outside the magnet."""
-    external = study.external
+    external = magnet.external
     field = np.tile(external.background_T, (len(points), 1)).astype(float)
     for neighbour in external.neighbours:
-        field += neighbour_field(study, neighbour, points)
+        field += neighbour_field(magnet, neighbour, points)
     for dipole in external.dipoles:
         field += dipole_field(np.array(dipole.position_m), np.array(dipole.moment_A_m2), points)
     return field
 
 
 def neighbour_field(
-    study: Study, neighbour: Neighbour, points: Floats, order: int = EXACT
+    magnet: Magnet, neighbour: Neighbour, points: Floats, order: int = EXACT
 ) -> Floats:
     """B (n, 3) in T of a magnet like the study's, in vacuum, by ``order`` Gauss points a panel."""
     turn = rotation_about_z(np.radians(neighbour.turn_deg))
     seen = (points - [0.0, 0.0, neighbour.z_m]) @ turn
-    alone = study.with_(external=External())
-    return np.asarray(neighbour.factor * field_of(blocks_of(alone), seen, order) @ turn.T)
+    return np.asarray(neighbour.factor * field_of(magnet.blocks, seen, order) @ turn.T)
 
 
 def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:

@@ -14,10 +14,8 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import (
     boundary_half_length,
     boundary_radius,
-    magnet_half_length,
-    magnet_radius,
 )
-from halbach_fe.geometry.magnet import blocks_of, points_in_material
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, solve_modes
 from halbach_fe.solver.external_field import external_field
@@ -35,7 +33,6 @@ from halbach_fe.solver.magnetostatics import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import field_of
-from halbach_fe.study.model import Study, is_nonlinear
 
 SUPERPOSITION_TOLERANCE = 1e-8
 """The problem is linear and the solver direct: what remains is rounding, about 1e-12; a wrong or
@@ -100,29 +97,29 @@ class ElementFields:
         return self.nominal is not self.along_nominal
 
 
-def solve_nominal(study: Study, points: Floats, session: Session) -> Floats:
+def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
     """Field of the nominal array at points (n, 3) in m, by the study's method; (n, 3) in T."""
-    check_points(study, points)
-    return vacuum_part(study, points) + finite_element_part(
-        study, points, session, columns=False).nominal
+    check_points(magnet, points)
+    return vacuum_part(magnet, points) + finite_element_part(
+        magnet, points, session, columns=False).nominal
 
 
-def vacuum_part(study: Study, points: Floats) -> Floats:
+def vacuum_part(magnet: Magnet, points: Floats) -> Floats:
     """What is not left to finite elements of the field with the nominal array, (n, 3) in T."""
-    external = external_field(study, points)
-    if study.solver.method == "direct":
+    external = external_field(magnet, points)
+    if magnet.study.solver.method == "direct":
         return external
-    return external + field_of(blocks_of(study), points)
+    return external + field_of(magnet.blocks, points)
 
 
-def is_vacuum(study: Study) -> bool:
+def is_vacuum(magnet: Magnet) -> bool:
     """Tell whether nothing reacts: the exact field is all there is."""
-    return study.iron_ring is None and all(
-        block.isotropic and block.recoil_permeability == 1.0 for block in blocks_of(study))
+    return magnet.iron_ring is None and all(
+        block.isotropic and block.recoil_permeability == 1.0 for block in magnet.blocks)
 
 
 def finite_element_part(
-    study: Study, points: Floats, session: Session, columns: bool = True
+    magnet: Magnet, points: Floats, session: Session, columns: bool = True
 ) -> ElementFields:
     """What finite elements contribute to B, by the route that suits.
 
@@ -135,26 +132,26 @@ def finite_element_part(
     columns : bool
         Whether single blocks are wanted too.
     """
-    size = study.dimension
-    if study.solver.method == "reaction" and is_vacuum(study):
+    size = magnet.dimension
+    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         zero = np.zeros((len(points), 3))
-        return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, blocks_of(study),
+        return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, magnet.blocks,
                              lambda number, some: np.zeros((len(points[some]), 3, size)))
-    route = choose_route(study, points)
+    route = choose_route(magnet, points)
     if not columns:
-        nominal = _solve_nominal(study, points, session, route)
-        return ElementFields(np.nan, nominal, nominal, blocks_of(study), _not_solved)
-    near = axisymmetric_stand_in(study, route, points)
+        nominal = _solve_nominal(magnet, points, session, route)
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved)
+    near = axisymmetric_stand_in(magnet, route, points)
     if near is not None:
-        return _about(near, study, points, session)
-    placed = uses_symmetry(study)
-    symmetry = symmetry_of(study) if placed else no_symmetry(study)
+        return _about(near, magnet, points, session)
+    placed = uses_symmetry(magnet)
+    symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
     places, index = symmetry.spread(points)
-    if is_nonlinear(study):
-        nominal, fields = solve_tangent(study, places, symmetry.sources, session,
-                                        formulation_of(study, route))
+    if magnet.is_nonlinear:
+        nominal, fields = solve_tangent(magnet, places, symmetry.sources, session,
+                                        formulation_of(magnet, route))
     else:
-        fields = _solve(study, places, symmetry.sources, session, route)
+        fields = _solve(magnet, places, symmetry.sources, session, route)
         nominal = fields[0]
     # the identity is among the placements: the first block is its own source, where it stands
     here = index[symmetry.sources[0]]
@@ -166,40 +163,41 @@ def finite_element_part(
         return placement.from_source(seen)
 
     tangent = fields[0, here]
-    return ElementFields(_superposition_tolerance(study, route, placed),
-                         nominal[here] if is_nonlinear(study) else tangent, tangent,
-                         blocks_of(study), block)
+    return ElementFields(_superposition_tolerance(magnet, route, placed),
+                         nominal[here] if magnet.is_nonlinear else tangent, tangent,
+                         magnet.blocks, block)
 
 
-def uses_symmetry(study: Study) -> bool:
+def uses_symmetry(magnet: Magnet) -> bool:
     """Whether blocks are solved for by symmetry: in a cross-section there is little to save, and
     iron saturates where the field is.
     """
-    return study.solver.symmetry and study.dimension == 3 and not is_nonlinear(study)
+    return magnet.study.solver.symmetry and magnet.dimension == 3 and not magnet.is_nonlinear
 
 
-def axisymmetric_stand_in(study: Study, route: str, points: Floats) -> Study | None:
-    """The `without_gaps` study, if its single blocks stand for those of the study; see `_about`."""
-    near = without_gaps(study)
-    chosen = study.solver.route == "auto" and route == "scalar_potential" and is_axisymmetric(
-        near, points)
-    return near if chosen else None
+def axisymmetric_stand_in(magnet: Magnet, route: str, points: Floats) -> Magnet | None:
+    """The magnet `without_gaps`, if its single blocks can stand for those of the magnet; see
+    `_about`.
+    """
+    near = without_gaps(magnet)
+    chosen = magnet.study.solver.route == "auto" and route == "scalar_potential"
+    return near if chosen and is_axisymmetric(near, points) else None
 
 
-def without_gaps(study: Study) -> Study:
-    """The study with blocks that are alike, without gaps between them."""
-    array = study.array
+def without_gaps(magnet: Magnet) -> Magnet:
+    """The magnet with blocks that are alike, without gaps between them."""
+    array = magnet.array
     exceptions = tuple(one.with_(recoil_permeability=None, recoil_permeability_across=None)
         for one in array.exceptions)
     block = array.block
     if block.shape == "sector":
         block = block.with_(angular_gap_deg=0.0)
-    return study.with_(
+    return magnet.with_(
         array=array.with_(block=block, exceptions=exceptions, recoil_permeability_across=None))
 
 
 def _about(
-    near: Study, study: Study, points: Floats, session: Session
+    near: Magnet, magnet: Magnet, points: Floats, session: Session
 ) -> ElementFields:
     """The nominal array on a 3D mesh, and single blocks as they react in a simpler array, which
     azimuthal modes can do.
@@ -212,12 +210,12 @@ def _about(
     nominal, same_mesh = (
         _solve_nominal(one, points, replace(session, folder=session.folder / name),
                        "scalar_potential")
-        for one, name in ((study, "as-it-is"), (near, "simpler")))
+        for one, name in ((magnet, "as-it-is"), (near, "simpler")))
     return replace(base, nominal=nominal, error=same_mesh - base.nominal)
 
 
-def _superposition_tolerance(study: Study, route: str, placed: bool) -> float:
-    if placed and route == "edge_elements" and study.solver.edge_order == 1:
+def _superposition_tolerance(magnet: Magnet, route: str, placed: bool) -> float:
+    if placed and route == "edge_elements" and magnet.study.solver.edge_order == 1:
         return PLACED_TOLERANCE_LOWEST_ORDER
     if placed and route != "azimuthal_modes":  # whose mesh is symmetric
         return PLACED_TOLERANCE
@@ -229,27 +227,27 @@ def _not_solved(number: int, some: Ints | slice) -> Floats:
 
 
 def _solve(
-    study: Study, points: Floats, blocks: Sequence[int], session: Session, route: str
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session, route: str
 ) -> Floats:
     if route == "azimuthal_modes":
-        return solve_modes(study, points, blocks, session)
-    return solve_sources(study, points, blocks, session, formulation_of(study, route))
+        return solve_modes(magnet, points, blocks, session)
+    return solve_sources(magnet, points, blocks, session, formulation_of(magnet, route))
 
 
-def _solve_nominal(study: Study, points: Floats, session: Session, route: str) -> Floats:
-    if is_nonlinear(study):
-        return solve_samples(study, points, nominal_samples(study), session,
-                             formulation_of(study, route))[0]
-    return _solve(study, points, (), session, route)[0]
+def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: str) -> Floats:
+    if magnet.is_nonlinear:
+        return solve_samples(magnet, points, nominal_samples(magnet), session,
+                             formulation_of(magnet, route))[0]
+    return _solve(magnet, points, (), session, route)[0]
 
 
-def formulation_of(study: Study, route: str) -> Formulation:
+def formulation_of(magnet: Magnet, route: str) -> Formulation:
     """What is solved on the mesh of a route."""
     return {"cross_section": CROSS_SECTION, "scalar_potential": SCALAR_POTENTIAL}.get(
-        route) or edge_elements(study.solver.edge_order)
+        route) or edge_elements(magnet.study.solver.edge_order)
 
 
-def choose_route(study: Study, points: Floats) -> str:
+def choose_route(magnet: Magnet, points: Floats) -> str:
     """The study's route, or for ``auto`` the fastest that can do it.
 
     Raises
@@ -257,50 +255,50 @@ def choose_route(study: Study, points: Floats) -> str:
     StudyError
         If azimuthal modes are asked for where they do not apply.
     """
-    if study.dimension == 2:
+    if magnet.dimension == 2:
         return "cross_section"
-    asked, symmetric = study.solver.route, is_axisymmetric(study, points)
+    asked, symmetric = magnet.study.solver.route, is_axisymmetric(magnet, points)
     if asked == "azimuthal_modes" and not symmetric:
         raise StudyError(
-            f"Input `solver.route` of study {study.name} must be another than "
+            f"Input `solver.route` of study {magnet.name} must be another than "
             "azimuthal_modes here, which needs sectors without angular gaps, of one isotropic "
             "permeability in each ring, linear iron, and points that are not too near to the "
             "blocks. Leave it out.")
     if asked == "auto":
-        if study.solver.method == "direct":
+        if magnet.study.solver.method == "direct":
             return "edge_elements"
         return "azimuthal_modes" if symmetric else "scalar_potential"
     return asked
 
 
-def check_points(study: Study, points: Floats) -> None:
+def check_points(magnet: Magnet, points: Floats) -> None:
     """Refuse points inside magnet or iron, where the field is not what a probe can read; warn of
     points so near to the boundary that it shapes their field.
     """
-    if study.dimension == 2 and np.ptp(points[:, 2]) > 0:
+    if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
-            f"Input `observation.positions` of study {study.name} must lie in one plane, since it "
+            f"Input `observation.positions` of study {magnet.name} must lie in one plane, since it "
             f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
             "one circle, or a 3D study.")
-    inside = points_in_material(study, points)
+    inside = magnet.contains(points)
     if inside.any():
         x, y, z = points[np.argmax(inside)]
         raise StudyError(
-            f"Input `observation.positions` of study {study.name} must lie in air; instead "
+            f"Input `observation.positions` of study {magnet.name} must lie in air; instead "
             f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
             f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
-    mesh = MESHES[choose_route(study, points)]
-    ways = [(np.hypot(points[:, 0], points[:, 1]), magnet_radius(study),
-             boundary_radius(study, mesh))]
-    if study.dimension == 3:
-        ways.append((np.abs(points[:, 2]), magnet_half_length(study),
-                     boundary_half_length(study, mesh)))
-    for position, magnet, boundary in ways:
-        near = position > magnet + BOUNDARY_NEAR * (boundary - magnet)
+    mesh = MESHES[choose_route(magnet, points)]
+    ways = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
+             boundary_radius(magnet, mesh))]
+    if magnet.dimension == 3:
+        ways.append((np.abs(points[:, 2]), magnet.half_length,
+                     boundary_half_length(magnet, mesh)))
+    for position, end, boundary in ways:
+        near = position > end + BOUNDARY_NEAR * (boundary - end)
         if near.any() and position.max() <= boundary:  # those beyond are refused
             x, y, z = points[np.argmax(near)]
             warnings.warn(
                 f"{near.sum()} of {len(points)} points lie more than half-way from the magnet to "
                 f"the boundary of the mesh, which shapes their field, the first at ({x:g}, {y:g}, "
-                f"{z:g}) m. Enlarge `open_boundary` of study {study.name}.", HalbachWarning,
+                f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)

@@ -6,15 +6,14 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.field import choose_route, formulation_of
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study, is_nonlinear
 
 
-def gateaux_derivative(study: Study, block: int, points: Floats, session: Session) -> Floats:
+def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
     """Derivative of B along the nominal magnetization of a block, iron at its operating point.
 
     Parameters
@@ -28,17 +27,17 @@ def gateaux_derivative(study: Study, block: int, points: Floats, session: Sessio
     -------
     ndarray, shape (n, 3), in T m/A
     """
-    blocks = blocks_of(study)
+    blocks = magnet.blocks
     if not 0 <= block < len(blocks):
-        raise StudyError(f"Input block of study {study.name} must be one of its {len(blocks)}; "
+        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)}; "
                          f"instead received {block + 1}.")
     # the field in materials has no exact form, and the scalar potential gives H there
-    direct = study.with_(solver__method="direct", solver__route="auto")
+    direct = magnet.with_(solver__method="direct", solver__route="auto")
     formulation = formulation_of(direct, choose_route(direct, points))
-    if is_nonlinear(study):
+    if magnet.is_nonlinear:
         fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
     else:
         fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
-    size, one = study.dimension, blocks[block]
+    size, one = magnet.dimension, blocks[block]
     remanence = MU_0 * one.recoil_tensor @ np.array(one.easy_axis)  # of 1 A/m
     return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

@@ -19,7 +19,7 @@ from halbach_fe import pro
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.files import make_folder
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns, read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.formulations import Formulation
@@ -35,7 +35,6 @@ from halbach_fe.solver.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_m
 from halbach_fe.solver.runs import MATRIX_FILE, Task, run_tasks, variant_name, write_history
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study, curve_of
 
 NOMINAL_SOURCE = 0
 FLUX_DENSITY_FILE = "flux_density.txt"
@@ -50,7 +49,7 @@ PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro", "solve_newton.pro")
 
 
 def solve_sources(
-    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> Floats:
     """Finite-element part of the field of the nominal array and of single blocks, iron being
@@ -73,12 +72,12 @@ def solve_sources(
     ndarray, shape (1 + D len(blocks), n, 3), in T
         The nominal array, then block by block, axis by axis.
     """
-    case = _case(study, points, blocks, session, formulation, anywhere)
-    return _difference(study, session, lambda vacuum, parts: _source_tasks(case, vacuum, parts))
+    case = _case(magnet, points, blocks, session, formulation, anywhere)
+    return _difference(magnet, session, lambda vacuum, parts: _source_tasks(case, vacuum, parts))
 
 
 def solve_tangent(
-    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> tuple[Floats, Floats]:
     """Finite-element part of the field of a magnet with non-linear iron, and its derivative.
@@ -93,20 +92,20 @@ def solve_tangent(
         There, along the nominal magnetization, then per tesla of each block along each axis: the
         Gateaux problem, with the differential reluctivity dH/dB.
     """
-    case = _case(study, points, blocks, session, formulation, anywhere)
+    case = _case(magnet, points, blocks, session, formulation, anywhere)
 
     def tasks(vacuum: bool, parts: int) -> list[Task]:
         return _source_tasks(case, vacuum, 1) if vacuum else [
-            _newton_task(case, nominal_samples(study), False, NEWTON_TOLERANCE, gateaux=True)]
+            _newton_task(case, nominal_samples(magnet), False, NEWTON_TOLERANCE, gateaux=True)]
 
-    real, *vacuum = _run_variants(study, session, tasks)
+    real, *vacuum = _run_variants(magnet, session, tasks)
     if vacuum:  # of the nominal array, for the field, and for the derivative along it
         real = real - vacuum[0][[0, *range(len(vacuum[0]))]]
     return real[0], real[1:]
 
 
 def solve_samples(
-    study: Study, points: Floats, samples: Floats, session: Session, formulation: Formulation,
+    magnet: Magnet, points: Floats, samples: Floats, session: Session, formulation: Formulation,
     cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
 ) -> Floats:
     """Finite-element part of the field for samples of magnetization, by Newton's method.
@@ -129,14 +128,14 @@ def solve_samples(
     NotConvergedError
         With the residuals of the sample that failed.
     """
-    case = _case(study, points, (), session, formulation)
-    return _difference(study, session, lambda vacuum, parts: [
+    case = _case(magnet, points, (), session, formulation)
+    return _difference(magnet, session, lambda vacuum, parts: [
         _newton_task(case, samples, vacuum, tolerance, cold=cold)])
 
 
-def nominal_samples(study: Study) -> Floats:
+def nominal_samples(magnet: Magnet) -> Floats:
     """The nominal magnetization as the only sample, (1, blocks, 3) in A/m."""
-    return np.array([[block.magnetization for block in blocks_of(study)]])
+    return np.array([[block.magnetization for block in magnet.blocks]])
 
 
 @dataclass(frozen=True)
@@ -156,12 +155,12 @@ class Assembly:
     solutions: Floats
 
 
-def assemble(study: Study, session: Session, formulation: Formulation) -> Assembly:
+def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Assembly:
     """Have GetDP assemble and solve a study with linear iron, for all its blocks."""
     place = np.zeros((1, 3))  # any in air: GetDP prints there what is compared
-    blocks = range(len(blocks_of(study)))
-    case = _case(study, place, blocks, session, formulation)
-    last = study.dimension * len(blocks)
+    blocks = range(len(magnet.blocks))
+    case = _case(magnet, place, blocks, session, formulation)
+    last = magnet.dimension * len(blocks)
     kept: dict[str, Any] = {}
 
     def keep_matrix(folder: Path, unknowns: Unknowns, _: NDArray[np.floating]) -> None:
@@ -179,9 +178,9 @@ def assemble(study: Study, session: Session, formulation: Formulation) -> Assemb
 
 @dataclass(frozen=True)
 class _Case:
-    """What the runs of a study on one mesh have in common."""
+    """What the runs for a magnet on one mesh have in common."""
 
-    study: Study
+    magnet: Magnet
     mesh: VerifiedMesh
     located: Located
     blocks: Sequence[int]
@@ -190,40 +189,40 @@ class _Case:
 
 
 def _case(
-    study: Study, points: Floats, blocks: Sequence[int], session: Session,
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> _Case:
-    if study.dimension == 2:
+    if magnet.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
-    mesh = verify_mesh(build_mesh(study, make_folder(session.folder)))
-    check_inside(study.name, mesh.radius, mesh.half_length, points)
-    return _Case(study, mesh, locate(mesh, points, anywhere), blocks, formulation,
+    mesh = verify_mesh(build_mesh(magnet, make_folder(session.folder)))
+    check_inside(magnet.name, mesh.radius, mesh.half_length, points)
+    return _Case(magnet, mesh, locate(mesh, points, anywhere), blocks, formulation,
                  session.time_limit_s)
 
 
 def _difference(
-    study: Study, session: Session, tasks: Callable[[bool, int], list[Task]]
+    magnet: Magnet, session: Session, tasks: Callable[[bool, int], list[Task]]
 ) -> Floats:
     """B by the study's method: of real materials, or that minus vacuum."""
-    real, *vacuum = _run_variants(study, session, tasks)
+    real, *vacuum = _run_variants(magnet, session, tasks)
     return real - vacuum[0] if vacuum else real
 
 
 def _run_variants(
-    study: Study, session: Session, tasks: Callable[[bool, int], list[Task]]
+    magnet: Magnet, session: Session, tasks: Callable[[bool, int], list[Task]]
 ) -> list[Floats]:
     """Run the tasks of each variant that the study's method needs, real materials first.
 
     ``tasks`` makes those of real materials (False) or vacuum (True), in about so many parts.
     """
-    variants = [False] if study.solver.method == "direct" else [False, True]
+    variants = [False] if magnet.study.solver.method == "direct" else [False, True]
     made = [tasks(vacuum, max(1, session.jobs // len(variants))) for vacuum in variants]
     results = run_tasks([task for part in made for task in part], session)
     limits = np.cumsum([0, *(len(part) for part in made)])
     return [np.concatenate(results[a:b]) for a, b in pairwise(limits)]
 
 
-def render(template: str, *, study: Study, **data: object) -> str:
+def render(template: str, *, magnet: Magnet, **data: object) -> str:
     """The generated part of a problem, as GetDP text."""
     source = resources.files(pro).joinpath(template).read_text("utf-8")
     environment = jinja2.Environment(
@@ -232,14 +231,14 @@ def render(template: str, *, study: Study, **data: object) -> str:
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
         autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
     return environment.from_string(source).render(
-        study=study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=blocks_of(study),
-        iron_permeability=study.iron_ring.relative_permeability if study.iron_ring else 1.0,
+        study=magnet.study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=magnet.blocks,
+        iron_permeability=magnet.iron_ring.relative_permeability if magnet.iron_ring else 1.0,
         **data)
 
 
 def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:
     """The nominal array and all sources of a linear problem, in up to so many runs."""
-    last = case.study.dimension * len(case.blocks)
+    last = case.magnet.dimension * len(case.blocks)
     limits = np.linspace(0, last + 1, min(last + 1, parts) + 1).astype(int)
     return [_source_task(case, vacuum, (int(a), int(b) - 1), f"-{number}" if number else "")
             for number, (a, b) in enumerate(pairwise(limits))]
@@ -265,7 +264,7 @@ def _source_task(
 
     return Task(
         name=f"getdp-{variant_name(vacuum)}{suffix}",
-        stage=lambda folder: fill_run_folder(case.study, case.mesh, places, folder,
+        stage=lambda folder: fill_run_folder(case.magnet, case.mesh, places, folder,
                                              case.formulation,
                                    case.blocks, sources, vacuum, case.time_limit_s),
         read=read, solves=count)
@@ -276,11 +275,11 @@ def _newton_task(
     gateaux: bool = False,
 ) -> Task:
     """Newton's method for samples (k, blocks, 3) in A/m; its fields, then derivatives if wanted."""
-    columns = 1 + case.study.dimension * len(case.blocks) if gateaux else 0
+    columns = 1 + case.magnet.dimension * len(case.blocks) if gateaux else 0
     probes, places = probes_of(case.mesh, case.located)
 
     def fill(folder: Path) -> Job:
-        job = fill_run_folder(case.study, case.mesh, places, folder, case.formulation, case.blocks,
+        job = fill_run_folder(case.magnet, case.mesh, places, folder, case.formulation, case.blocks,
                     (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
         unknowns = case.formulation.unknowns(case.mesh.inner)
@@ -325,7 +324,7 @@ def _fields(
 
 
 def fill_run_folder(
-    study: Study, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
+    magnet: Magnet, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
     blocks: Sequence[int] = (), sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE),
     vacuum: bool = False, time_limit_s: float = 3600.0, samples: Floats | None = None,
 ) -> Job:
@@ -341,9 +340,9 @@ def fill_run_folder(
     ranks = np.zeros(len(mesh.regions.blocks), int)
     ranks[list(blocks)] = np.arange(1, len(blocks) + 1)
     (folder / "case.pro").write_text(
-        render("case.pro.j2", study=study, regions=mesh.regions, points=places.tolist(),
-               ranks=ranks.tolist(), curve=curve_of(study),
-               samples=(nominal_samples(study) if samples is None else samples).tolist()),
+        render("case.pro.j2", magnet=magnet, regions=mesh.regions, points=places.tolist(),
+               ranks=ranks.tolist(), curve=magnet.curve,
+               samples=(nominal_samples(magnet) if samples is None else samples).tolist()),
         encoding="utf-8")
     shutil.copyfile(mesh.path, folder / MESH_NAME)
     unknowns = formulation.unknowns(mesh.inner)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import Regions
-from halbach_fe.study.model import Study
 
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
@@ -90,34 +90,34 @@ class VerifiedMesh:
     half_length: float
 
 
-def build_mesh(study: Study, folder: Path) -> MeshFiles:
+def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
     """Mesh a study into ``folder``; the same study always gives the same mesh."""
     from halbach_fe import geo  # Gmsh loads only when a mesh is built
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
         files = MeshFiles(folder / MESH_NAME, folder / REGIONS_NAME)
-        builder = geo.mesh_2d if study.dimension == 2 else geo.mesh_3d
-        builder(study, files.mesh).write(files.regions)
+        builder = geo.mesh_2d if magnet.dimension == 2 else geo.mesh_3d
+        builder(magnet, files.mesh).write(files.regions)
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files
 
 
-def meridian_size(study: Study) -> float:
+def meridian_size(magnet: Magnet) -> float:
     """Element size in m of the half-plane at the magnet."""
-    thickness = study.array.outer_radius_m - study.array.inner_radius_m
-    return study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
+    thickness = magnet.array.outer_radius_m - magnet.array.inner_radius_m
+    return magnet.study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
 
 
-def build_meridian(study: Study, folder: Path) -> MeshFiles:
+def build_meridian(magnet: Magnet, folder: Path) -> MeshFiles:
     """Mesh the (r, z) half-plane of a rotationally symmetric study into ``folder``."""
     from halbach_fe import geo
 
     files = MeshFiles(folder / f"{MERIDIAN}.msh", folder / f"{MERIDIAN}-regions.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        geo.mesh_meridian(study, meridian_size(study), files.mesh).write(files.regions)
+        geo.mesh_meridian(magnet, meridian_size(magnet), files.mesh).write(files.regions)
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files

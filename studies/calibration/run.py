@@ -21,6 +21,7 @@ from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.mcmc import LAPLACE_STEPS, PRIOR_STEP
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -51,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     observation = observe(study, points, measured)
     generator = np.random.default_rng(arguments.seed)
     with common.session(arguments) as session:
-        model = nonlinear_model(study, observation, replace(
+        model = nonlinear_model(build_magnet(study), observation, replace(
             session, folder=session.folder / "model"), generator)
     prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
     noise = independent(np.full(len(observation), SIGMA_T))

@@ -33,7 +33,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import NominalSolver, memoized_solver
-from halbach_fe.geometry.domain import magnet_half_length
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.measurement.block_table import BlockTable
@@ -176,9 +176,9 @@ def fringe(
     """Rms error in T of the fringe field, beyond the magnet's ends, as it is foretold by a model
     that was updated with the readings of the bore alone.
     """
-    end = magnet_half_length(study)
+    end = build_magnet(study).half_length
     kept = HeldOut(z_ranges_m=((-FAR_M, -end), (end, FAR_M)))
-    update = infer(study.with_(inference__held_out=kept),
+    update = infer(build_magnet(study.with_(inference__held_out=kept)),
         readings, session, blocks)
     truth = update.observation.read(exact["B_T"].values)[update.held_out]
     return float(np.sqrt(np.mean((update.prediction_posterior.mean[update.held_out] - truth)**2)))

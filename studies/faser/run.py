@@ -17,6 +17,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
@@ -89,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.say(f"FASER dipole: {study.array.rings * study.array.blocks_per_ring} blocks, "
                f"{len(published.z)} readings.")
     with common.session(arguments) as session:
-        update = infer(study, read_map(measured), session)
+        update = infer(build_magnet(study), read_map(measured), session)
     write_inference(update, arguments.output)
     write_inference_report(update, arguments.output, published,
                            assumptions(update, arguments.z_step_m))

@@ -18,6 +18,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.block_table import read_blocks
@@ -55,14 +56,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the twin and print its table."""
     study, axis = read_study(arguments.study), read_map(HERE / "twin" / "axis.csv")
     with common.session(arguments) as session:
-        update = infer(study, read_map(HERE / "twin" / "map.csv"), session,
+        update = infer(build_magnet(study), read_map(HERE / "twin" / "map.csv"), session,
                        read_blocks(HERE / "twin" / "blocks.csv"))
         points = points_of(axis)
         line = study.with_(observation=FluxDensity(
             quantity="flux_density", components=("x",), positions=PointPositions(
                 kind="points", points_m=tuple(map(tuple, points.tolist())))))
         seen = observe(line, points, ~np.isnan(axis["B_T"].values))
-        on_axis = response_matrix(line, seen, replace(session, folder=arguments.output / "axis"))
+        on_axis = response_matrix(build_magnet(line), seen,
+                                  replace(session, folder=arguments.output / "axis"))
     write_inference(update, arguments.output)
     write_inference_report(update, arguments.output)
     measured = seen.apply(np.nan_to_num(axis["B_T"].values))
@@ -79,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     write_magnetizations(
-        study, known, truth, arguments.output, "the magnetizations of FASER's twin",
+        build_magnet(study), known, truth, arguments.output, "the magnetizations of FASER's twin",
         "results.json, posterior.h5", ring=5)
     common.print_table(
         [{"region": region, "model": name} | {

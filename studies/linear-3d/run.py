@@ -18,6 +18,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
@@ -117,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         folder = arguments.output / reading
         write_map(measured, folder / "map.h5")
         with common.session(arguments) as session:
-            update = infer(one, measured, replace(session, folder=folder))
+            update = infer(build_magnet(one), measured, replace(session, folder=folder))
         write_inference(update, folder)
         known = {"prior": update.prior} | known | {f"posterior from {reading}": update.posterior}
         results["here"][reading] = figures(update.prior, update.posterior, truth)
@@ -127,7 +128,8 @@ def run(arguments: argparse.Namespace) -> int:
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     write_magnetizations(
-        study, known, truth, arguments.output, "576 magnetizations from a map of the bore",
+        build_magnet(study), known, truth, arguments.output,
+        "576 magnetizations from a map of the bore",
         "results.json, B/posterior.h5, F/posterior.h5",
         {f"{whose}, q_{reading}, {name}": value for whose, one in results.items()
          for reading, row in one.items() for name, value in row.items()}, ring=RING)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import read_study
@@ -33,7 +33,7 @@ def main() -> None:
     points = points_from(study.observation.positions)
     table = np.genfromtxt(HERE / "fig3_nonlinear_2d_dM.csv", delimiter=",", names=True)
     generator = np.random.default_rng(SEED)
-    nominal = np.array([block.magnetization[:2] for block in blocks_of(study)])
+    nominal = np.array([block.magnetization[:2] for block in build_magnet(study).blocks])
     sd = np.abs(table["prior_edge_1_A_per_m"] - table["prior_edge_2_A_per_m"]) / 2
     drawn = table["prior_mean_A_per_m"] + sd * generator.standard_normal(len(sd))
     assert study.noise is not None

@@ -19,7 +19,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.measurement.field_map import read_map
@@ -40,7 +40,7 @@ def published(study: Study) -> tuple[Gaussian, dict[str, float]]:
     def by_block(values: Floats) -> Floats:
         return values.reshape(2, -1).T.ravel()
 
-    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization[:2] for block in build_magnet(study).blocks])
     sd = {name: np.abs(table[f"{name}_edge_1_A_per_m"] - table[f"{name}_edge_2_A_per_m"]) / 2
           for name in ("prior", "posterior_B")}
     error = table["posterior_B_mean_A_per_m"] - table["truth_A_per_m"]
@@ -61,7 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
         folder = arguments.output / case
         with common.session(arguments) as session:
             there = replace(session, folder=folder)
-            update = infer(study, read_map(HERE / f"map-{case}.csv"), there, prior=prior)
+            update = infer(build_magnet(study), read_map(HERE / f"map-{case}.csv"), there,
+                           prior=prior)
             with common.workers(arguments) as pool:
                 found = sample_posterior(update, there, arguments.samples, effective=EFFECTIVE,
                                          say=common.say, mapped=pool.map)
@@ -71,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
         results[f"{what}: posterior"] = scores(
             updated.posterior, truth) | sampled_summary(found)
         write_magnetizations(
-            study, {"prior": prior, "posterior": updated.posterior}, truth, folder,
+            build_magnet(study), {"prior": prior, "posterior": updated.posterior}, truth, folder,
             f"the magnetizations of {what}", "sampled.json, sampled.csv, chains.nc",
             sampled_summary(found))
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)

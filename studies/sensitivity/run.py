@@ -18,7 +18,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.design.measurement_plan import plan_measurement
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.plan import plan_summary, write_plan
@@ -42,7 +42,7 @@ def plane(study: Study, session: Session) -> tuple[Floats, Floats]:
     axis = np.linspace(-MAP_HALF_WIDTH_M, MAP_HALF_WIDTH_M, MAP_POINTS) + 1e-6
     x, y = np.meshgrid(axis, axis)
     points = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
-    found = gateaux_derivative(study, BLOCK - 1, points, session)
+    found = gateaux_derivative(build_magnet(study), BLOCK - 1, points, session)
     return axis, np.linalg.norm(found, axis=1).reshape(x.shape)
 
 
@@ -51,7 +51,7 @@ def by_block(study: Study, model: Response) -> tuple[Floats, Floats]:
     size = []
     for turned in (False, True):
         columns = []
-        for number, block in enumerate(blocks_of(study)):
+        for number, block in enumerate(build_magnet(study).blocks):
             x, y = block.magnetization[:2]
             change = 0.01 * np.array([x, y]) if not turned else np.radians(1) * np.array([-y, x])
             column = model.matrix[:, 2 * number:2 * number + 2] @ change
@@ -69,10 +69,11 @@ def printed_form_error(study: Study, model: Response, session: Session) -> float
     assert ring is not None
     initial = study.with_(iron_ring=ring.with_(curve=None, relative_permeability=curve.initial))
     points = points_from(study.observation.positions)
-    other = response_matrix(initial, observe(study, points, np.ones_like(points, bool)),
+    other = response_matrix(build_magnet(initial),
+                            observe(study, points, np.ones_like(points, bool)),
                      replace(session, folder=session.folder / "printed-form"))
     column = 2 * (BLOCK - 1)
-    change = blocks_of(study)[BLOCK - 1].magnetization[:2]
+    change = build_magnet(study).blocks[BLOCK - 1].magnetization[:2]
     ours, theirs = (one.matrix[:, column:column + 2] @ change for one in (model, other))
     return float(np.abs(ours - theirs).max() / np.abs(ours).max())
 
@@ -87,22 +88,22 @@ def run(options: argparse.Namespace) -> int:
             return replace(session, folder=session.folder / name)
 
         axis, size = plane(study, room("map"))
-        model = response_matrix(study, observation, room("circle"))
+        model = response_matrix(build_magnet(study), observation, room("circle"))
         on_circle = study.with_(
             plan__candidates=tuple(one for one in study.plan.candidates
                                    if one.radius_m == study.observation.positions.radius_m))
-        plans = {"on the circle": plan_measurement(on_circle, room("plan-circle")),
-                 "wherever the probe can go": plan_measurement(study, room("plan"))}
+        plans = {"on the circle": plan_measurement(build_magnet(on_circle), room("plan-circle")),
+                 "wherever the probe can go": plan_measurement(build_magnet(study), room("plan"))}
         error = printed_form_error(study, model, session)
     along, across = by_block(study, model)
     one = plans["on the circle"]
     information = {"equally spaced circle": (one.baseline_counts, one.baseline_gain)} | {
         f"plan {name}": (np.arange(1, len(found.gain) + 1), found.gain)
         for name, found in plans.items()}
-    write_plan(on_circle, plans["on the circle"], options.output / "plan-circle")
-    write_plan(study, plans["wherever the probe can go"], options.output / "plan")
+    write_plan(build_magnet(on_circle), plans["on the circle"], options.output / "plan-circle")
+    write_plan(build_magnet(study), plans["wherever the probe can go"], options.output / "plan")
     summaries = {name: plan_summary(found) for name, found in plans.items()}
-    write_sensitivity(study, Sensitivity(
+    write_sensitivity(build_magnet(study), Sensitivity(
         BLOCK, axis, axis, size, np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), along,
         across, error, information), options.output, summaries)
     first, second = summaries.values()

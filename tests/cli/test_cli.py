@@ -20,7 +20,7 @@ from benchmarks.recovery import unreadable
 from halbach_fe.cli import main, parser
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import EXIT_CODES
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.solver.getdp import blas_of
 from halbach_fe.solver.getdp_cache import LIMIT_VARIABLE
@@ -149,7 +149,7 @@ def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
 def table(study, tmp_path):
     """Three blocks of every slot, 1 % too weak, and different."""
     study.write_text(STUDY.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
-    blocks = blocks_of(read_study(study))
+    blocks = build_magnet(read_study(study)).blocks
     volume = 0.05 * blocks[0].area
     rows = ["serial,type,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2,volume_m3"]
     for number, block in enumerate(blocks * 3):

@@ -18,7 +18,8 @@ from halbach_fe.cli import main
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.map_conventions import PLAUSIBLE
 from halbach_fe.diagnosis.summary import diagnosis_summary
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT, circle
@@ -83,7 +84,7 @@ def fields(sag):
     along = (POINTS[:, 2] - POINTS[:, 2].min()) / np.ptp(POINTS[:, 2])
     there = POINTS - np.outer(sag * along**2, [0, 1, 0])
     total = 3e-5 * generator.standard_normal(POINTS.shape)
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         middle = position_angle_deg(study.array, block.slot)
         polarization = np.array(block.easy_axis) + 0.01 * generator.standard_normal(3)
         total += magpylib.magnet.CylinderSegment(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import common, main
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.storage import read_posterior
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import read_map
@@ -130,7 +131,7 @@ def test_multipoles_of_the_measured_magnet(made, tmp_path, capsys):
     np.testing.assert_allclose(directly["b_units"][1:5], own["b_units"], atol=0.5)
     assert "Multipoles" in page(tmp_path / "report.html")
     # standard deviations are those of the stored covariance, and the wrong magnet is refused
-    stored = read_posterior(read_study(study), tmp_path / "posterior.h5")
+    stored = read_posterior(build_magnet(read_study(study)), tmp_path / "posterior.h5")
     assert stored["posterior"].sd.max() < stored["prior"].sd.min()
     other = tmp_path / "other.toml"
     other.write_text(STUDY.replace("1.3", "1.31"))

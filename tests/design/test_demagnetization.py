@@ -14,7 +14,7 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.demagnetization import demagnetization_summary, write_demagnetization
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.magnet import Demagnetization
@@ -39,7 +39,7 @@ def along(found, vectors):
 def strength_by_magpylib(study, found):
     """H (cells, 3) in A/m of cuboids in vacuum."""
     total = np.zeros_like(found.cells.middles)
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         angle = np.degrees(np.arctan2(block.easy_axis[1], block.easy_axis[0]))
         source = magpylib.magnet.Cuboid(
             dimension=(study.array.outer_radius_m - study.array.inner_radius_m,
@@ -52,7 +52,7 @@ def strength_by_magpylib(study, found):
 
 def test_vacuum_against_magpylib(short_dipole, session):
     study = short_dipole(**CUBES, array__recoil_permeability=1.0, demagnetization=COLD)
-    found = demagnetization_map(study, session, 4)
+    found = demagnetization_map(build_magnet(study), session, 4)
     strength = strength_by_magpylib(study, found)
     expected = along(found, strength)
     scale = np.abs(expected).max()
@@ -70,7 +70,7 @@ def test_permeability_and_iron_against_ngsolve(short_dipole, session):
         array__recoil_permeability=1.1, demagnetization=COLD, array__rings=1,
         mesh={"block_size_m": 0.04},
         iron_ring={"inner_radius_m": 0.2, "outer_radius_m": 0.23, "relative_permeability": 1e3})
-    found = demagnetization_map(study, session, 3)
+    found = demagnetization_map(build_magnet(study), session, 3)
     magnet = dipole_of(study)
     reaction = ngsolve_model.vector_potential(
         magnet, ngsolve_model.eighth(magnet, 0.06), 2, found.cells.middles)
@@ -91,7 +91,7 @@ def test_saturating_cross_section_against_ngsolve(dipole, session):
             "inner_radius_m": 0.19, "outer_radius_m": 0.2, "curve": {
                 "kind": "froehlich_kennelly", "saturation_polarization_T": 2.0,
                 "initial_relative_permeability": 1e3}})
-    found = demagnetization_map(study, session, 3)
+    found = demagnetization_map(build_magnet(study), session, 3)
     magnet, middles = magnet_of(study), found.cells.middles
     mesh = mesh_of(magnet, np.zeros((1, 3)), Elements(0.02))
     flux_density = ngsolve_nonlinear.section_field(magnet, mesh, 4, middles)
@@ -105,7 +105,7 @@ def test_saturating_cross_section_against_ngsolve(dipole, session):
 def test_cells_fill_the_blocks(short_dipole):
     study = short_dipole(array__exceptions=[{"ring": 1, "slot": 3, "rotation_deg": [0, 0, 20.0],
                                              "displacement_m": [0.01, 0.0, 0.002]}])
-    blocks = blocks_of(study)
+    blocks = build_magnet(study).blocks
     cells = cut(blocks, [2, 20], 8)
     for number in (2, 20):
         mine = cells.block == number
@@ -121,7 +121,7 @@ def warm(dipole, session):
     """Maps of a dipole at a temperature."""
     def make(temperature=20.0, **changes):
         study = dipole(**changes, demagnetization=COLD | {"temperature_C": temperature})
-        return demagnetization_map(study, session)
+        return demagnetization_map(build_magnet(study), session)
     return make
 
 
@@ -145,8 +145,8 @@ def test_limit_temperature_is_where_the_share_is_passed(warm, share):
 
 
 def test_no_limit_where_nothing_falls(dipole, session):
-    found = demagnetization_map(dipole(demagnetization=COLD | {
-        "coercivity_coefficient_per_K": 0.0, "remanence_coefficient_per_K": 0.0}), session)
+    found = demagnetization_map(build_magnet(dipole(demagnetization=COLD | {
+        "coercivity_coefficient_per_K": 0.0, "remanence_coefficient_per_K": 0.0})), session)
     assert found.share_beyond_now == 0.0
     assert found.limit_temperature(0.0) == np.inf
     assert demagnetization_summary(found)["limit_temperature_C"]["0.0"] is None
@@ -205,9 +205,9 @@ def test_the_command_line(tmp_path, capsys):
 
 def test_studies_that_say_too_little_are_refused(dipole, session):
     with pytest.raises(StudyError, match="what the material withstands"):
-        demagnetization_map(dipole(), session)
+        demagnetization_map(build_magnet(dipole()), session)
     with pytest.raises(StudyError, match="every magnetization_factor"):
-        demagnetization_map(dipole(demagnetization=COLD, array__exceptions=[
-            {"magnetization_factor": 0.0}]), session)
+        demagnetization_map(build_magnet(dipole(demagnetization=COLD, array__exceptions=[
+            {"magnetization_factor": 0.0}])), session)
     with pytest.raises(ValueError, match="leaves nothing"):
         Demagnetization(**COLD | {"coercivity_coefficient_per_K": -0.012, "temperature_C": 120.0})

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.remounting import mounts_of, remounted, rotation_deg, shape_turns
 from halbach_fe.design.shimming import gain, shim, taken_out
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -115,11 +116,12 @@ def shimmed_magnets(study, session, with_blocks, **options):
     """For every seed: what was to be expected, and the truth before and after the moves, done
     rightly and wrongly.
     """
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     sd = np.radians(study.prior.mounting_sd_deg)
     for seed in SEEDS:
         made, drawn = campaign(study, seed)
-        update = infer(study, made.readings, session, made.blocks if with_blocks else None)
+        update = infer(build_magnet(study), made.readings, session,
+                       made.blocks if with_blocks else None)
         generator = np.random.default_rng(seed)
         found = shim(update, model, generator, BUDGET, **options)
 
@@ -180,11 +182,11 @@ def test_the_same_in_three_dimensions(session):
         prior__mounting_sd_deg=0.1, observation__positions={
             "kind": "circles", "radius_m": RADIUS, "angles": 16, "z_min_m": -0.06,
             "z_max_m": 0.06, "count": 4})
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS, 0.0), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS, 0.0), session)
     before, after, wrong, turned = [], [], [], 0
     for seed in SEEDS[:10]:
         made, drawn = campaign(study, seed)
-        update = infer(study, made.readings, session, made.blocks)
+        update = infer(build_magnet(study), made.readings, session, made.blocks)
         generator = np.random.default_rng(seed)
         found = shim(update, model, generator, BUDGET)
         sd, bodies, loose = np.radians(0.1), drawn.mounted.bodies, drawn.single.bodies
@@ -210,7 +212,7 @@ def test_a_new_mounting_undoes_the_old_one(session):
     scores, naive = [], []
     for seed in SEEDS:
         made, drawn = campaign(study, seed)
-        update = infer(study, made.readings, session, made.blocks)
+        update = infer(build_magnet(study), made.readings, session, made.blocks)
         mean, loose, placed = taken_out(update)
         truth = np.array([body.magnetization[:2] for body in drawn.single.bodies]).ravel()
         scores += ((truth - mean) / np.linalg.norm(loose, axis=1)).tolist()
@@ -247,8 +249,8 @@ def one_magnet(session):
     """Study, update and model of one magnet of squares."""
     study = study_of(**SQUARES)
     made, _ = campaign(study, 3)
-    return (study, infer(study, made.readings, session),
-            multipole_model(study, MultipoleReference(RADIUS, ORDERS), session), made)
+    return (study, infer(build_magnet(study), made.readings, session),
+            multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session), made)
 
 
 def test_a_limit_ends_the_search(one_magnet, generator):
@@ -282,7 +284,7 @@ def test_the_best_swap_is_found(one_magnet, generator):
     """Of one swap, every pair and turn is tried here by hand."""
     study, update, model, _ = one_magnet
     found = shim(update, model, generator, {"swap": 1, "turn": 0, "replace": 0})
-    mounts, p = mounts_of(study), update.posterior.mean.reshape(-1, 2)
+    mounts, p = mounts_of(build_magnet(study)), update.posterior.mean.reshape(-1, 2)
     best = np.inf
     for i in range(12):
         for j in range(i):
@@ -307,7 +309,7 @@ def test_the_shimmed_study_is_the_shimmed_magnet(one_magnet, generator):
     shimmed = found.shimmed_study
     assert shimmed is not None
     p, new = update.posterior.mean.reshape(-1, 2), update.posterior.mean.reshape(-1, 2).copy()
-    for number, (source, matrix) in enumerate(mountings(shimmed)):
+    for number, (source, matrix) in enumerate(mountings(build_magnet(shimmed))):
         new[number] = matrix[:2, :2] @ p[source]
     known = model.of(Gaussian(new.ravel(), np.zeros((24, 1))))
     np.testing.assert_allclose(known.mean, found.after.mean, atol=1e-6)
@@ -315,7 +317,7 @@ def test_the_shimmed_study_is_the_shimmed_magnet(one_magnet, generator):
     plain = parse_study(changed(shimmed.model_dump(mode="json"), array__exceptions=[
         one.model_dump(mode="json") | {"rotation_deg": (0.0, 0.0, 0.0)}
         for one in shimmed.array.exceptions]))
-    for number, (source, matrix) in enumerate(mountings(plain)):
+    for number, (source, matrix) in enumerate(mountings(build_magnet(plain))):
         new[number] = matrix[:2, :2] @ p[source]
     wrong = model.of(Gaussian(new.ravel(), np.zeros((24, 1))))
     assert np.abs(wrong.mean - found.after.mean).max() > 100
@@ -330,7 +332,7 @@ def test_a_bad_block_is_replaced(one_magnet, session, generator):
     points = points_from(study.observation.positions)
     made = field_map(points, vacuum_field(weak, points))
     wide = study.with_(prior__magnitude_sd=0.04)
-    update = infer(wide, made, session)
+    update = infer(build_magnet(wide), made, session)
     table, _ = coil_table(study, nominal, nominal, 1e-3, generator)
     rows = [5, 5]
     stock = replace(
@@ -366,7 +368,7 @@ def test_what_fits_where():
     for the latter; blocks of another permeability do not.
     """
     study = study_of(array__exceptions=[{"slot": 9, "recoil_permeability": 1.1}])
-    mounts = mounts_of(study)
+    mounts = mounts_of(build_magnet(study))
     fits = mounts.fits(mounts.there, mounts.kinds_there)
     angles = np.degrees(np.arctan2(mounts.wanted[:, 1], mounts.wanted[:, 0])).round()
     for slot in range(12):
@@ -380,12 +382,12 @@ def test_what_fits_where():
 def test_moves_that_a_study_cannot_say():
     """A block that is weak takes its weakness along, which exceptions of slots do not."""
     study = study_of(**SQUARES)
-    mounts = mounts_of(study)
+    mounts = mounts_of(build_magnet(study))
     moves = [(to, source, mounts.frames[to] @ mounts.frames[source].T)
              for to, source in ((2, 4), (4, 2))]
-    assert remounted(study, moves) is not None
+    assert remounted(build_magnet(study), moves) is not None
     weak = study_of(**SQUARES, array__exceptions=[{"slot": 3, "magnetization_factor": 0.9}])
-    assert remounted(weak, moves) is None
+    assert remounted(build_magnet(weak), moves) is None
 
 
 @pytest.mark.parametrize(("reference", "said"), [
@@ -393,7 +395,7 @@ def test_moves_that_a_study_cannot_say():
     (MultipoleReference(RADIUS, (1,)), "unwanted multipoles")])
 def test_references_that_make_no_sense(session, reference, said):
     with pytest.raises(StudyError, match=said):
-        multipole_model(study_of(), reference, session)
+        multipole_model(build_magnet(study_of()), reference, session)
 
 
 def test_stock_of_another_magnet(one_magnet, generator):
@@ -408,17 +410,17 @@ def test_a_shimmed_study_solves(session):
     matrix is that of the blocks where they are, to 1e-6 of its largest column.
     """
     study = study_of(array__recoil_permeability=1.05)
-    mounts = mounts_of(study)
+    mounts = mounts_of(build_magnet(study))
     fits = mounts.fits(mounts.there, mounts.kinds_there)
     turn, to, source = (int(numbers[0]) for numbers in np.nonzero(
         fits[1:] & ~np.eye(12, dtype=bool)))
     turns = mounts.turns[1 + turn]
-    shimmed = remounted(study, [
+    shimmed = remounted(build_magnet(study), [
         (i, j, mounts.frames[i] @ turns @ mounts.frames[j].T)
         for i, j in ((to, source), (source, to))])
     assert shimmed is not None
     assert any(one.rotation_deg != (0.0, 0.0, 0.0) for one in shimmed.array.exceptions)
-    one, other = (multipole_model(some, MultipoleReference(RADIUS, ORDERS), session)
+    one, other = (multipole_model(build_magnet(some), MultipoleReference(RADIUS, ORDERS), session)
                   for some in (study, shimmed))
     np.testing.assert_allclose(one.nominal, other.nominal, atol=1e-6 * np.abs(one.nominal).max())
     scale = np.abs(one.matrix).max()
@@ -430,12 +432,13 @@ def test_a_magnet_with_permeability(session):
     numbers, the solver's error included, is 1 +- 0.5; four of that.
     """
     study = study_of(array__recoil_permeability=1.05, mesh__block_size_m=0.012)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     generator = np.random.default_rng(2)
     drawn = draw_magnet(study, magnet_of(study), generator)
     places = points_from(study.observation.positions)
     readings = true_field(drawn.mounted, places)
-    update = infer(study, field_map(places, readings + 2e-5 * generator.standard_normal(
+    update = infer(build_magnet(study),
+                   field_map(places, readings + 2e-5 * generator.standard_normal(
         readings.shape)), session)
     found = shim(update, model, generator, BUDGET)
     assert found.steps
@@ -468,8 +471,8 @@ def test_what_a_diagnosis_found_is_put_right(session, generator):
     def found(bodies, exceptions, **budget):
         study = study_of(array__exceptions=exceptions)
         readings = vacuum_field(bodies, places)
-        update = infer(study, field_map(places, readings), session)
-        model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+        update = infer(build_magnet(study), field_map(places, readings), session)
+        model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
         return shim(update, model, generator, {"swap": 0, "turn": 0, "replace": 0} | budget)
 
     missing = list(nominal.bodies)
@@ -489,6 +492,6 @@ def test_what_a_diagnosis_found_is_put_right(session, generator):
     assert np.abs(result.before.mean).max() > 1000
     assert np.abs(result.after.mean).max() < 10  # of thousands; the prior draws a little
     shimmed = result.shimmed_study
-    assert [source for source, _ in mountings(shimmed)] == list(range(12))
+    assert [source for source, _ in mountings(build_magnet(shimmed))] == list(range(12))
     # negative control: what is nominal as it stands is left alone
     assert not found(nominal.bodies, [], swap=4, turn=4, replace=4).steps

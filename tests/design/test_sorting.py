@@ -9,6 +9,7 @@ import pytest
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.design.sorting import sort_blocks
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
@@ -46,8 +47,8 @@ def blocks(study, seed, spare=0):
         bodies += single.bodies
         tables.append(coil_table(study, nominal, single, COIL_SD, generator)[0])
         # a block without a place is measured as in the first slot of its type
-        moments.append(as_mounted(study, tables[-1], np.array([
-            types_of(study)[label][0] - 1 for label in tables[-1].type])))
+        moments.append(as_mounted(build_magnet(study), tables[-1], np.array([
+            types_of(build_magnet(study))[label][0] - 1 for label in tables[-1].type])))
     rows = np.arange(count + spare)
     sigma, volume, temperature = (
         np.concatenate([getattr(one, name) for one in tables])[rows]
@@ -82,11 +83,11 @@ def test_sorted_blocks_beat_random_ones(session):
     and as foretold: chi2 per number is 1 +- 0.11 (160 numbers), three of that.
     """
     study = study_of(**CUBES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     scores, ratios = [], []
     for seed in range(20):
         bodies, table = blocks(study, seed)
-        found = sort_blocks(study, table, model, np.random.default_rng(seed))
+        found = sort_blocks(build_magnet(study), table, model, np.random.default_rng(seed))
         assert sorted(found.table.slot.tolist()) == list(range(1, 13))
         truth, _ = true_multipoles(assembled(study, bodies, found.table), 1, model.turn)
         scores.append(chi2(found.best, truth))
@@ -106,12 +107,12 @@ def test_random_orders_are_as_they_are(session):
     the own order is true.
     """
     study = study_of(**CUBES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     wrong, foretold, random = [], [], []
     for seed in range(10):
         _, table = blocks(study, seed)
         others, _ = blocks(study, seed + 50)
-        found = sort_blocks(study, table, model, np.random.default_rng(seed))
+        found = sort_blocks(build_magnet(study), table, model, np.random.default_rng(seed))
         truth, _ = true_multipoles(assembled(study, others, found.table), 1, model.turn)
         wrong.append(np.sqrt(np.sum(truth**2) / len(ORDERS)))
         foretold.append(np.sqrt(np.mean(found.best.sizes**2)))
@@ -122,11 +123,11 @@ def test_random_orders_are_as_they_are(session):
 
 def test_spare_blocks_help(session):
     study = study_of(**CUBES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     bodies, table = blocks(study, 3, spare=6)
-    found = sort_blocks(study, table, model, np.random.default_rng(1))
+    found = sort_blocks(build_magnet(study), table, model, np.random.default_rng(1))
     assert found.left_over == 6
-    without = sort_blocks(study, part(table, 12), model, np.random.default_rng(1))
+    without = sort_blocks(build_magnet(study), part(table, 12), model, np.random.default_rng(1))
     assert np.sum(found.best.mean**2) < np.sum(without.best.mean**2)
     truth, _ = true_multipoles(assembled(study, bodies, found.table), 1, model.turn)
     assert chi2(found.best, truth) < 3  # of 8 numbers: 1 +- 0.5, four of that
@@ -135,19 +136,19 @@ def test_spare_blocks_help(session):
 def test_sorted_tables_are_priors(session):
     """What `infer --blocks` makes of the sorted table is what `sort` foretells."""
     study = study_of(**CUBES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     _, table = blocks(study, 5)
-    found = sort_blocks(study, table, model, np.random.default_rng(5))
-    prior = prior_from_blocks(study, found.table).gaussian
+    found = sort_blocks(build_magnet(study), table, model, np.random.default_rng(5))
+    prior = prior_from_blocks(build_magnet(study), found.table).gaussian
     known = model.of(prior)
     np.testing.assert_allclose(known.mean, found.best.mean, atol=1e-6)
     np.testing.assert_allclose(known.sd, found.best.sd, rtol=1e-6)
-    again = sort_blocks(study, found.table, model, np.random.default_rng(6))
+    again = sort_blocks(build_magnet(study), found.table, model, np.random.default_rng(6))
     assert again.own_order == "as placed in the table"
     np.testing.assert_allclose(again.numbered.mean, found.best.mean, atol=1e-6)
     # negative control: moments that are not turned into the slots' own axes
     with pytest.raises(MeasurementError, match="moment of block"):
-        prior_from_blocks(study, replace(found.table, moment=table.moment))
+        prior_from_blocks(build_magnet(study), replace(found.table, moment=table.moment))
 
 
 def test_types_stay_in_their_slots(session):
@@ -155,30 +156,30 @@ def test_types_stay_in_their_slots(session):
     type needs a block for each of its slots.
     """
     study = study_of(prior__types={str(slot): [slot, slot + 6] for slot in range(1, 7)})
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     _, table = blocks(study_of(), 3)
     table = replace(table, type=tuple(str((int(name) - 1) % 6 + 1) for name in table.type))
     with pytest.raises(StudyError, match="alike"):
-        sort_blocks(study, table, model, np.random.default_rng(1))
+        sort_blocks(build_magnet(study), table, model, np.random.default_rng(1))
     with pytest.raises(MeasurementError, match="enough for the 1 slots"):
-        sort_blocks(study_of(), part(blocks(study_of(), 3)[1], 11), model,
+        sort_blocks(build_magnet(study_of()), part(blocks(study_of(), 3)[1], 11), model,
                     np.random.default_rng(1))
 
 
 def test_where_there_is_no_choice_it_is_said(session):
     study = study_of(**SQUARES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     nominal = magnet_of(study)
     table, _ = coil_table(study, nominal, nominal, COIL_SD, np.random.default_rng(0))
     with pytest.warns(HalbachWarning, match="nothing to sort"):
-        sort_blocks(study, table, model, np.random.default_rng(0))
+        sort_blocks(build_magnet(study), table, model, np.random.default_rng(0))
 
 
 def test_the_seed_decides(session):
     study = study_of(**CUBES)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
     _, table = blocks(study, 8)
-    one, same, other = (sort_blocks(study, table, model, np.random.default_rng(seed))
+    one, same, other = (sort_blocks(build_magnet(study), table, model, np.random.default_rng(seed))
                         for seed in (1, 1, 2))
     assert one.table.places == same.table.places
     np.testing.assert_array_equal(one.random, same.random)

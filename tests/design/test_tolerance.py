@@ -7,6 +7,7 @@ import pytest
 import scipy.stats as stats
 
 from halbach_fe.design.tolerance import assembled_prior, predict_tolerance
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.bodies import magnet_of
@@ -60,8 +61,9 @@ def coefficients(bodies):
 
 def drawn(session, prior=PRIOR, **options):
     study = study_of(prior=prior)
-    model = multipole_model(study, MultipoleReference(RADIUS, ORDERS), session)
-    return predict_tolerance(model, study, assembled_prior(study, model.nominal), 20_000,
+    model = multipole_model(build_magnet(study), MultipoleReference(RADIUS, ORDERS), session)
+    return predict_tolerance(model, build_magnet(study),
+                             assembled_prior(build_magnet(study), model.nominal), 20_000,
                      np.random.default_rng(1), **options)
 
 

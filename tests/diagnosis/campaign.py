@@ -5,7 +5,8 @@ from __future__ import annotations
 import magpylib
 import numpy as np
 
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
@@ -39,7 +40,8 @@ def with_array(**keys) -> Study:
 
 def drawn(study: Study, generator: np.random.Generator, sd=0.01) -> np.ndarray:
     """Polarizations (blocks, 3) in T of blocks that are off by 1 % and 1 deg, and all by 1 %."""
-    nominal = np.array([np.array(one.easy_axis) * one.remanence for one in blocks_of(study)])
+    nominal = np.array(
+        [np.array(one.easy_axis) * one.remanence for one in build_magnet(study).blocks])
     size = sd * np.linalg.norm(nominal, axis=1)[:, None]
     return (nominal * (1 + sd * generator.standard_normal())
             + size * np.array([1.0, 1.0, np.pi / 1.8]) * generator.standard_normal(nominal.shape))
@@ -50,7 +52,7 @@ def field(study: Study, polarizations: np.ndarray, points: np.ndarray) -> np.nda
     array, total = study.array, np.zeros(points.shape)
     size = (array.outer_radius_m - array.inner_radius_m, array.block.width_m, array.ring_length_m)
     radius = (array.outer_radius_m + array.inner_radius_m) / 2
-    for block, polarization in zip(blocks_of(study), polarizations, strict=True):
+    for block, polarization in zip(build_magnet(study).blocks, polarizations, strict=True):
         angle = np.radians(position_angle_deg(array, block.slot))
         cuboid = magpylib.magnet.Cuboid(dimension=size, position=(
             radius * np.cos(angle), radius * np.sin(angle), (block.z_min + block.z_max) / 2))

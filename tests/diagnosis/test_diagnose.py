@@ -12,7 +12,7 @@ from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
 from halbach_fe.diagnosis.search import _possible
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.reader import parse_study
@@ -61,8 +61,8 @@ def test_impossible_amplitudes_are_no_explanation(session, generator, name):
     gap = next(effect for effect in catalogue() if effect.name == name)
     study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | {
         "outer_radius_m": 0.15, "block": {"shape": "sector"}}})
-    nominal = field_of(blocks_of(study), CIRCLES)
-    change = field_of(blocks_of(gap.apply(study, Place(), [3e-4])), CIRCLES) - nominal
+    nominal = field_of(build_magnet(study).blocks, CIRCLES)
+    change = field_of(build_magnet(gap.apply(study, Place(), [3e-4])).blocks, CIRCLES) - nominal
     noise = NOISE_T * generator.standard_normal(CIRCLES.shape)
     wider, narrower = (field_map(CIRCLES, nominal + sign * change + noise) for sign in (-1, 1))
     tight = study.with_(prior__magnitude_sd=1e-4, prior__direction_sd_deg=0.01,

@@ -25,7 +25,7 @@ from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -56,8 +56,9 @@ def inferred(session):
             array__recoil_permeability=1.0, observation__components=list(components),
             noise={"regions": [{"name": "all", "sigma_T": SIGMA}]},
             prior={"common_mode_sd": 0.001}))
-        data = field_map(POINTS, field_of(blocks_of(study), POINTS))
-        return infer(study, data, replace(session, folder=session.folder / components)), data
+        data = field_map(POINTS, field_of(build_magnet(study).blocks, POINTS))
+        return infer(build_magnet(study), data,
+                     replace(session, folder=session.folder / components)), data
     return make
 
 
@@ -217,7 +218,7 @@ def test_a_turned_probe_sees_a_turned_world(name, axis, turn):
     def shown(instrument):
         used = probe(instrument, np.zeros((len(POINTS), 3)))  # sensors, from the probe's middle
         sensors = np.repeat(POINTS, len(used.points) // len(POINTS), axis=0)
-        world = field_of(blocks_of(STUDY), sensors + used.points @ turn.T) @ turn
+        world = field_of(build_magnet(STUDY).blocks, sensors + used.points @ turn.T) @ turn
         linear = (used.operator @ world.ravel()).reshape(-1, 3)
         return (linear + remainder(instrument, linear, time)) @ turn.T
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings
 from halbach_fe.measurement.instrument import probe, remainder
 from halbach_fe.solver.external_field import external_field
@@ -36,14 +36,16 @@ LARGE = {"wrong_line", "wrong_radius"}
 def shown(study):
     """What a map of a study shows, without what permeability and iron add."""
     used = probe(study.instrument, POINTS)
-    field = field_of(blocks_of(study), used.points) + external_field(study, used.points)
+    field = field_of(build_magnet(study).blocks, used.points) + external_field(build_magnet(study),
+                                                                               used.points)
     linear = (used.operator @ field.ravel()).reshape(-1, 3)
     return linear + remainder(study.instrument, linear, TIME)
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return NominalFields(STUDY, POINTS, TIME, lambda study: field_of(blocks_of(study), POINTS))
+    return NominalFields(STUDY, POINTS, TIME,
+                         lambda study: field_of(build_magnet(study).blocks, POINTS))
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED))
@@ -83,7 +85,7 @@ def test_whole_blocks_count_as_they_were_measured(scene, name, generator):
     nominal = scene.magnetizations
     known = nominal * (1 + 0.02 * generator.standard_normal((len(nominal), 1)))
     signature = effect.signature(replace(scene, known=known), place)[0]
-    mountings_of = mountings(effect.apply(STUDY, place, [1.0]))
+    mountings_of = mountings(build_magnet(effect.apply(STUDY, place, [1.0])))
     mounted = np.array([matrix @ known[number] for number, matrix in mountings_of])
     change = sum(scene.field_with(number, mounted[number] - known[number])
                  for number in range(len(known)))
@@ -125,7 +127,8 @@ def test_places_are_in_the_magnet():
 
 def test_seams_move_what_is_beyond_them_outwards():
     effect = EFFECTS["ring_gap"]
-    moved = [[block.shift[2] for block in blocks_of(effect.apply(STUDY, place, [1e-3]))[::16]]
+    moved = [
+        [block.shift[2] for block in build_magnet(effect.apply(STUDY, place, [1e-3])).blocks[::16]]
              for place in effect.places(STUDY)]
     assert moved == pytest.approx(np.array([
         [-1e-3, 0, 0, 0], [-5e-4, -5e-4, 5e-4, 5e-4], [0, 0, 0, 1e-3]]))

@@ -7,7 +7,7 @@ import pytest
 
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import as_read, probe, remainder
 from halbach_fe.solver.external_field import external_field
@@ -158,8 +158,9 @@ def test_effects_of_usual_size_are_no_gross_errors(effect, right, generator):
 
     def shown(study):
         used = probe(study.instrument, CIRCLES)
-        linear = (used.operator @ (field_of(blocks_of(study), used.points) + external_field(
-            study, used.points)).ravel()).reshape(-1, 3)
+        linear = (used.operator
+                  @ (field_of(build_magnet(study).blocks, used.points) + external_field(
+            build_magnet(study), used.points)).ravel()).reshape(-1, 3)
         return linear + remainder(study.instrument, linear, np.linspace(0, 1, len(CIRCLES)))
 
     change = shown(true) - shown(STUDY)

@@ -16,7 +16,7 @@ from halbach_fe.diagnosis.position_noise import (
     has_settled,
     with_position_noise,
 )
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.vacuum_field import gradient_of, unit_fields
 from halbach_fe.stats.noise import independent
 from halbach_fe.study.reader import parse_study
@@ -28,7 +28,7 @@ POINTS = np.vstack([circle(radius, 24, z, 0.1) for radius in (0.05, 0.07)
 LABELS = ["Bx", "By", "Bz"] * len(POINTS)
 COUNT = len(LABELS)  # 4032
 OFF_T = 5e-3
-BLOCKS = blocks_of(STUDY)
+BLOCKS = build_magnet(STUDY).blocks
 LARGEST_T = 0.5
 
 

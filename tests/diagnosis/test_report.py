@@ -14,7 +14,7 @@ from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.model_selection import MOST, Candidate
 from halbach_fe.diagnosis.result import UnknownCause
 from halbach_fe.diagnosis.summary import amounts, human_unit, note, place_in_words
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_diagnosis_report
 from halbach_fe.solver.vacuum_field import field_of
@@ -26,7 +26,7 @@ NOISE = {"regions": [{"name": "all", "sigma_T": 2e-5}]}
 
 def diagnosed(study, points, add, names, session, generator):
     """Diagnose the nominal map with something added and noise."""
-    field = field_of(blocks_of(study), points)
+    field = field_of(build_magnet(study).blocks, points)
     data = field_map(points, field + add(field) + 2e-5 * generator.standard_normal(points.shape))
     effects = [EFFECTS[name] for name in names]
     found = diagnose(study, data, session, effects=effects)

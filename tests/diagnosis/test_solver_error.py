@@ -9,7 +9,7 @@ import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.summary import diagnosis_summary, others
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import verdict
 from halbach_fe.solver.vacuum_field import field_of
@@ -27,7 +27,7 @@ def found(session, generator, method, gain=0.0):
         noise={"regions": [{"name": "all", "sigma_T": SIGMA}]},
         prior={"magnitude_sd": 0.002, "direction_sd_deg": 0.1, "common_mode_sd": 0.002}))
     blocks = [replace(one, remanence=one.remanence * (1 + 0.002 * generator.standard_normal()))
-              for one in blocks_of(study)]
+              for one in build_magnet(study).blocks]
     readings = field_of(blocks, POINTS) + SIGMA * generator.standard_normal(POINTS.shape)
     readings[:, 0] *= 1 + gain
     return diagnose(study, field_map(POINTS, readings), session)

@@ -22,7 +22,7 @@ from halbach_fe.core.errors import (
     MeshError,
     StudyError,
 )
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.regions import Regions
 from halbach_fe.inference import mcmc
 from halbach_fe.inference.mcmc import _Run
@@ -125,7 +125,7 @@ def compact_hdf5() -> bytes:
 
 
 def posterior() -> bytes:
-    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(TINY)])
+    nominal = np.concatenate([block.magnetization[:2] for block in build_magnet(TINY).blocks])
     count = len(nominal)
     data = xr.Dataset(
         {name: ("parameter", nominal * factor) for name, factor in (
@@ -286,9 +286,9 @@ def imported(name: str):
 def run_of_getdp() -> dict[str, bytes]:
     """Mesh, regions and all that GetDP leaves of a tiny problem."""
     with tempfile.TemporaryDirectory() as folder:
-        files = build_mesh(TINY, Path(folder))
+        files = build_mesh(build_magnet(TINY), Path(folder))
         session = Session(find_getdp(), Path(folder) / "work", jobs=1)
-        finite_element_part(TINY, PLACES, session)
+        finite_element_part(build_magnet(TINY), PLACES, session)
         run = session.folder / "getdp-real"
         return {"mesh": files.mesh.read_bytes(), "regions": files.regions.read_bytes(),
                 "pre": (run / "magnetostatics_2d.pre").read_bytes(),
@@ -449,7 +449,8 @@ def readers() -> tuple[Reader, ...]:
                   seeds=(columns[0], (OPERA + rows(field=FIELD)).encode(), sheet, grid))
           for name in FORMATS),
         Reader("posterior", "posterior.h5", (posterior(),),
-               lambda path: read_posterior(TINY, path), MeasurementError, check_posterior, HDF5),
+               lambda path: read_posterior(build_magnet(TINY), path), MeasurementError,
+               check_posterior, HDF5),
         Reader("stored response", "response.h5", (a_response(),),
                lambda path: read_response(path, "the key"), None, check_response, HDF5),
         Reader("stored matrix", "response.npy", (a_matrix(),), with_matrix, None, check_matrix,

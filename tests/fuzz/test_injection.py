@@ -12,7 +12,7 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import MeasurementError, MeshError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.regions import Regions
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
@@ -70,11 +70,11 @@ def hostile_studies():
 @pytest.fixture(scope="module")
 def staged(tmp_path_factory):
     """All files of a run of GetDP, as text."""
-    mesh = verify_mesh(build_mesh(parse_study(TINY), tmp_path_factory.mktemp("mesh")))
+    mesh = verify_mesh(build_mesh(build_magnet(parse_study(TINY)), tmp_path_factory.mktemp("mesh")))
 
     def files(study):
         folder = tmp_path_factory.mktemp("run")
-        fill_run_folder(study, mesh, circle(0.05, 3), folder, CROSS_SECTION)
+        fill_run_folder(build_magnet(study), mesh, circle(0.05, 3), folder, CROSS_SECTION)
         return {path.name: path.read_text() for path in folder.iterdir() if path.suffix == ".pro"}
     return files
 
@@ -157,7 +157,7 @@ def campaign(tmp_path_factory):
     study, blocks = home / "study.toml", home / "blocks.csv"
     study.write_text(tomlkit.dumps(document), encoding="utf-8")
     rows = [f"# {hostile}: {hostile}", "serial,type,ring,slot,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2"]
-    for block in blocks_of(parse_study(document)):
+    for block in build_magnet(parse_study(document)).blocks:
         outward = np.append(block.middle[:2], 0) / np.hypot(*block.middle[:2])
         moment = 0.08 * block.area * block.magnetization
         rows.append(f'"{hostile}{block.slot}","{hostile}{block.slot}",1,{block.slot},'

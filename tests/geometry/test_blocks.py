@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.magnet import blocks_of, points_in_material, ring_limits
+from halbach_fe.geometry.magnet import build_magnet
 
 SHAPES = {
     "sector": {"shape": "sector"},
@@ -26,14 +26,14 @@ AREAS = {
 
 @pytest.mark.parametrize("shape", AREAS)
 def test_area(dipole, shape):
-    for block in blocks_of(dipole(array__block=SHAPES[shape])):
+    for block in build_magnet(dipole(array__block=SHAPES[shape])).blocks:
         assert block.area == pytest.approx(AREAS[shape], rel=1e-12)
 
 
 @pytest.mark.parametrize("shape", [name for name in SHAPES if name != "turned cuboid"])
 def test_contains_agrees_with_area(dipole, generator, shape):
     """Monte Carlo: the fraction of points inside equals the area, within 4 sigma."""
-    block = blocks_of(dipole(array__block=SHAPES[shape]))[2]
+    block = build_magnet(dipole(array__block=SHAPES[shape])).blocks[2]
     points = np.column_stack([generator.uniform(-0.2, 0.2, (200_000, 2)), np.zeros(200_000)])
     fraction = block.contains(points).mean()
     expected = block.area / 0.16
@@ -42,7 +42,7 @@ def test_contains_agrees_with_area(dipole, generator, shape):
 
 def test_arcs_decide_at_the_bulge(dipole):
     """Between chord and arc: outside at the inner face, inside at the outer one."""
-    block = blocks_of(dipole())[0]  # centred at 90 degrees
+    block = build_magnet(dipole()).blocks[0]  # centred at 90 degrees
     radii = np.array([0.1035, 0.1045, 0.186, 0.187])
     points = np.column_stack([0 * radii, radii, 0 * radii])
     assert block.contains(points).tolist() == [False, True, True, False]
@@ -52,7 +52,7 @@ def test_arcs_decide_at_the_bulge(dipole):
 
 def test_slots_and_magnetization_follow_the_published_dipole(dipole):
     """FASER: block i at 90 + (i-1) 22.5 deg, magnetized along 180 + (i-1) 45 deg."""
-    blocks = blocks_of(dipole())
+    blocks = build_magnet(dipole()).blocks
     centre = np.mean([edge.start for edge in blocks[4].outline], axis=0)
     assert np.degrees(np.arctan2(centre[1], centre[0])) == pytest.approx(180.0)
     assert blocks[4].easy_axis == pytest.approx((1, 0, 0), abs=1e-12)
@@ -60,34 +60,35 @@ def test_slots_and_magnetization_follow_the_published_dipole(dipole):
 
 def test_rings_are_centred_and_apart(short_dipole):
     study = short_dipole(array__rings=3, array__ring_gap_m=0.01)
-    limits = np.array(ring_limits(study))
+    limits = np.array(build_magnet(study).ring_limits)
     assert limits == pytest.approx(-limits[::-1, ::-1])
     assert limits[1:, 0] - limits[:-1, 1] == pytest.approx(0.01)
 
 
 def test_overlapping_cuboids_are_refused(dipole):
     with pytest.raises(StudyError, match="overlap"):
-        blocks_of(dipole(array__block={"shape": "cuboid", "width_m": 0.05}))
+        build_magnet(dipole(array__block={"shape": "cuboid", "width_m": 0.05}))
     with pytest.raises(StudyError, match="overlap"):
-        blocks_of(dipole(array__block={
+        build_magnet(dipole(array__block={
             "shape": "cuboid", "width_m": 0.0825, "orientation": "magnetization"}))
 
 
 def test_many_narrow_neighbours(dipole):
     """Sectors and trapezoids that share faces are apart; cuboids a little too wide are not."""
     many = {"array__blocks_per_ring": 256}
-    blocks_of(dipole(**many))
-    blocks_of(dipole(**many, array__block={"shape": "trapezoid", "side_gap_m": 0.0}))
+    build_magnet(dipole(**many))
+    build_magnet(dipole(**many, array__block={"shape": "trapezoid", "side_gap_m": 0.0}))
     pitch = 2 * 0.104 * np.tan(np.pi / 256)
-    blocks_of(dipole(**many, array__block={"shape": "cuboid", "width_m": 0.999 * pitch}))
+    build_magnet(dipole(**many, array__block={"shape": "cuboid", "width_m": 0.999 * pitch}))
     with pytest.raises(StudyError, match="overlap"):
-        blocks_of(dipole(**many, array__block={"shape": "cuboid", "width_m": 1.001 * pitch}))
+        build_magnet(
+            dipole(**many, array__block={"shape": "cuboid", "width_m": 1.001 * pitch}))
 
 
 def test_crossing_cuboids_are_refused(dipole):
     """Thin cuboids that cross like swords hold no corner or centre of each other."""
     with pytest.raises(StudyError, match="overlap"):
-        blocks_of(dipole(array__inner_radius_m=0.1, array__outer_radius_m=0.2, array__block={
+        build_magnet(dipole(array__inner_radius_m=0.1, array__outer_radius_m=0.2, array__block={
             "shape": "cuboid", "width_m": 0.002, "orientation": "magnetization"}))
 
 
@@ -96,4 +97,4 @@ def test_iron_and_blocks_are_material_air_is_not(short_dipole):
                                     "relative_permeability": 100.0, "length_m": 0.1})
     points = np.array([[0, 0, 0], [0, 0.15, 0.0], [0, 0.195, 0.0], [0, 0.195, 0.06],
                        [0, 0.188, 0.0], [0, 0.15, 0.2]])
-    assert points_in_material(study, points).tolist() == [False, True, True, False, False, False]
+    assert build_magnet(study).contains(points).tolist() == [False, True, True, False, False, False]

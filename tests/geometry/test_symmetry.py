@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import (
     SymmetryImage,
     frame_of,
@@ -24,8 +24,9 @@ POINTS = np.vstack([circle(0.05, 5, z, 0.2 + z) for z in (-0.12, 0.03, 0.1)])
 
 
 def fields(study, session):
-    parts = finite_element_part(study, POINTS, session)
-    return np.array([parts.block(number, slice(None)) for number in range(len(blocks_of(study)))])
+    parts = finite_element_part(build_magnet(study), POINTS, session)
+    return np.array(
+        [parts.block(number, slice(None)) for number in range(len(build_magnet(study).blocks))])
 
 
 @pytest.mark.parametrize("rings", [2, 3])
@@ -48,7 +49,7 @@ def test_3d_reduced_agree_with_unreduced(short_dipole, session, block):
     """
     changes = {"array__block": block, "array__recoil_permeability": 1.2,
                "array__blocks_per_ring": 6, "mesh__block_size_m": 0.05, "mesh__growth": 2.5}
-    assert choose_route(short_dipole(**changes), POINTS) == "scalar_potential"
+    assert choose_route(build_magnet(short_dipole(**changes)), POINTS) == "scalar_potential"
     reduced = fields(short_dipole(**changes), session)
     plain = fields(short_dipole(solver__symmetry=False, **changes), session)
     scale = np.abs(plain).max()
@@ -62,16 +63,17 @@ def test_3d_reduced_agree_with_unreduced(short_dipole, session, block):
 def test_lowest_order_on_a_coarse_mesh_is_not_taken_for_a_wrong_column(short_dipole, session):
     """Edge elements of order 1, placed by symmetry, miss the array by 11 % here."""
     study = short_dipole(solver__method="direct")
-    built = response_matrix(study, observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
+    built = response_matrix(build_magnet(study),
+                            observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
     assert 0.05 < built.superposition_error < 0.25
 
 
 def test_what_is_a_symmetry(short_dipole):
     def count(**changes):
-        return len(symmetry_of(short_dipole(array__rings=3, **changes)).sources)
+        return len(symmetry_of(build_magnet(short_dipole(array__rings=3, **changes))).sources)
 
     assert count() == 2  # one slot, of the outer and the middle ring
-    assert len(no_symmetry(short_dipole(array__rings=3)).sources) == 48
+    assert len(no_symmetry(build_magnet(short_dipole(array__rings=3))).sources) == 48
     # cubes that follow the magnetization turn twice as fast: the same again after four slots
     cubes = {"shape": "cuboid", "width_m": 0.03, "orientation": "magnetization"}
     assert count(array__block=cubes, array__outer_radius_m=0.134) == 4 * 2
@@ -87,9 +89,11 @@ def test_what_is_a_symmetry(short_dipole):
 
 def test_blocks_of_other_permeability_take_a_3d_route(short_dipole):
     odd = {"ring": 1, "slot": 4, "recoil_permeability": 1.3}
-    assert choose_route(short_dipole(array__exceptions=[odd]), POINTS) == "scalar_potential"
+    assert choose_route(build_magnet(short_dipole(array__exceptions=[odd])),
+                        POINTS) == "scalar_potential"
     ring = {"ring": 1, "recoil_permeability": 1.3}
-    assert choose_route(short_dipole(array__exceptions=[ring]), POINTS) == "azimuthal_modes"
+    assert choose_route(build_magnet(short_dipole(array__exceptions=[ring])),
+                        POINTS) == "azimuthal_modes"
 
 
 def test_an_exceptional_ring_in_modes_and_in_3d(short_dipole, session):
@@ -100,7 +104,7 @@ def test_an_exceptional_ring_in_modes_and_in_3d(short_dipole, session):
                "mesh__growth": 1.5}
 
     def nominal(**more):
-        return finite_element_part(short_dipole(**changes | more), POINTS, session,
+        return finite_element_part(build_magnet(short_dipole(**changes | more)), POINTS, session,
                                    columns=False).nominal
 
     modes, solid = nominal(), nominal(solver__route="scalar_potential")
@@ -137,13 +141,13 @@ def test_congruent_blocks_share_integrals_without_a_trace(short_dipole, generato
     points = 0.09 * (2 * generator.random((40, 3)) - 1)
     for block in ({"shape": "sector"}, {"shape": "trapezoid"},
                   {"shape": "cuboid", "width_m": 0.02, "orientation": "magnetization"}):
-        blocks = blocks_of(short_dipole(array__block=block, array__inner_radius_m=0.13))
+        blocks = build_magnet(short_dipole(array__block=block, array__inner_radius_m=0.13)).blocks
         together = list(unit_fields(blocks, points))
         for number in (0, 3, 15, 21):
             alone = unit_field(blocks[number], points)
             np.testing.assert_allclose(together[number], alone, atol=1e-12)
         assert np.abs(together[0] - together[1]).max() > 1e-3
-    assert len({frame_of(block).shape for block in blocks_of(short_dipole())}) == 1
+    assert len({frame_of(block).shape for block in build_magnet(short_dipole()).blocks}) == 1
 
 
 def test_unique_points(generator):
@@ -164,11 +168,11 @@ def test_blocks_react_as_in_a_regular_array(short_dipole, session):
                "array__block__angular_gap_deg": 2.0, "array__recoil_permeability": 1.1,
                "mesh": {"block_size_m": 0.035, "layers_per_ring": 2, "growth": 1.8}}
     solid = {"solver__route": "scalar_potential"}
-    parts = finite_element_part(short_dipole(**changes), POINTS, session)
-    whole = finite_element_part(short_dipole(**changes | solid), POINTS, session)
+    parts = finite_element_part(build_magnet(short_dipole(**changes)), POINTS, session)
+    whole = finite_element_part(build_magnet(short_dipole(**changes | solid)), POINTS, session)
     assert np.array_equal(parts.nominal, whole.nominal)
-    finer = finite_element_part(short_dipole(**changes | solid | {
-        "mesh": {"block_size_m": 0.027, "layers_per_ring": 3, "growth": 1.6}}), POINTS, session,
+    finer = finite_element_part(build_magnet(short_dipole(**changes | solid | {
+        "mesh": {"block_size_m": 0.027, "layers_per_ring": 3, "growth": 1.6}})), POINTS, session,
         columns=False).nominal
 
     def rms(field):
@@ -192,5 +196,6 @@ def test_a_turned_block_adds_up_too(short_dipole, session, across):
     changes = {} if across is None else {"array__recoil_permeability_across": across}
     study = short_dipole(array__exceptions=[
         {"ring": 1, "slot": 5, "rotation_deg": [0.3, 0.2, 1.0]}], **changes)
-    built = response_matrix(study, observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
+    built = response_matrix(build_magnet(study),
+                            observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
     assert built.superposition_error < 1e-10

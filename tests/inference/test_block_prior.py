@@ -17,7 +17,7 @@ import scipy.stats as stats
 import xarray as xr
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
@@ -67,7 +67,7 @@ def table_of(study, slots, magnetization, rings=None, volume=np.nan, **changes):
 
 def blocks_and_truth(study, generator, spread=0.01, copies=1):
     """Slots, rings and magnetizations (n, 3) of all blocks, ``copies`` times."""
-    blocks = blocks_of(study) * copies
+    blocks = build_magnet(study).blocks * copies
     nominal = np.array([block.magnetization for block in blocks])
     size = np.linalg.norm(nominal[0])
     return ([block.slot for block in blocks], [block.ring for block in blocks],
@@ -109,7 +109,7 @@ def test_demagnetizing_tensor_of_a_cuboid(short_dipole, width):
     study = short_dipole(array__block={"shape": "cuboid", "width_m": width},
                          array__blocks_per_ring=8, array__inner_radius_m=0.124,
                          array__outer_radius_m=0.2065)
-    block = blocks_of(study)[1]  # at 135 degrees
+    block = build_magnet(study).blocks[1]  # at 135 degrees
     (tensor,) = demagnetizing_tensors([block])
     turn = np.array([[-1, -1, 0], [1, -1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
     sides = np.array([0.0825, width, 0.08])
@@ -125,7 +125,7 @@ def test_demagnetizing_tensor_of_a_sector(short_dipole):
     stand-in, is 1e-2 off.
     """
     study = short_dipole(array__first_block_angle_deg=0.0)
-    block = blocks_of(study)[0]
+    block = build_magnet(study).blocks[0]
     t, weight = np.polynomial.legendre.leggauss(10)
     r, phi, z = np.meshgrid(0.14525 + 0.04125 * t, np.pi / 16 * t, 0.04 * t, indexing="ij")
     weights = (r * np.einsum("i,j,k->ijk", weight, weight, weight)).ravel()
@@ -162,7 +162,7 @@ def test_conversion_of_a_lone_block(short_dipole, along, across, error):
     slots, rings, others = blocks_and_truth(study, np.random.default_rng(0))
     table = table_of(study, slots, others, rings)
     table.moment[0] = moment
-    mean = prior_from_blocks(study, table).gaussian.mean[:3]
+    mean = prior_from_blocks(build_magnet(study), table).gaussian.mean[:3]
     expected = remanence / MU_0 / permeability
     size = np.linalg.norm(expected)
     assert np.linalg.norm(mean - expected) < error * size
@@ -176,22 +176,24 @@ def test_rotation_from_block_axes(vacuum_dipole, generator):
     """Exact but for rounding; the axes of the next slot, or of the array, are not the same."""
     study = vacuum_dipole()
     slots, rings, truth = blocks_and_truth(study, generator)
-    prior = prior_from_blocks(study, table_of(study, slots, truth, rings))
+    prior = prior_from_blocks(build_magnet(study), table_of(study, slots, truth, rings))
     np.testing.assert_allclose(prior.gaussian.mean, truth.ravel(), atol=1e-9 * np.abs(truth).max())
     np.testing.assert_allclose(prior.gaussian.sd, SIGMA / VOLUME, rtol=1e-9)
 
     next_slot = table_of(study, slots, truth, rings,
                          moment=VOLUME * in_block_axes(study, np.add(slots, 1), truth))
-    wrong = prior_from_blocks(study, next_slot).gaussian.mean
+    wrong = prior_from_blocks(build_magnet(study), next_slot).gaussian.mean
     assert np.abs(wrong - truth.ravel()).max() > 0.3 * np.abs(truth).max()
     with pytest.raises(MeasurementError, match="own axes as mounted"):
-        prior_from_blocks(study, table_of(study, slots, truth, rings, moment=VOLUME * truth))
+        prior_from_blocks(build_magnet(study),
+                          table_of(study, slots, truth, rings, moment=VOLUME * truth))
 
 
 def test_volume_of_the_table_counts(vacuum_dipole, generator):
     study = vacuum_dipole()
     slots, rings, truth = blocks_and_truth(study, generator)
-    prior = prior_from_blocks(study, table_of(study, slots, truth, rings, volume=0.98 * VOLUME))
+    prior = prior_from_blocks(build_magnet(study),
+                              table_of(study, slots, truth, rings, volume=0.98 * VOLUME))
     np.testing.assert_allclose(prior.gaussian.mean, truth.ravel() / 0.98, rtol=1e-9)
 
 
@@ -200,11 +202,12 @@ def test_temperature(vacuum_dipole, generator):
                                  "reference_temperature_C": 20.0})
     slots, rings, truth = blocks_and_truth(study, generator)
     warm = table_of(study, slots, truth, rings, temperature=np.full(len(slots), 30.0))
-    np.testing.assert_allclose(prior_from_blocks(study, warm).gaussian.mean, truth.ravel() / 0.99)
+    np.testing.assert_allclose(prior_from_blocks(build_magnet(study), warm).gaussian.mean,
+                               truth.ravel() / 0.99)
     np.testing.assert_allclose(  # without a coefficient temperatures are not used
-        prior_from_blocks(vacuum_dipole(), warm).gaussian.mean, truth.ravel())
+        prior_from_blocks(build_magnet(vacuum_dipole()), warm).gaussian.mean, truth.ravel())
     with pytest.raises(MeasurementError, match=r"temperature_C of block B0 .* must be given"):
-        prior_from_blocks(study, table_of(study, slots, truth, rings))
+        prior_from_blocks(build_magnet(study), table_of(study, slots, truth, rings))
 
 
 # --- statistics --------------------------------------------------------------------------------
@@ -317,7 +320,7 @@ def test_types_without_places(vacuum_dipole, generator):
     """Mean and covariance of samples, turned into every place; the mean's error is shared."""
     study = vacuum_dipole()
     slots, _, truth = blocks_and_truth(study, generator, copies=5)  # 10 of each slot
-    found = prior_from_blocks(study, table_of(study, slots, truth)).gaussian
+    found = prior_from_blocks(build_magnet(study), table_of(study, slots, truth)).gaussian
     of_slot = truth[np.array(slots) == 3]
     first, second = (slice(3 * b, 3 * b + 3) for b in (2, 16 + 2))
     np.testing.assert_allclose(found.mean[first], of_slot.mean(axis=0), rtol=1e-9)
@@ -342,7 +345,7 @@ def test_prior_is_calibrated(vacuum_dipole, generator, copies):
         new = truth[-32:].ravel()
         gain = 1 + 0.01 * generator.standard_normal()
         table = table_of(study, slots[:-32], gain * truth[:-32])
-        found = prior_from_blocks(study, table).gaussian
+        found = prior_from_blocks(build_magnet(study), table).gaussian
         scores.append((new - found.mean) / found.sd)
     rms = np.sqrt(np.mean(np.square(scores)))
     # 30 gains, each in a third of the variance: sd about 5 %
@@ -358,7 +361,7 @@ def test_placed_prior_is_calibrated(vacuum_dipole, generator):
         slots, rings, truth = blocks_and_truth(study, generator)
         table = table_of(study, slots, (1 + 0.002 * generator.standard_normal()) * truth, rings)
         table.moment[:] += SIGMA * generator.standard_normal(table.moment.shape)
-        found = prior_from_blocks(study, table).gaussian
+        found = prior_from_blocks(build_magnet(study), table).gaussian
         turns = np.radians(0.2) * generator.standard_normal(truth.shape)
         error = (truth + np.cross(turns, truth)).ravel() - found.mean
         scores.append(error / found.sd)
@@ -374,10 +377,10 @@ def test_types_join_slots(short_dipole, generator):
                          array__recoil_permeability=1.0, prior={"types": types})
     slots, _, truth = blocks_and_truth(study, generator)
     labels = tuple(f"{(slot - 1) % 6 + 1} and {(slot - 1) % 6 + 7}" for slot in slots)
-    volume = blocks_of(study)[0].volume
+    volume = build_magnet(study).blocks[0].volume
     table = table_of(study, slots, truth, type=labels,
                      moment=volume * in_block_axes(study, slots, truth))
-    prior = prior_from_blocks(study, table)
+    prior = prior_from_blocks(build_magnet(study), table)
     assert [len(one.deviations) for one in prior.types] == [4] * 6
     own = in_block_axes(study, slots, truth)[[0, 6, 12, 18]].mean(axis=0)
     placed = in_block_axes(study, [1, 7], prior.gaussian.mean.reshape(-1, 3)[[0, 6]])
@@ -392,14 +395,14 @@ def test_types_join_slots(short_dipole, generator):
         "ring", "slot", "moment", "sigma", "volume", "temperature")},
         serial=tuple(np.array(table.serial)[halves]), type=tuple(np.array(labels)[halves]))
     with pytest.raises(StudyError, match=r"blocks that are alike .* r01s01 and r01s07"):
-        prior_from_blocks(dipole, some)
+        prior_from_blocks(build_magnet(dipole), some)
 
 
 def test_spares_do_not_disturb_placed_blocks(vacuum_dipole, generator):
     study = vacuum_dipole()
     slots, rings, truth = blocks_and_truth(study, generator, copies=2)
     mounted = np.arange(64) < 32
-    found = prior_from_blocks(study, table_of(study, slots, truth, rings * mounted,
+    found = prior_from_blocks(build_magnet(study), table_of(study, slots, truth, rings * mounted,
                                               slot=slots * mounted))
     assert (found.placed, found.count) == (True, 64)
     np.testing.assert_allclose(found.gaussian.mean, truth[:32].ravel())
@@ -437,7 +440,7 @@ def test_calibration_of_the_coil_is_not_mistaken_for_a_discovery(dipole, generat
     """
     study, data, table, truth = arc_campaign(dipole, generator, 1.005)
     without = study.with_(prior__common_mode_sd=0.0)
-    good, bad = (infer(one, data, session, table) for one in (study, without))
+    good, bad = (infer(build_magnet(one), data, session, table) for one in (study, without))
     nominal = good.response.nominal
     errors = [(update.posterior.mean - truth).reshape(16, 2) for update in (good, bad)]
     along = [np.sum(error * nominal.reshape(16, 2), axis=1) / np.linalg.norm(nominal[:2]) ** 2
@@ -475,9 +478,10 @@ def test_refusals(vacuum_dipole, generator, placed, change, said):
     slots, rings, truth = blocks_and_truth(study, generator)
     table = table_of(study, slots, truth, rings if placed else None, volume=VOLUME)
     if placed:
-        prior_from_blocks(study, table)  # the control: it is the change that is refused
+        prior_from_blocks(build_magnet(study),
+                          table)  # the control: it is the change that is refused
     with pytest.raises(MeasurementError, match=said):
-        prior_from_blocks(study, replace(table, **change(table)))
+        prior_from_blocks(build_magnet(study), replace(table, **change(table)))
 
 
 def test_a_component_that_was_not_measured(vacuum_dipole, generator):
@@ -485,15 +489,16 @@ def test_a_component_that_was_not_measured(vacuum_dipole, generator):
     slots, _, truth = blocks_and_truth(study, generator, copies=3)
     truth[:, 2] = 0
     with pytest.raises(MeasurementError, match="the same moment z in all"):
-        prior_from_blocks(study, table_of(study, slots, truth))
+        prior_from_blocks(build_magnet(study), table_of(study, slots, truth))
 
 
 def test_a_cross_section_needs_a_length(dipole, generator):
     study = dipole(array__recoil_permeability=1.0)
     slots, rings, truth = blocks_and_truth(study, generator)
     with pytest.raises(MeasurementError, match=r"volume_m3 of block B0 .* 2D study"):
-        prior_from_blocks(study, table_of(study, slots, truth, rings))
-    found = prior_from_blocks(study, table_of(study, slots, truth, rings, volume=VOLUME))
+        prior_from_blocks(build_magnet(study), table_of(study, slots, truth, rings))
+    found = prior_from_blocks(build_magnet(study),
+                              table_of(study, slots, truth, rings, volume=VOLUME))
     np.testing.assert_allclose(found.gaussian.mean, truth[:, :2].ravel())
 
 
@@ -501,8 +506,8 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     """In the warning, on the page and in the summary; healthy ones are not."""
     study = vacuum_dipole()
     slots, _, truth = blocks_and_truth(study, generator, copies=8)
-    healthy = prior_from_blocks(study, table_of(study, slots, truth))
-    write_prior(study, healthy, tmp_path)
+    healthy = prior_from_blocks(build_magnet(study), table_of(study, slots, truth))
+    write_prior(build_magnet(study), healthy, tmp_path)
     assert "Not normal" not in (tmp_path / "prior.html").read_text()
     with xr.open_dataset(tmp_path / "prior.h5", engine="h5netcdf") as stored:
         np.testing.assert_allclose(stored["prior_covariance"], healthy.gaussian.covariance)
@@ -510,7 +515,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     truth[slots.index(4)] *= 0.85  # one block that was partly demagnetized
     table = table_of(study, slots, truth)
     with pytest.warns(HalbachWarning, match="type 4 do not look normally"):
-        write_prior(study, prior_from_blocks(study, table), tmp_path)
+        write_prior(build_magnet(study), prior_from_blocks(build_magnet(study), table), tmp_path)
     assert "Not normal" in (tmp_path / "prior.html").read_text()
     summary = json.loads((tmp_path / "prior.json").read_text())
     assert summary["not_normal"] == ["4"]

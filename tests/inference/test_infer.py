@@ -10,7 +10,8 @@ import pytest
 import xarray as xr
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -50,7 +51,7 @@ def iron_campaign(dipole, generator, noise=1e-5):
 def test_permeable_dipole_with_iron_is_learnt(dipole, generator, session):
     """Truth by closed form, model by finite elements: error falls, error bars hold."""
     study, data, truth = iron_campaign(dipole, generator)
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     before = np.abs(update.prior.mean - truth)
     after = np.abs(update.posterior.mean - truth)
     assert np.median(after) < 0.5 * np.median(before)
@@ -72,9 +73,10 @@ def test_a_model_of_another_bore_does_not_fit(dipole, generator, session):
     study, data, _ = iron_campaign(dipole, generator)
     tight = {"prior": {"magnitude_sd": 1e-3, "direction_sd_deg": 0.05, "common_mode_sd": 0.1},
              "noise": NOISE, "mesh__block_size_m": 0.01, "observation__components": ["x", "y"]}
-    wrong = infer(dipole(array__inner_radius_m=0.106, iron_ring=IRON, **tight), data, session)
+    wrong = infer(build_magnet(dipole(array__inner_radius_m=0.106, iron_ring=IRON, **tight)), data,
+                  session)
     assert wrong.prior_conflict > wrong.conflict_limit
-    loose = infer(study, data, session)
+    loose = infer(build_magnet(study), data, session)
     assert loose.prior_conflict < loose.conflict_limit
 
 
@@ -85,7 +87,7 @@ def magpylib_campaign(short_dipole, generator):
     points = np.vstack([circle(0.08, 16, z, 0.1 * z) for z in np.linspace(-0.16, 0.16, 30)])
     field = np.zeros_like(points)
     truth = []
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         middle = position_angle_deg(study.array, block.slot)
         polarization = np.array(block.easy_axis) * block.remanence
         polarization = polarization + 0.01 * block.remanence * generator.standard_normal(3)
@@ -101,7 +103,7 @@ def magpylib_campaign(short_dipole, generator):
 def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, generator, session,
                                                              tmp_path):
     study, data, truth = magpylib_campaign(short_dipole, generator)
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     score = (update.posterior.mean - truth) / update.posterior.sd
     assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.3)  # 96 values: sd 0.07
     training, unseen = update.scores
@@ -138,12 +140,12 @@ def test_a_second_map_is_only_predicted(short_dipole, generator, session, tmp_pa
     the same posterior and scores.
     """
     study, data, _ = magpylib_campaign(short_dipole, generator)
-    one = infer(study, data, session)
+    one = infer(build_magnet(study), data, session)
     unseen = np.unique(np.flatnonzero(one.held_out) // 3)
     apart = short_dipole(array__recoil_permeability=1.0, noise=NOISE)
     other = data.isel(point=unseen)
     other["sigma_T"] = (("point", "component"), np.full((len(unseen), 3), 1e-5))
-    two = infer(apart, data.drop_isel(point=unseen), session, unseen=other)
+    two = infer(build_magnet(apart), data.drop_isel(point=unseen), session, unseen=other)
     np.testing.assert_allclose(two.posterior.mean, one.posterior.mean, rtol=1e-9)
     assert [score.part for score in two.scores] == ["training", "held-out map"]
     assert two.scores[1].chi2_posterior == pytest.approx(one.scores[1].chi2_posterior)
@@ -158,7 +160,7 @@ def test_a_second_map_is_only_predicted(short_dipole, generator, session, tmp_pa
     for name, value in (("x_m", 0.15), ("y_m", 0.0), ("z_m", 0.04)):
         other[name].values[0] = value
     with pytest.raises(MeasurementError, match="reading 1 of held-out map must be at a point in"):
-        infer(apart, data, session, unseen=other)
+        infer(build_magnet(apart), data, session, unseen=other)
 
 
 def test_the_axis_from_fourier_coefficients(short_dipole, generator, session):
@@ -170,15 +172,16 @@ def test_the_axis_from_fourier_coefficients(short_dipole, generator, session):
             "kind": "circles", "radius_m": 0.08, "angles": 16}})
     z = np.linspace(-0.15, 0.15, 21)
     points = np.column_stack([0 * z, 0 * z, z])
-    everything = infer(study, data, session)  # by all three components, ten times as sure
+    everything = infer(build_magnet(study), data,
+                       session)  # by all three components, ten times as sure
     field = observe(study, points, np.ones_like(points, bool))
-    matrix = response_matrix(study, field, session).matrix
+    matrix = response_matrix(build_magnet(study), field, session).matrix
     truth = (matrix @ everything.posterior.mean).reshape(-1, 3)
     axis = field_map(points, truth + 1e-5 * generator.standard_normal(truth.shape))
     with pytest.raises(MeasurementError, match="sigma_T of held-out map must be given"):
-        infer(coefficients, data, session, unseen=axis)
+        infer(build_magnet(coefficients), data, session, unseen=axis)
     axis["sigma_T"] = (("point", "component"), np.full(truth.shape, 1e-5))
-    update = infer(coefficients, data, session, unseen=axis)
+    update = infer(build_magnet(coefficients), data, session, unseen=axis)
     _, unseen = update.scores
     assert (unseen.part, unseen.readings) == ("held-out map", 63)
     assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.75)  # sd 0.18
@@ -192,12 +195,12 @@ def test_held_out_components_whose_points_were_seen(short_dipole, generator, ses
     """
     study, data, _ = magpylib_campaign(short_dipole, generator)
     points = np.column_stack([data[name].values for name in ("x_m", "y_m", "z_m")])
-    gradient = gradient_of(blocks_of(study), points)
+    gradient = gradient_of(build_magnet(study).blocks, points)
     data["B_T"].values[:] += np.einsum(
         "ick,ik->ic", gradient, 2e-4 * generator.standard_normal(points.shape))
-    update = infer(short_dipole(
+    update = infer(build_magnet(short_dipole(
         array__recoil_permeability=1.0, noise=NOISE | {"position_sd_m": 2e-4},
-        inference={"held_out": {"components": ["z"], "z_ranges_m": [[0.1, 1.0]]}}), data, session)
+        inference={"held_out": {"components": ["z"], "z_ranges_m": [[0.1, 1.0]]}})), data, session)
     assert update.held_out.sum() == 480 + 2 * 6 * 16
     _, unseen = update.scores
     # sd over 80 campaigns: 0.051 (of 672 independent readings 0.055), 0.042, 0.011; 4 to 5 sigma
@@ -210,7 +213,7 @@ def test_held_out_components_whose_points_were_seen(short_dipole, generator, ses
 def test_report_says_when_the_model_does_not_fit(short_dipole, generator, session, tmp_path):
     study, data, _ = magpylib_campaign(short_dipole, generator)
     data["B_T"].values[:, 2] += 1e-3  # an offset of the z sensor: no magnet makes it
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     assert update.prior_conflict > update.conflict_limit
     write_inference_report(update, tmp_path)
     assert "Model and measurement disagree" in (tmp_path / "report.html").read_text()
@@ -220,25 +223,25 @@ def test_maps_that_do_not_fit_the_study(short_dipole, dipole, session):
     study = short_dipole(noise=NOISE)
     inside = field_map(np.array([[0, 0, 0], [0.15, 0, 0.04]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match=r"reading 2 of map must be at a point in air"):
-        infer(study, inside, session)
+        infer(build_magnet(study), inside, session)
     sloped = field_map(np.array([[0, 0, 0], [0, 0, 0.1]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match="one plane for a 2D study"):
-        infer(dipole(noise=NOISE), sloped, session)
+        infer(build_magnet(dipole(noise=NOISE)), sloped, session)
     with pytest.raises(StudyError, match="how noisy"):
-        infer(short_dipole(), field_map(np.zeros((1, 3)), np.ones((1, 3))), session)
+        infer(build_magnet(short_dipole()), field_map(np.zeros((1, 3)), np.ones((1, 3))), session)
 
 
 def test_the_study_says_how_a_map_is_to_be_read(short_dipole, generator, session):
     """A map with a wrong radius, in mm and with axes exchanged, is that which it was made of."""
     study, data, _ = magpylib_campaign(short_dipole, generator)
-    right = infer(study, data, session)
+    right = infer(build_magnet(study), data, session)
     points, field = points_of(data), data["B_T"].values
     written = field_map(1e3 * (points * [3.0, 3.0, 1.0])[:, [1, 0, 2]], field * [1, 1, -1])
     with pytest.raises(MeasurementError, match="a point in air"):
-        infer(study, field_map(points * [2.0, 2.0, 1.0], field), session)
+        infer(build_magnet(study), field_map(points * [2.0, 2.0, 1.0], field), session)
     instrument = Instrument(length_unit_m=1e-3, radius_scale=1 / 3 - 1,
                             position_axes=("y", "x", "z"), field_axes=("x", "y", "-z"))
-    found = infer(study.with_(instrument=instrument), written, session)
+    found = infer(build_magnet(study.with_(instrument=instrument)), written, session)
     # solvers of the response stop at 1e-10, and points are off by their rounding
     np.testing.assert_allclose(found.posterior.mean, right.posterior.mean, rtol=0,
                                atol=1e-5 * right.posterior.sd.min())
@@ -251,13 +254,14 @@ def test_excluded_readings_are_gone(short_dipole, generator, session):
     broken["B_T"].values[100] = 0.2
     told = {"held_out": {"every": 3, "window": 5},
             "excluded_readings": [{"row": 7, "components": ["y"]}, 101]}
-    without = infer(parse_study(study.model_dump(exclude_none=True) | {"inference": told}), broken,
+    without = infer(build_magnet(
+        parse_study(study.model_dump(exclude_none=True) | {"inference": told})), broken,
                     session)
     assert len(without.observation) == 3 * data.sizes["point"] - 4
     assert without.prior_conflict < without.conflict_limit
-    assert infer(study, broken, session).prior_conflict > 100  # as it is with them
+    assert infer(build_magnet(study), broken, session).prior_conflict > 100  # as it is with them
     with pytest.raises(MeasurementError, match=r"at least the 101 that inference\.excl"):
-        infer(without.study, data.isel(point=slice(0, 100)), session)
+        infer(build_magnet(without.study), data.isel(point=slice(0, 100)), session)
 
 
 def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, session):
@@ -269,7 +273,7 @@ def test_fourier_coefficients_are_updated_and_predicted(dipole, generator, sessi
                    observation={"quantity": "fourier_coefficients", "harmonics": 8,
                                 "positions": {"kind": "circles", "radius_m": 0.075,
                                               "angles": 60}})
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     assert update.observation.labels == tuple(
         f"{part}{k}" for part in "AB" for k in range(1, 9))
     before = np.abs(update.readings - update.prediction_prior.mean)
@@ -291,7 +295,7 @@ def test_two_radii_with_unequal_noise(dipole, generator, session):
     data["B_T"].values[:] += sigma * generator.standard_normal((120, 3))
     data["sigma_T"] = (("point", "component"), sigma)
     study = dipole(iron_ring=IRON, mesh__block_size_m=0.01, observation=TWO_CIRCLES)
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     assert len(update.readings) == 32
     assert not update.noise.independent
     score = (update.posterior.mean - truth) / update.posterior.sd
@@ -319,7 +323,7 @@ def test_uncertain_positions(short_dipole, generator, session):
     moved = points + 2e-4 * generator.standard_normal(points.shape)
     field = np.zeros_like(points)
     study = short_dipole(array__recoil_permeability=1.0)
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         middle = position_angle_deg(study.array, block.slot)
         polarization = np.array(block.easy_axis) + 0.01 * generator.standard_normal(3)
         field += magpylib.magnet.CylinderSegment(
@@ -329,8 +333,9 @@ def test_uncertain_positions(short_dipole, generator, session):
     field += 1e-5 * generator.standard_normal(field.shape)
     data = field_map(points, field, np.full_like(field, 1e-5))
     for observation in (study.observation.model_dump(), TWO_CIRCLES):
-        known, exact = (infer(short_dipole(array__recoil_permeability=1.0, observation=observation,
-                                           noise=noise), data, session)
+        known, exact = (
+            infer(build_magnet(short_dipole(array__recoil_permeability=1.0, observation=observation,
+                                           noise=noise)), data, session)
                         for noise in ({"position_sd_m": 2e-4}, None))
         assert known.prior_conflict < known.conflict_limit
         # 840 readings: sd 0.05; 224: 0.09
@@ -341,23 +346,23 @@ def test_uncertain_positions(short_dipole, generator, session):
 def test_nothing_held_out_is_said(dipole, generator, session):
     _, data, _ = iron_campaign(dipole, generator)
     with pytest.raises(MeasurementError, match="enough z positions"):
-        infer(dipole(noise=NOISE, inference={"held_out": {"every": 2}},
-                     observation__components=["x", "y"]), data, session)
+        infer(build_magnet(dipole(noise=NOISE, inference={"held_out": {"every": 2}},
+                     observation__components=["x", "y"])), data, session)
 
 
 def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, session):
     far = field_map(np.array([[0.0, 0, 0], [75.0, 0, 0]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match="Check the units"):
-        infer(short_dipole(noise=NOISE), far, session)
+        infer(build_magnet(short_dipole(noise=NOISE)), far, session)
     with pytest.raises(MeasurementError, match="Check the units"):
-        infer(short_dipole(noise=NOISE), far.isel(point=[0]), session, unseen=far)
+        infer(build_magnet(short_dipole(noise=NOISE)), far.isel(point=[0]), session, unseen=far)
 
 
 def test_readings_that_vanish_by_symmetry(short_dipole, session):
     """B_y on the axis is zero; neither the checks nor the report may stumble over it."""
     study = short_dipole(noise=NOISE, observation__components=["y"])
     points = np.column_stack([np.zeros((5, 2)), np.linspace(-0.1, 0.1, 5)])
-    update = infer(study, field_map(points, np.zeros((5, 3))), session)
+    update = infer(build_magnet(study), field_map(points, np.zeros((5, 3))), session)
     (score,) = update.scores
     assert score.median_relative_error_posterior is None
     write_inference(update, session.folder)
@@ -375,12 +380,12 @@ def saturated_campaign(dipole, generator, session, spread):
                "prior": {"magnitude_sd": spread, "direction_sd_deg": np.degrees(spread)}}
     study = dipole(**changes, mesh__block_size_m=0.007)
     points = np.vstack([circle(0.075, 40), circle(0.09, 40)])
-    nominal = np.concatenate([block.magnetization[:2] for block in blocks_of(study)])
+    nominal = np.concatenate([block.magnetization[:2] for block in build_magnet(study).blocks])
     size = np.linalg.norm(nominal[:2])
     truth = nominal + spread * size * generator.standard_normal(len(nominal))
     finer = dipole(**changes, mesh__block_size_m=0.005)
     observation = observe(finer, points, np.ones((len(points), 3), bool))
-    readings = newton_readings(finer, observation, session, truth[None])[0]
+    readings = newton_readings(build_magnet(finer), observation, session, truth[None])[0]
     field = np.full((len(points), 3), np.nan)
     field[:, :2] = readings.reshape(-1, 2) + 1e-5 * generator.standard_normal((len(points), 2))
     return study, field_map(points, field), truth
@@ -389,7 +394,7 @@ def saturated_campaign(dipole, generator, session, spread):
 def test_saturated_iron_is_linearized(dipole, generator, session):
     """Errors of 0.1 % leave the iron's tangent good enough; without the offset nothing fits."""
     study, data, truth = saturated_campaign(dipole, generator, session, 0.001)
-    update = infer(study, data, session)
+    update = infer(build_magnet(study), data, session)
     score = (update.posterior.mean - truth) / update.posterior.sd
     assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)  # 32 values: sd 0.13
     assert update.prior_conflict < update.conflict_limit
@@ -400,4 +405,4 @@ def test_saturated_iron_is_linearized(dipole, generator, session):
 def test_iron_that_is_too_far_from_linear_is_said(dipole, generator, session):
     study, data, _ = saturated_campaign(dipole, generator, session, 0.05)
     with pytest.warns(HalbachWarning, match="needs the non-linear posterior"):
-        infer(study, data, session)
+        infer(build_magnet(study), data, session)

@@ -13,7 +13,7 @@ import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import SamplingError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 from halbach_fe.measurement.field_map import field_map, write_map
@@ -70,7 +70,7 @@ def campaign(getdp, tmp_path_factory):
         noise={"regions": [{"name": "all", "sigma_T": 1e-4}]},
         prior={"magnitude_sd": SPREAD, "direction_sd_deg": np.degrees(SPREAD)}))
     generator = np.random.default_rng(20231)
-    nominal = np.array([block.magnetization[:2] for block in blocks_of(study)])
+    nominal = np.array([block.magnetization[:2] for block in build_magnet(study).blocks])
     truth = nominal + SPREAD * np.linalg.norm(nominal[0]) * generator.standard_normal(nominal.shape)
     points = np.vstack([circle(0.075, 30), circle(0.06, 20, start=0.1)])
     magnet = magnet_of(study).with_magnetizations(truth)
@@ -82,7 +82,7 @@ def campaign(getdp, tmp_path_factory):
     data = field_map(points, field)
     folder = tmp_path_factory.mktemp("sampled")
     session = Session(getdp, folder / "work", jobs=2)
-    return study, truth.ravel(), data, infer(study, data, session), session
+    return study, truth.ravel(), data, infer(build_magnet(study), data, session), session
 
 
 def room(session, name):

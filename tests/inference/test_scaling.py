@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse as sparse
 from scipy import stats
 
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
@@ -192,11 +192,11 @@ def test_a_matrix_on_the_disk(monkeypatch, session, tmp_path):
     study = parse_study(document)
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool))
-    whole = response_matrix(study, observation, session)
+    whole = response_matrix(build_magnet(study), observation, session)
     monkeypatch.setattr(response_module, "LOADED_BYTES", 1000)
     monkeypatch.setattr(linear_gaussian, "NUMBERS_AT_ONCE", 700)
     (session.folder / "response.h5").unlink()
-    parts = response_matrix(study, observation, session)
+    parts = response_matrix(build_magnet(study), observation, session)
     assert isinstance(parts.matrix, StoredMatrix)
     scale = np.abs(whole.matrix).max()
     # panels of the exact field depend on the points that are taken together: 1e-12
@@ -204,11 +204,11 @@ def test_a_matrix_on_the_disk(monkeypatch, session, tmp_path):
                                atol=1e-11 * scale)
     np.testing.assert_allclose(parts.matrix @ parts.nominal, whole.matrix @ whole.nominal,
                                atol=1e-12)
-    again = response_matrix(study, observation, session)
+    again = response_matrix(build_magnet(study), observation, session)
     assert again.reused
     np.testing.assert_array_equal(again.matrix[np.arange(9)], parts.matrix[np.arange(9)])
     parts.matrix.path.write_bytes(b"")
-    assert not response_matrix(study, observation, session).reused
+    assert not response_matrix(build_magnet(study), observation, session).reused
     assert len(list(session.folder.glob("response-*.npy"))) == 1
 
 
@@ -217,12 +217,12 @@ def long_array(generator, session):
     """The update of 2 000 blocks with a map of 252 readings by magpylib; and the truth."""
     document = long_dipole(125, 21, angles=4)
     study = parse_study(document)
-    nominal = np.array([block.magnetization for block in blocks_of(study)])
+    nominal = np.array([block.magnetization for block in build_magnet(study).blocks])
     truth = nominal_prior(nominal.ravel(), 3, 0.01, 1.0, 0.005).sample(1, generator)[0]
     points = points_from(study.observation.positions)
     field = cuboid_field(document, truth.reshape(-1, 3), points)
     field += 5e-5 * generator.standard_normal(field.shape)
-    return infer(study, field_map(points, field), session), truth
+    return infer(build_magnet(study), field_map(points, field), session), truth
 
 
 def test_two_thousand_blocks(long_array, tmp_path):
@@ -241,7 +241,7 @@ def test_two_thousand_blocks(long_array, tmp_path):
     write_inference(update, tmp_path)
     # far below the 288 MB of one covariance
     assert Path(tmp_path / "posterior.h5").stat().st_size < 20e6
-    stored = read_posterior(update.study, tmp_path / "posterior.h5")
+    stored = read_posterior(build_magnet(update.study), tmp_path / "posterior.h5")
     for name, one in (("prior", update.prior), ("posterior", update.posterior)):
         np.testing.assert_allclose(stored[name].mean, one.mean)
         np.testing.assert_allclose(stored[name].sd, one.sd)

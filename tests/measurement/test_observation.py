@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import held_out, observe, together
 from halbach_fe.measurement.positions import points_from
@@ -107,14 +107,15 @@ def test_noise_by_region_and_from_the_map(dipole):
     points = np.array([[0, 0, 0.0], [0, 0, 0.2]])
     observation = observe(study, points, np.ones((2, 3), bool))
     data = field_map(points, np.ones((2, 3)))
-    assert reading_noise(study, observation, data).sd == pytest.approx([1e-5] * 3 + [1e-3] * 3)
+    assert reading_noise(build_magnet(study), observation,
+                         data).sd == pytest.approx([1e-5] * 3 + [1e-3] * 3)
     data["sigma_T"] = (("point", "component"), np.full((2, 3), 7e-5))
-    assert reading_noise(study, observation, data).sd == pytest.approx(7e-5)
+    assert reading_noise(build_magnet(study), observation, data).sd == pytest.approx(7e-5)
     with pytest.raises(StudyError, match="cover every reading"):
-        reading_noise(dipole(noise={"regions": regions[:1]}), observation,
+        reading_noise(build_magnet(dipole(noise={"regions": regions[:1]})), observation,
                             data.drop_vars("sigma_T"))
     with pytest.raises(StudyError, match="how noisy"):
-        reading_noise(dipole(), observation, data.drop_vars("sigma_T"))
+        reading_noise(build_magnet(dipole()), observation, data.drop_vars("sigma_T"))
 
 
 def test_noise_by_component(dipole):
@@ -129,7 +130,8 @@ def test_noise_by_component(dipole):
 
     def noise(some):
         study = dipole(noise={"regions": some})
-        return reading_noise(study, observe(study, points, np.ones((2, 3), bool)), data)
+        return reading_noise(build_magnet(study), observe(study, points, np.ones((2, 3), bool)),
+                             data)
 
     assert noise(regions).sd == pytest.approx([1e-5, 2e-5, 1e-5, 2e-3, 2e-3, 1e-3])
     assert noise(regions[::-1]).sd == pytest.approx([2e-3, 2e-3, 1e-3] * 2)
@@ -145,7 +147,8 @@ POSITION_SD = (3e-4, 1e-5, 1e-4)
 def displaced(short_dipole):
     """B (1500, 12, 3) of the blocks at points that are each moved at random."""
     moved = NEAR_END + POSITION_SD * np.random.default_rng(2).standard_normal((1500, 12, 3))
-    return field_of(blocks_of(short_dipole()), moved.reshape(-1, 3), order=4).reshape(moved.shape)
+    return field_of(build_magnet(short_dipole()).blocks, moved.reshape(-1, 3),
+                    order=4).reshape(moved.shape)
 
 
 @pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
@@ -163,7 +166,7 @@ def test_noise_of_positions(short_dipole, displaced, generator, quantity, from_m
     observation = observe(study, NEAR_END, np.ones((12, 3), bool))
     sigma = np.full((12, 3), 2e-5)
     data = field_map(NEAR_END, np.ones((12, 3)), sigma if from_map else None)
-    noise = reading_noise(study, observation, data)
+    noise = reading_noise(build_magnet(study), observation, data)
     draws = observation.apply(displaced)
     own = (observation.apply(2e-5 * generator.standard_normal((1500, 12, 3))) if from_map
            else 1e-5 * generator.standard_normal(draws.shape))
@@ -174,7 +177,7 @@ def test_noise_of_positions(short_dipole, displaced, generator, quantity, from_m
     assert np.abs(np.eye(len(scale)) - covariance).max() > 0.5
     turned = short_dipole(**changes | {"noise": changes["noise"] | {
         "position_sd_m": POSITION_SD[-1:] + POSITION_SD[:-1]}})
-    other = reading_noise(turned, observation, data).covariance.toarray()
+    other = reading_noise(build_magnet(turned), observation, data).covariance.toarray()
     assert np.abs(other / scale - covariance).max() > 0.3
 
 
@@ -185,14 +188,15 @@ def test_one_value_for_all_axes(short_dipole):
 
     def noise(value):
         study = short_dipole(noise={"position_sd_m": value})
-        return reading_noise(study, observe(study, points, np.ones((12, 3), bool)), data)
+        return reading_noise(build_magnet(study), observe(study, points, np.ones((12, 3), bool)),
+                             data)
 
     one, three = noise(1e-4), noise([1e-4] * 3)
     np.testing.assert_array_equal(one.covariance.toarray(), three.covariance.toarray())
     assert one.sd.max() > 1e-4
     study = short_dipole(noise={"position_sd_m": 1e-4})
     with pytest.raises(StudyError, match="how noisy"):
-        reading_noise(study, observe(study, points, np.ones((12, 3), bool)),
+        reading_noise(build_magnet(study), observe(study, points, np.ones((12, 3), bool)),
                       data.drop_vars("sigma_T"))
 
 
@@ -209,7 +213,8 @@ def test_point_noise_propagates_to_fourier_coefficients(dipole, generator, equal
     if not equal:
         sigma[:, 0] = 3e-4  # Bx is worse than By
         sigma[:24] *= 1 + 0.8 * np.cos(np.arange(24))[:, None] ** 2
-    noise = reading_noise(study, observation, field_map(points, np.ones((48, 3)), sigma))
+    noise = reading_noise(build_magnet(study), observation,
+                          field_map(points, np.ones((48, 3)), sigma))
     draws = observation.apply(sigma * generator.standard_normal((4000, 48, 3)))
     scale = np.outer(noise.sd, noise.sd)
     found = noise.covariance.toarray()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.solver.getdp import find_getdp
@@ -21,7 +22,7 @@ def main() -> None:
     for name, study in CASES.items():
         points = points_of_case(study)
         with tempfile.TemporaryDirectory() as folder:
-            field = solve_nominal(study, points, Session(getdp, Path(folder), jobs=2))
+            field = solve_nominal(build_magnet(study), points, Session(getdp, Path(folder), jobs=2))
         write_map(field_map(points, field, attributes={"case": name, "getdp": getdp.version}),
                   FOLDER / f"{name}.h5")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.study.reader import parse_study
@@ -26,7 +27,7 @@ def stored(name):
 @pytest.mark.parametrize("name", CASES)
 def test_map_is_unchanged(name, session):
     study = CASES[name]
-    found = solve_nominal(study, points_of_case(study), session)
+    found = solve_nominal(build_magnet(study), points_of_case(study), session)
     assert difference(found, stored(name)) < tolerance(study)
 
 
@@ -35,7 +36,7 @@ def test_map_is_unchanged(name, session):
 def test_a_perturbed_model_fails(name, change, session):
     document = CASES[name].model_dump(exclude_none=True)
     study = parse_study(changed(document, **change))
-    found = solve_nominal(study, points_of_case(study), session)
+    found = solve_nominal(build_magnet(study), points_of_case(study), session)
     assert difference(found, stored(name)) > tolerance(study)
 
 
@@ -43,7 +44,7 @@ def test_a_perturbed_model_fails(name, change, session):
 def test_forgotten_iron_fails(name, session):
     """In 3D the direct field is not exact enough to show it; its reaction is."""
     study = CASES[name].with_(iron_ring=None)
-    found = solve_nominal(study, points_of_case(study), session)
+    found = solve_nominal(build_magnet(study), points_of_case(study), session)
     assert difference(found, stored(name)) > tolerance(study)
 
 
@@ -53,7 +54,7 @@ def test_linear_iron_in_place_of_the_curve_fails(permeability, session):
     document["iron_ring"] = {"inner_radius_m": 0.19, "outer_radius_m": 0.192,
                              "relative_permeability": permeability}
     study = parse_study(document)
-    found = solve_nominal(study, points_of_case(study), session)
+    found = solve_nominal(build_magnet(study), points_of_case(study), session)
     assert difference(found, stored("dipole_2d_saturated")) > tolerance(study)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report import view
 from halbach_fe.report.view import Colours, Known, magnet_view, prism, residuals
 from halbach_fe.study.reader import read_study
@@ -23,7 +23,7 @@ def study_of(name):
 
 
 def known_of(study):
-    blocks = blocks_of(study)
+    blocks = build_magnet(study).blocks
     percent = np.linspace(-2, 2, len(blocks))
     return Known(np.array([block.magnetization[:study.dimension] for block in blocks]), Colours(
         percent, "in %", [f"{one:+.2f} ± 0.40 %" for one in percent]))
@@ -88,7 +88,8 @@ def words(page):
 def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     study = study_of("quadrupole")
     known = known_of(study)
-    shown = page(magnet_view(study, known, residuals(np.zeros((1, 3)), np.array([2.5]))))
+    shown = page(
+        magnet_view(build_magnet(study), known, residuals(np.zeros((1, 3)), np.array([2.5]))))
     assert coloured(shown) > 20_000
     found = words(shown)
     own = [one for one in found if "ring 1, slot" in one]
@@ -105,7 +106,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
 @pytest.mark.parametrize("name", STUDIES)
 def test_studies_are_shown(page, name):
     study = study_of(name)
-    shown = page(magnet_view(study, known_of(study)))
+    shown = page(magnet_view(build_magnet(study), known_of(study)))
     whole = coloured(shown)
     shown.evaluate("Plotly.restyle('magnet-view', {visible: false}, [0])")
     assert coloured(shown) < 0.2 * whole  # the iron stays
@@ -114,15 +115,15 @@ def test_studies_are_shown(page, name):
 def test_of_too_many_blocks_neighbouring_rings_are_one(short_dipole, monkeypatch):
     """What changed most in them is shown, and the whole length."""
     study = short_dipole(array__rings=7, array__recoil_permeability=1.0)
-    blocks = blocks_of(study)
+    blocks = build_magnet(study).blocks
     values = np.zeros(len(blocks))
     values[16 * 3 + 4], values[16 * 6 + 1] = -5.0, 2.0  # ring 4, slot 5; ring 7, slot 2
     known = Known(np.array([block.magnetization for block in blocks]), Colours(
         values, "change", [f"{one:g} %" for one in values]))
-    every, _ = view._few(study, known)
+    every, _ = view._few(build_magnet(study), known)
     assert len(every) == len(blocks)
     monkeypatch.setattr(view, "MOST_BLOCKS", 40)
-    few, shown = view._few(study, known)
+    few, shown = view._few(build_magnet(study), known)
     assert len(few) == len(shown.magnetization) == len(shown.colours.words) == 48  # rings by three
     assert shown.colours.values[16 + 4] == -5.0
     assert shown.colours.words[16 + 4] == "most in ring 4: -5 %"
@@ -136,7 +137,7 @@ def test_of_too_many_blocks_neighbouring_rings_are_one(short_dipole, monkeypatch
 @pytest.mark.parametrize("name", STUDIES)
 def test_surface_of_a_block_is_closed_and_has_its_volume(name):
     study = study_of(name)
-    for block in blocks_of(study)[:5]:
+    for block in build_magnet(study).blocks[:5]:
         points, faces = prism(block, 0.01)
         edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         _, count = np.unique(edges, axis=0, return_counts=True)

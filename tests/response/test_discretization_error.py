@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import HalbachWarning
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import observe
@@ -24,13 +25,13 @@ def bars(study, session):
     """Error bars and actual readings of a 2D study, and the readings of the closed form."""
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool) & [True, True, False])
-    part = finite_element_part(study, points, session, columns=False)
+    part = finite_element_part(build_magnet(study), points, session, columns=False)
     iron = study.iron_ring and (0.19, 0.2, 1000.0)
     truth = np.zeros_like(points)
     truth[:, :2] = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
                                       1.05, points[:, :2], iron)
-    found = observation.apply(vacuum_part(study, points) + part.nominal)
-    return (reading_errors(study, observation, part, session),
+    found = observation.apply(vacuum_part(build_magnet(study), points) + part.nominal)
+    return (reading_errors(build_magnet(study), observation, part, session),
             np.abs(found - observation.apply(truth)))
 
 
@@ -62,9 +63,10 @@ def test_dual_formulations_bracket_the_modes(short_dipole, session):
     study = short_dipole(solver__route="scalar_potential", **changes)
     points = np.vstack([circle(0.05, 7, z, 0.2 + z) for z in (-0.12, -0.03, 0.0, 0.05, 0.11)])
     observation = observe(study, points, np.ones_like(points, bool))
-    parts = finite_element_part(study, points, session, columns=False)
-    part, stated = parts.nominal, reading_errors(study, observation, parts, session)
-    truth = finite_element_part(short_dipole(mesh__meridian_size_m=0.01), points, session,
+    parts = finite_element_part(build_magnet(study), points, session, columns=False)
+    part, stated = parts.nominal, reading_errors(build_magnet(study), observation, parts, session)
+    truth = finite_element_part(build_magnet(short_dipole(mesh__meridian_size_m=0.01)), points,
+                                session,
                                 columns=False).nominal
     assert np.mean(np.abs(part - truth).ravel() <= stated) > 0.95
     assert stated.max() < 0.3 * np.abs(part).max()
@@ -76,9 +78,10 @@ def test_the_error_is_part_of_the_inference(dipole, session):
                    noise={"regions": [{"name": "all", "sigma_T": 1e-9}]},
                    observation__components=["x", "y"])
     points = points_from(study.observation.positions)
-    field = vacuum_part(study, points) + finite_element_part(study, points, session,
+    field = vacuum_part(build_magnet(study), points) + finite_element_part(build_magnet(study),
+                                                                           points, session,
                                                             columns=False).nominal
-    update = infer(study, field_map(points, field), session)
+    update = infer(build_magnet(study), field_map(points, field), session)
     error = update.response.error
     assert error.min() > 1e-7
     np.testing.assert_allclose(update.sigma, np.hypot(1e-9, error))
@@ -87,6 +90,6 @@ def test_the_error_is_part_of_the_inference(dipole, session):
 
 def test_readings_near_the_boundary_are_warned_of(dipole):
     study = dipole(open_boundary={"radius_m": 1.0})
-    check_points(study, circle(0.5))
+    check_points(build_magnet(study), circle(0.5))
     with pytest.warns(HalbachWarning, match="half-way from the magnet to the boundary"):
-        check_points(study, circle(0.8))
+        check_points(build_magnet(study), circle(0.8))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.verification import verdict, write_verification
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
@@ -28,9 +29,9 @@ def test_stated_error_covers_the_true_one(dipole, session, method, iron):
     tube = None if iron is None else (0.19, 0.2, 1000.0)
     expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
                                   1.05, points[:, :2], tube)
-    found = solve_nominal(study, points, session)[:, :2]
+    found = solve_nominal(build_magnet(study), points, session)[:, :2]
     true = np.linalg.norm(found - expected, axis=1).max() / np.abs(expected).max()
-    stated = verify(study, session)
+    stated = verify(build_magnet(study), session)
     assert true < stated.error_pointwise < 30 * true
 
 
@@ -40,7 +41,7 @@ def test_coarse_meshes_are_told_from_fine_ones(short_dipole, session):
         "kind": "circles", "radius_m": 0.05, "angles": 5, "z_min_m": -0.1, "z_max_m": 0.1,
         "count": 3}}
     study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.012, observation=observation)
-    fine, coarse = verify(study, session), verify(refined(study, 0.4), session)
+    fine, coarse = verify(build_magnet(study), session), verify(refined(study, 0.4), session)
     assert fine.route == "azimuthal_modes"
     assert coarse.error_pointwise > 3 * fine.error_pointwise
     assert fine.error_pointwise < 1e-3
@@ -53,7 +54,7 @@ def test_several_circles_and_regions(dipole, session):
     study = dipole(iron_ring=IRON, noise={"regions": regions}, observation__components=["x", "y"],
                    observation__positions={"kind": "circles", "radius_m": [0.05, 0.075],
                                            "angles": 12})
-    found = verify(study, session).differences[0]
+    found = verify(build_magnet(study), session).differences[0]
     assert list(found.by_region) == ["bore"]
     assert found.by_region["bore"] == found.pointwise
     assert 0 < found.fourier < found.pointwise
@@ -61,7 +62,7 @@ def test_several_circles_and_regions(dipole, session):
 
 def test_other_geometries_get_the_dual_route(short_dipole, session):
     study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04)
-    found = verify(study, session)
+    found = verify(build_magnet(study), session)
     assert found.route == "scalar_potential"
     assert found.differences[-1].what == "dual route, edge_elements"
     assert 1e-5 < found.differences[-1].pointwise < 0.02
@@ -100,12 +101,12 @@ def test_verify_from_the_command_line(tmp_path, capsys):
 def test_a_field_without_finite_elements(dipole, session, tmp_path):
     """In vacuum the reaction is nothing: no figure of convergence, and a verdict that says so."""
     study = dipole(array__recoil_permeability=1.0)
-    found = verify(study, session)
-    assert "exact one of the blocks" in verdict(study, found)
-    write_verification(study, found, tmp_path, {})
+    found = verify(build_magnet(study), session)
+    assert "exact one of the blocks" in verdict(build_magnet(study), found)
+    write_verification(build_magnet(study), found, tmp_path, {})
     page(tmp_path / "verification.html")
     assert not (tmp_path / "verification_convergence.png").exists()
     # negative control: a mesh whose refinement does not help is warned of
     stuck = replace(found, order=0.5, error_pointwise=0.01)
-    write_verification(study, stuck, tmp_path, {})
+    write_verification(build_magnet(study), stuck, tmp_path, {})
     assert "the mesh should be finer" in page(tmp_path / "verification.html")

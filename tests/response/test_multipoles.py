@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.matrix import response_matrix
@@ -52,7 +53,7 @@ def deviating(study, generator):
 def test_the_cross_section_is_magpylibs(session, generator, order):
     """Both fields are exact: 1e-8 of the main multipole, what sums over angles leave."""
     study = study_of(array__multipole_order=order, array__first_magnetization_angle_deg=70.0)
-    model = multipole_model(study, MultipoleReference(0.06, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(0.06, ORDERS), session)
     bodies, magnetizations = deviating(study, generator)
     angle = 2 * np.pi * np.arange(200) / 200
     points = 0.06 * np.column_stack([np.cos(angle + model.turn), np.sin(angle + model.turn),
@@ -75,7 +76,7 @@ def test_the_cross_section_is_magpylibs(session, generator, order):
     roll = -np.angle(fourier(field, angle, order)) / order
     assert known.roll == pytest.approx(roll, abs=1e-8)
     # negative control: another reference radius
-    other = multipole_model(study, MultipoleReference(0.066, ORDERS), session).of(
+    other = multipole_model(build_magnet(study), MultipoleReference(0.066, ORDERS), session).of(
         Gaussian(magnetizations, np.zeros((len(magnetizations), 1))))
     assert np.abs(other.mean - known.mean).max() > 1
 
@@ -87,7 +88,7 @@ def test_a_short_magnet_integrated_along_z(session, generator):
     study = parse_study(changed(
         DIPOLE, dimension=3, array__recoil_permeability=1.0, array__blocks_per_ring=8,
         array__ring_length_m=0.08, array__rings=2))
-    model = multipole_model(study, MultipoleReference(0.05, (2, 3, 4)), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(0.05, (2, 3, 4)), session)
     assert model.integrated
     bodies, magnetizations = deviating(study, generator)
     angle = 2 * np.pi * np.arange(32) / 32
@@ -110,7 +111,7 @@ def test_a_short_magnet_integrated_along_z(session, generator):
     np.testing.assert_allclose(found[0] + 1j * found[1], relative, atol=0.02)
     assert np.abs(relative).max() > 10
     # negative control: the circle in the middle is not the integral
-    local = multipole_model(study, MultipoleReference(0.05, (2, 3, 4), 0.0), session)
+    local = multipole_model(build_magnet(study), MultipoleReference(0.05, (2, 3, 4), 0.0), session)
     assert not local.integrated
     middle = local.of(Gaussian(magnetizations, np.zeros((len(magnetizations), 1)))).mean
     assert np.abs(middle - known.mean).max() > 1
@@ -121,7 +122,7 @@ def test_covariances_are_those_of_samples(session, generator):
     largest variance (sqrt(2/4000) = 2.2 %).
     """
     study = study_of()
-    model = multipole_model(study, MultipoleReference(0.06, ORDERS), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(0.06, ORDERS), session)
     root = 0.01 * np.abs(model.nominal).max() * generator.standard_normal((24, 24)) / 5
     drawn = Gaussian(model.nominal, root).sample(4000, generator)
     values = model.units(model.offset + drawn @ model.matrix.T)
@@ -143,17 +144,17 @@ def test_covariances_are_those_of_samples(session, generator):
 
 
 def test_the_radius_is_that_of_the_studys_circle(session):
-    assert multipole_model(study_of(), MultipoleReference(), session).radius == 0.075
+    assert multipole_model(build_magnet(study_of()), MultipoleReference(), session).radius == 0.075
     line = study_of(observation__positions={
         "kind": "line", "start_m": [0, 0, 0], "end_m": [0.05, 0, 0], "count": 3})
-    assert multipole_model(line, MultipoleReference(),
+    assert multipole_model(build_magnet(line), MultipoleReference(),
                            session).radius == pytest.approx(0.104 * 2 / 3)
 
 
 def test_what_the_mapper_does_is_no_multipole(session):
     """The reference circle is no measurement: a probe's gain does not come into it."""
     study = study_of(instrument={"gain": [0.1, 0.0, 0.0], "offset_T": [0.01, 0, 0]})
-    one, other = (multipole_model(some, MultipoleReference(0.06, ORDERS), session)
+    one, other = (multipole_model(build_magnet(some), MultipoleReference(0.06, ORDERS), session)
                   for some in (study, study_of()))
     np.testing.assert_array_equal(one.matrix, other.matrix)
 
@@ -161,7 +162,7 @@ def test_what_the_mapper_does_is_no_multipole(session):
 def test_permeability_and_its_error(session):
     """A symmetric dipole has no unwanted multipoles; the error bar allows for those of the mesh."""
     study = parse_study(DIPOLE)
-    model = multipole_model(study, MultipoleReference(0.06, (3, 5)), session)
+    model = multipole_model(build_magnet(study), MultipoleReference(0.06, (3, 5)), session)
     assert model.error.max() > 0
     known = model.of(Gaussian(model.nominal, np.zeros((32, 1))))
     assert np.abs(known.mean).max() < 3 * known.sd.max()
@@ -177,7 +178,8 @@ def circles_of(study, session, measured=None):
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool) if measured is None
                           else measured)
-    return circle_models(study, observation, response_matrix(study, observation, session))
+    return circle_models(build_magnet(study), observation,
+                         response_matrix(build_magnet(study), observation, session))
 
 
 @pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
@@ -228,9 +230,9 @@ def test_references_solved_together(session):
     """Are the same as one by one."""
     study = study_of(**RINGS)
     wanted = MultipoleReference(0.05, (2, 3)), MultipoleReference(0.05, (2, 4), 0.02)
-    together = multipole_models(study, wanted, session)
+    together = multipole_models(build_magnet(study), wanted, session)
     for one, reference in zip(together, wanted, strict=True):
-        alone = multipole_model(study, reference, session)
+        alone = multipole_model(build_magnet(study), reference, session)
         np.testing.assert_allclose(one.matrix, alone.matrix, rtol=1e-12, atol=1e-20)
         assert (one.orders, one.z, one.integrated) == (alone.orders, alone.z, alone.integrated)
     assert together[0].integrated

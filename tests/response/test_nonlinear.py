@@ -18,7 +18,7 @@ import pytest
 
 from halbach_fe.core.errors import EXIT_CODES, GetDPError, NotConvergedError
 from halbach_fe.core.files import make_folder
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
@@ -91,7 +91,7 @@ def saturated(getdp, tmp_path_factory) -> Magnet:
     session = Session(getdp, tmp_path_factory.mktemp("saturated"), jobs=2)
     observation = observation_of(study)
     return Magnet(study, observation, nonlinear_model(
-        study, observation, session, np.random.default_rng(1)), session)
+        build_magnet(study), observation, session, np.random.default_rng(1)), session)
 
 
 def test_the_fixture_saturates(saturated):
@@ -126,7 +126,7 @@ def errors_of(differences, derivative):
 @pytest.fixture(scope="module")
 def change(saturated):
     """1 % of M in random directions, (1, blocks, 3) in A/m."""
-    nominal = nominal_samples(saturated.study)
+    nominal = nominal_samples(build_magnet(saturated.study))
     found = np.zeros_like(nominal)
     found[..., :2] = (0.01 * np.linalg.norm(nominal[0, 0])
                       * np.random.default_rng(3).standard_normal((1, 16, 2)))
@@ -138,8 +138,8 @@ def gateaux(saturated, change):
     """The derivative of the reaction along the change and along the nominal magnetization, by
     GetDP's Gateaux problem, (n, 3) in T.
     """
-    blocks = blocks_of(saturated.study)
-    field, columns = solve_tangent(saturated.study, saturated.observation.points,
+    blocks = build_magnet(saturated.study).blocks
+    field, columns = solve_tangent(build_magnet(saturated.study), saturated.observation.points,
                                    range(len(blocks)), saturated.session, CROSS_SECTION)
     units = columns[1:].reshape(len(blocks), 2, -1, 3)
     mu = saturated.study.array.recoil_permeability
@@ -148,7 +148,7 @@ def gateaux(saturated, change):
 
 
 def solved(saturated, samples):
-    return solve_samples(saturated.study, saturated.observation.points, samples,
+    return solve_samples(build_magnet(saturated.study), saturated.observation.points, samples,
                          saturated.session, CROSS_SECTION, tolerance=1e-13)
 
 
@@ -156,7 +156,8 @@ def test_gateaux_problem_against_central_differences(saturated, change, gateaux)
     """Relative to the derivative of the reaction alone, the harsher measure; see RATIOS."""
     along_change, along_nominal, field = gateaux
     errors = errors_of(central(functools.partial(solved, saturated),
-                               nominal_samples(saturated.study), change), along_change)
+                               nominal_samples(build_magnet(saturated.study)), change),
+                       along_change)
     assert min(errors) < 1e-7
     assert errors[1] < 1e-6
     assert errors[1] < errors[0] / 1e3  # of second order: 1e4 but for rounding
@@ -189,7 +190,7 @@ def test_jacobian_of_the_condensed_engine_against_central_differences(saturated,
         assert min(errors) < 1e-7
         assert errors[1] < 1e-6
         assert errors[1] < errors[0] / 1e3
-    built = response_matrix(saturated.study, saturated.observation, saturated.session)
+    built = response_matrix(build_magnet(saturated.study), saturated.observation, saturated.session)
     jacobian = model.jacobian(model.nominal)
     assert np.abs(built.matrix - jacobian).max() < 1e-11 * np.abs(jacobian).max()
     # negative control: the jacobian elsewhere, where other iron is saturated
@@ -212,10 +213,10 @@ def test_highly_permeable_tube_against_shielded_multipoles(dipole, session, orde
             "kind": "froehlich_kennelly", "saturation_polarization_T": saturation,
             "initial_relative_permeability": 3e5 if saturation > 1 else 1e4}})
         observation = observation_of(study)
-        part = finite_element_part(study, observation.points, session, columns=False)
-        bar = reading_errors(study, observation, part, session) if bars else None
+        part = finite_element_part(build_magnet(study), observation.points, session, columns=False)
+        bar = reading_errors(build_magnet(study), observation, part, session) if bars else None
         return observation, observation.apply(
-            vacuum_part(study, observation.points) + part.nominal), bar
+            vacuum_part(build_magnet(study), observation.points) + part.nominal), bar
 
     observation, found, bar = readings(2.4, True)
     truth = np.zeros_like(observation.points)
@@ -270,8 +271,8 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     points = np.vstack([circle(0.06, 8, z, 0.2 + z) for z in (0.0, 0.04, 0.09)])
     session = Session(getdp, tmp_path, jobs=2)
     observation = observe(study, points, np.ones_like(points, bool))
-    part = finite_element_part(study, points, session, columns=False)
-    bar = reading_errors(study, observation, part, session)
+    part = finite_element_part(build_magnet(study), points, session, columns=False)
+    bar = reading_errors(build_magnet(study), observation, part, session)
     assert 1.6 < observed_order(history(tmp_path / "getdp-real")[0]) < 2.5
     dipole, iron = dipole_of(study), law_of(study.iron_ring)
     with ngsolve.TaskManager():
@@ -312,7 +313,8 @@ def fields_at(study, points, session):
     """B (n, 2) anywhere."""
     flat = np.zeros((len(points), 3))
     flat[:, :2] = points
-    return solve_tangent(study, flat, (), session, CROSS_SECTION, anywhere=True)[0][:, :2]
+    return solve_tangent(build_magnet(study), flat, (), session, CROSS_SECTION,
+                         anywhere=True)[0][:, :2]
 
 
 @pytest.mark.parametrize("ring", [THIN, THICK], ids=["saturated", "thick"])
@@ -324,7 +326,7 @@ def test_energy_balance(dipole, session, ring):
     where H rises steeply. With linear iron in place of the curve it is 0.53 and 0.011.
     """
     study = dipole(**alike(20.0) | {"iron_ring": ring, "solver": {"method": "direct"}})
-    mesh = verify_mesh(build_mesh(study, make_folder(session.folder)))
+    mesh = verify_mesh(build_mesh(build_magnet(study), make_folder(session.folder)))
     nodes, weights = gauss(4)
     reference = np.array([(a, b * (1 - a)) for a in nodes for b in nodes])
     own = np.array([s * t * (1 - a) for a, s in zip(nodes, weights, strict=True) for t in weights])
@@ -399,7 +401,7 @@ def test_newton_converges_quadratically(saturated):
     """The order of the last three residuals above rounding: measured 1.9, and 0.9 where the tangent
     is frozen (below).
     """
-    solved(saturated, nominal_samples(saturated.study))
+    solved(saturated, nominal_samples(build_magnet(saturated.study)))
     residuals = history(saturated.session.folder / "getdp-real")[0]
     assert residuals[0] == pytest.approx(1.0)  # from zero: nothing but the right-hand side
     assert residuals[-1] <= 1e-13
@@ -439,7 +441,8 @@ def test_a_newton_that_does_not_converge_says_so(saturated, tmp_path, monkeypatc
     """
     def attempt(steps):
         return solve_samples(
-            saturated.study, saturated.observation.points, nominal_samples(saturated.study),
+            build_magnet(saturated.study), saturated.observation.points,
+            nominal_samples(build_magnet(saturated.study)),
             replace(saturated.session, folder=tmp_path), replace(
                 CROSS_SECTION, numbers={"MAX_STEPS": steps}))
 
@@ -480,18 +483,19 @@ def test_condensed_engine_against_getdp_at_200_magnetizations(getdp, tmp_path, g
         DIPOLE, **alike(20.0), iron_ring={**THIN, "curve": TABLE}, solver={"method": "direct"},
         mesh={"block_size_m": 0.04, "growth": 2.0}))
     session, observation = Session(getdp, tmp_path, jobs=2), observation_of(study)
-    model = nonlinear_model(study, observation, session, generator)
+    model = nonlinear_model(build_magnet(study), observation, session, generator)
     size = np.linalg.norm(model.nominal[:2])
     near = model.nominal + 0.03 * size * generator.standard_normal((120, 32))
     far = np.concatenate([8e5 * generator.standard_normal((30, 32)), directions(generator, 20)])
     cold = np.concatenate([model.nominal + 0.03 * size * generator.standard_normal((10, 32)),
                            8e5 * generator.standard_normal((10, 32)), directions(generator, 10)])
-    assert compare_with_newton(model, study, observation, session,
+    assert compare_with_newton(model, build_magnet(study), observation, session,
                                np.concatenate([near, far])) <= AGREEMENT_T
     steps = history(session.folder / "verified" / "getdp-real")
     assert len(steps) == 170
     assert all(residuals[-1] <= 1e-10 for residuals in steps)
-    assert compare_with_newton(model, study, observation, session, cold, cold=True) <= AGREEMENT_T
+    assert compare_with_newton(model, build_magnet(study), observation, session, cold,
+                               cold=True) <= AGREEMENT_T
     steps = history(session.folder / "verified" / "getdp-real")
     assert [residuals[0] for residuals in steps] == pytest.approx([1.0] * 30)
     for sample in cold:  # Newton's method alone, from zero
@@ -517,7 +521,8 @@ def test_a_wrong_model_is_refused(saturated, part):
     wrong = replace(saturated.model, condensed=replace(
         condensed, weights=weights, potential=potential, law=law))
     with pytest.raises(GetDPError, match="from GetDP's own Newton"):
-        compare_with_newton(wrong, saturated.study, saturated.observation, saturated.session,
+        compare_with_newton(wrong, build_magnet(saturated.study), saturated.observation,
+                            saturated.session,
                saturated.model.nominal[None])
     assert saturated.model.agreement_T <= AGREEMENT_T  # the right one was not
 
@@ -542,10 +547,10 @@ def test_condensed_engine_in_3d(getdp, tmp_path, generator):
         open_boundary={"radius_m": 0.5, "half_length_m": 0.4},
         observation__positions={"kind": "circles", "radius_m": 0.05, "angles": 6}))
     session, observation = Session(getdp, tmp_path, jobs=2), observation_of(study)
-    model = nonlinear_model(study, observation, session, generator)
+    model = nonlinear_model(build_magnet(study), observation, session, generator)
     assert model.condensed.iron_field(model.nominal).max() > 0.01
     samples = 8e5 * generator.standard_normal((2, 12))
-    assert compare_with_newton(model, study, observation, session, samples,
+    assert compare_with_newton(model, build_magnet(study), observation, session, samples,
                                cold=True) <= AGREEMENT_T
     potential = model.condensed.potential.copy()
     potential[:, 3] *= 1.001
@@ -569,7 +574,7 @@ def test_recoil_permeability_across_against_ngsolve(dipole, session, generator):
     """
     study = dipole(array__recoil_permeability_across=1.15)
     observation = observation_of(study)
-    built = response_matrix(study, observation, session)
+    built = response_matrix(build_magnet(study), observation, session)
     assert built.superposition_error < 1e-9
     magnet = magnet_of(study)
     changed_by = 0.1 * np.linalg.norm(built.nominal[:2]) * generator.standard_normal((16, 2))

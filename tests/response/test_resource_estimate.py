@@ -13,6 +13,7 @@ import pytest
 from benchmarks.memory import Weighed
 from halbach_fe import geo
 from halbach_fe.geo import cross_section
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
@@ -68,32 +69,33 @@ def studies(dipole, short_dipole):
 @pytest.mark.parametrize("name", ["cross-section", "modes", "symmetry", "second order"])
 def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
     study = studies[name]
-    kind = MESHES[choose_route(study, observation_of(study).points)]
+    kind = MESHES[choose_route(build_magnet(study), observation_of(study).points)]
     build = mesh.build_meridian if kind == "meridian" else mesh.build_mesh
     real = mesh.verify_mesh(build(study, tmp_path))
-    found = resource_estimate.counted(study, kind)
+    found = resource_estimate.counted(build_magnet(study), kind)
     assert (found.elements, found.inner, found.axis) == (len(real.cells), real.inner, real.axis)
 
 
 @pytest.mark.parametrize(("source", "finer"), [("quadrupole", 1), ("mri", 2), ("nonlinear-2d", 1)])
 def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
-    study = refined(read_study(ROOT / "studies" / source / "study.toml"), finer)
+    study = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
     kind = "cross_section" if study.dimension == 2 else "extruded"
     monkeypatch.setattr(cross_section, "COUNTED", np.inf)
-    real, rim = geo.plane_size(study, kind)
+    real, rim = geo.plane_size(build_magnet(study), kind)
     monkeypatch.setattr(cross_section, "COUNTED", real / 4)
-    found, its_rim = geo.plane_size(study, kind)
+    found, its_rim = geo.plane_size(build_magnet(study), kind)
     assert found != real
     assert within(COUNT_FACTOR, found, real)
     assert within(1.5, its_rim, rim)  # a few of thousands
-    assert not within(COUNT_FACTOR, geo.plane_size(refined(study, 1.15), kind)[0], real)
+    assert not within(COUNT_FACTOR, geo.plane_size(refined(build_magnet(study), 1.15), kind)[0],
+                      real)
 
 
 def test_large_rings_are_drawn_in_part(studies, monkeypatch):
     study = studies["many blocks"]
-    found, _ = geo.plane_size(study, "cross_section")
+    found, _ = geo.plane_size(build_magnet(study), "cross_section")
     monkeypatch.setattr(cross_section, "DRAWN", 512)
-    real, _ = geo.plane_size(study, "cross_section")
+    real, _ = geo.plane_size(build_magnet(study), "cross_section")
     assert found != real
     assert within(COUNT_FACTOR, found, real)
 
@@ -105,9 +107,9 @@ def test_the_runs_are_those_foretold(studies, name, session):
     session = replace(
         session, run=lambda getdp, job, *more: jobs.append(job) or run(getdp, job, *more))
     observation = observation_of(study)
-    parts = finite_element_part(study, observation.points, session)
-    reading_errors(study, observation, parts, error_bar_session(session))
-    estimate = resource_estimate.estimate_infer(study, observation, session.jobs)
+    parts = finite_element_part(build_magnet(study), observation.points, session)
+    reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
+    estimate = resource_estimate.estimate_infer(build_magnet(study), observation, session.jobs)
     real = sorted((job.unknowns, job.solves) for job in jobs)
     foretold = sorted((one.unknowns, one.solves) for one in estimate.problems
                       for _ in range(one.processes) if one.what != "the updated magnet")
@@ -135,11 +137,14 @@ def test_the_memory_of_getdp(dipole, short_dipole, weighed, route, changes):
     study = (dipole if route == "cross_section" else short_dipole)(**changes)
     points = observation_of(study).points
     session, scales = weighed
-    finite_element_part(study, points, session, columns=False)
+    finite_element_part(build_magnet(study), points, session, columns=False)
     peak = scales.peak
-    foretold = [max(one.memory_GiB for one in resource_estimate.nominal(variant, points, jobs=1))
-                for variant in (study, refined(study, 1.5), refined(study, 1 / 1.5))]
-    assert {problem.route for problem in resource_estimate.nominal(study, points, jobs=1)} == {
+    foretold = [max(one.memory_GiB
+                    for one in resource_estimate.nominal(build_magnet(variant), points, jobs=1))
+                for variant in (study, refined(build_magnet(study), 1.5),
+                                refined(build_magnet(study), 1 / 1.5))]
+    assert {problem.route for problem in resource_estimate.nominal(build_magnet(study), points,
+                                                                   jobs=1)} == {
         route}
     assert within(MEMORY_FACTOR, foretold[0], peak)
     assert not within(MEMORY_FACTOR, foretold[1], peak)
@@ -149,10 +154,10 @@ def test_the_memory_of_getdp(dipole, short_dipole, weighed, route, changes):
 def test_finer_and_more_takes_more(studies):
     study = studies["symmetry"]
     observation = observation_of(study)
-    base, finer = (resource_estimate.estimate_solve(one, observation, 1)
-                   for one in (study, refined(study, 1.5)))
-    more_jobs = resource_estimate.estimate_solve(study, observation, 2)
-    columns = resource_estimate.estimate_infer(study, observation, 1)
+    base, finer = (resource_estimate.estimate_solve(build_magnet(one), observation, 1)
+                   for one in (study, refined(build_magnet(study), 1.5)))
+    more_jobs = resource_estimate.estimate_solve(build_magnet(study), observation, 2)
+    columns = resource_estimate.estimate_infer(build_magnet(study), observation, 1)
     for name in ("memory_GiB", "disk_GiB", "own_memory_GiB"):
         assert getattr(finer, name) > getattr(base, name)
         assert getattr(columns, name) >= getattr(base, name)
@@ -166,7 +171,8 @@ def test_a_large_matrix_stays_on_the_disk():
         study = parse_study(long_dipole(125, circles))
         points = points_from(study.observation.positions)
         observation = observe(study, points, np.ones_like(points, bool))
-        return resource_estimate.estimate_infer(study, observation, jobs=1), 8 * 6000 * len(
+        return resource_estimate.estimate_infer(build_magnet(study), observation,
+                                                jobs=1), 8 * 6000 * len(
             observation) / resource_estimate.GIB
 
     few, few_matrix = foretold(42)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes
@@ -32,7 +32,7 @@ def modes(short_dipole):
 
 def columns_in_vacuum(study, points):
     return np.concatenate([np.moveaxis(unit_field(block, points), 2, 0)
-                           for block in blocks_of(study)])
+                           for block in build_magnet(study).blocks])
 
 
 def test_every_column_against_its_exact_field(modes, session):
@@ -42,7 +42,7 @@ def test_every_column_against_its_exact_field(modes, session):
     """
     study = modes(array__recoil_permeability=1.0, solver__method="direct")
     points = np.vstack([POINTS, AXIS])
-    found = azimuthal_modes.solve_modes(study, points, range(32), session)[1:]
+    found = azimuthal_modes.solve_modes(build_magnet(study), points, range(32), session)[1:]
     exact = columns_in_vacuum(study, points)
     scale = np.abs(exact).max(axis=(1, 2))
     error = np.abs(found - exact).max(axis=(1, 2)) / scale
@@ -56,9 +56,9 @@ def test_runs_of_few_modes_do_the_same(modes, session, monkeypatch):
     study = modes(array__recoil_permeability=1.1)
 
     def columns():
-        return azimuthal_modes.solve_modes(study, POINTS, [0], session)
+        return azimuthal_modes.solve_modes(build_magnet(study), POINTS, [0], session)
 
-    weights = azimuthal_modes.nominal_waves(study, 4)
+    weights = azimuthal_modes.nominal_waves(build_magnet(study), 4)
     assert azimuthal_modes.spans_of(weights, True, 1) == [(0, 0), (1, 4)]
     together = columns()
     monkeypatch.setattr(azimuthal_modes, "SOLVED_NUMBERS", 2)
@@ -78,7 +78,7 @@ def test_a_missing_mode_is_seen(modes, session, monkeypatch, missing):
         return superpose(case, modes | {missing: 0 * modes[missing]}, *arguments)
 
     monkeypatch.setattr(azimuthal_modes, "_superpose", incomplete)
-    found = azimuthal_modes.solve_modes(study, POINTS, range(32), session)[1:]
+    found = azimuthal_modes.solve_modes(build_magnet(study), POINTS, range(32), session)[1:]
     exact = columns_in_vacuum(study, POINTS)
     assert np.abs(found - exact).max() / np.abs(exact).max() > 0.05
 
@@ -90,8 +90,8 @@ def test_reaction_against_3d_routes(modes, session, route, cap):
     """
     changes = {"mesh__block_size_m": 0.02, "mesh__layers_per_ring": 4, "mesh__growth": 1.8}
     fast, slow = modes(**changes), modes(solver__route=route, **changes)
-    one = finite_element_part(fast, POINTS, session, columns=False).nominal
-    two = finite_element_part(slow, POINTS, session, columns=False).nominal
+    one = finite_element_part(build_magnet(fast), POINTS, session, columns=False).nominal
+    two = finite_element_part(build_magnet(slow), POINTS, session, columns=False).nominal
     scale = np.sqrt(np.mean(one**2))
     assert np.sqrt(np.mean((one - two) ** 2)) < cap * scale
     assert np.sqrt(np.mean((one + two) ** 2)) > 1.5 * scale
@@ -107,7 +107,7 @@ def test_middle_of_a_long_array_against_closed_form(modes, session, iron):
     tube = None if iron is None else (0.19, 0.2, 1000.0)
     expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
                                   1.05, points[:, :2], tube)
-    found = solve_nominal(study, points, session)
+    found = solve_nominal(build_magnet(study), points, session)
     assert np.abs(found[:, :2] - expected).max() < 1.2e-4 * np.abs(expected).max()
     assert np.abs(found[:, 2]).max() < 1e-7 * np.abs(expected).max()
 
@@ -116,7 +116,8 @@ def test_refinement_converges(modes, session):
     """The nominal field with iron on three meshes: each step is at least twice smaller.
     Measured 8.8e-5 and 4.1e-5 of the field.
     """
-    fields = [solve_nominal(modes(iron_ring=IRON, mesh__meridian_size_m=size), POINTS, session)
+    fields = [solve_nominal(build_magnet(modes(iron_ring=IRON, mesh__meridian_size_m=size)),
+                            POINTS, session)
               for size in (0.04, 0.02, 0.01)]
     steps = [np.abs(b - a).max() for a, b in pairwise(fields)]
     assert steps[1] < steps[0] / 2
@@ -126,7 +127,8 @@ def test_refinement_converges(modes, session):
 def test_superposition_of_rings(modes, session):
     """Columns add up to the nominal array, which was solved with all rings at once."""
     study = modes(iron_ring=IRON)
-    built = response_matrix(study, observe(study, POINTS, np.ones((len(POINTS), 3), bool)), session)
+    built = response_matrix(build_magnet(study),
+                            observe(study, POINTS, np.ones((len(POINTS), 3), bool)), session)
     assert built.superposition_error < 1e-9
 
 
@@ -136,8 +138,8 @@ def test_ring_gaps_and_turned_arrays(modes, session):
     """
     study = modes(array__ring_gap_m=0.01, array__recoil_permeability=1.0, solver__method="direct",
                   array__first_block_angle_deg=17.0, array__first_magnetization_angle_deg=71.0)
-    found = azimuthal_modes.solve_modes(study, POINTS, (), session)[0]
-    exact = field_of(blocks_of(study), POINTS)
+    found = azimuthal_modes.solve_modes(build_magnet(study), POINTS, (), session)[0]
+    exact = field_of(build_magnet(study).blocks, POINTS)
     assert np.abs(found - exact).max() < 1.5e-3 * np.abs(exact).max()
 
 
@@ -148,42 +150,45 @@ def test_one_block_of_another_remanence(modes, session, slot):
     """
     study = modes(array__recoil_permeability=1.0, solver__method="direct",
                   array__exceptions=[{"ring": 1, "slot": slot, "remanence_T": 1.9}])
-    found = solve_nominal(study, POINTS, session)
-    exact = field_of(blocks_of(study), POINTS)
-    ordinary = field_of(blocks_of(modes(array__recoil_permeability=1.0)), POINTS)
+    found = solve_nominal(build_magnet(study), POINTS, session)
+    exact = field_of(build_magnet(study).blocks, POINTS)
+    ordinary = field_of(build_magnet(modes(array__recoil_permeability=1.0)).blocks, POINTS)
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
     assert np.abs(found - ordinary).max() > 0.03 * np.abs(exact).max()
 
 
 def test_routes_are_chosen_by_symmetry(short_dipole, dipole):
     far = POINTS
-    assert choose_route(short_dipole(), far) == "azimuthal_modes"
-    assert choose_route(short_dipole(solver__method="direct"), far) == "edge_elements"
+    assert choose_route(build_magnet(short_dipole()), far) == "azimuthal_modes"
+    assert choose_route(build_magnet(short_dipole(solver__method="direct")), far) == "edge_elements"
     gaps = {"shape": "sector", "angular_gap_deg": 1.0}
     trapezoids = {"shape": "trapezoid"}
     for block in (gaps, trapezoids):
-        assert choose_route(short_dipole(array__block=block), far) == "scalar_potential"
+        assert choose_route(build_magnet(short_dipole(array__block=block)),
+                            far) == "scalar_potential"
         with pytest.raises(StudyError, match=r"solver\.route"):
-            choose_route(short_dipole(array__block=block, solver__route="azimuthal_modes"), far)
-    assert choose_route(dipole(), circle(0.07)) == "cross_section"
+            choose_route(build_magnet(
+                short_dipole(array__block=block, solver__route="azimuthal_modes")), far)
+    assert choose_route(build_magnet(dipole()), circle(0.07)) == "cross_section"
     near = circle(0.1035)
-    assert choose_route(short_dipole(), near) == "scalar_potential"
+    assert choose_route(build_magnet(short_dipole()), near) == "scalar_potential"
 
 
 def test_few_modes_on_the_axis_many_near_the_blocks(short_dipole):
     study = short_dipole()
-    counts = [azimuthal_modes.modes_needed(study, circle(r)) for r in (1e-6, 0.05, 0.075, 0.09)]
+    counts = [azimuthal_modes.modes_needed(build_magnet(study), circle(r))
+              for r in (1e-6, 0.05, 0.075, 0.09)]
     assert counts == sorted(counts)
     assert counts[0] == 1
-    assert azimuthal_modes.modes_needed(study, circle(0.4)) < counts[-1]
+    assert azimuthal_modes.modes_needed(build_magnet(study), circle(0.4)) < counts[-1]
 
 
 def test_meridian_mesh_is_verified(short_dipole, tmp_path):
     """Unknowns: nodes off the boundary, and off the axis for modes above 0."""
     study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.03)
-    mesh = verify_mesh(build_meridian(study, tmp_path))
+    mesh = verify_mesh(build_meridian(build_magnet(study), tmp_path))
     assert mesh.axis.nodes > 0
     assert mesh.axis.nodes < mesh.inner.nodes < len(mesh.points)
     assert mesh.radius > 10 * 0.2
-    again = build_meridian(study, tmp_path / "again")
+    again = build_meridian(build_magnet(study), tmp_path / "again")
     assert again.mesh.read_bytes() == mesh.path.read_bytes()

@@ -21,6 +21,7 @@ import xarray as xr
 from halbach_fe.cli import main
 from halbach_fe.core.errors import ExtraMissingError, GetDPError, SchedulerError
 from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.dask_cluster import Cluster, connected
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.solver.getdp import ENVIRONMENT_VARIABLE
@@ -112,13 +113,14 @@ def slow_getdp(getdp, folder):
 
 def test_work_of_a_lost_worker_is_done_again(grid, cluster, session, dipole, tmp_path):
     study = dipole(mesh__block_size_m=0.04)
-    alone = solve_nominal(study, POINTS, session)
+    alone = solve_nominal(build_magnet(study), POINTS, session)
     slow = slow_getdp(session.getdp, tmp_path)
     doomed = grid.worker(**slow)
     wait_for_workers(cluster, 1)
     found = []
     there = replace(session, folder=tmp_path / "there", run=cluster.run)
-    thread = threading.Thread(target=lambda: found.append(solve_nominal(study, POINTS, there)))
+    thread = threading.Thread(
+        target=lambda: found.append(solve_nominal(build_magnet(study), POINTS, there)))
     thread.start()
     child = run_of(doomed)
     doomed.send_signal(signal.SIGKILL)
@@ -155,7 +157,7 @@ def test_what_nobody_waits_for_ends(grid, cluster, session, dipole, tmp_path):
 
     def solve():
         with pytest.raises(GetDPError) as caught:
-            solve_nominal(dipole(mesh__block_size_m=0.04), POINTS,
+            solve_nominal(build_magnet(dipole(mesh__block_size_m=0.04)), POINTS,
                           replace(session, jobs=1, run=cancelled))
         errors.append(str(caught.value))
 
@@ -175,7 +177,7 @@ def test_a_worker_with_another_getdp_is_refused(grid, cluster, session, dipole, 
     other.chmod(0o755)
     grid.worker(**{ENVIRONMENT_VARIABLE: str(other)})
     with pytest.raises(GetDPError, match=r"another GetDP: 3\.9\.9 .* in place of 3\.2\.0"):
-        solve_nominal(dipole(), POINTS, replace(session, run=cluster.run))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, run=cluster.run))
 
 
 def test_a_failure_there_is_told_here(grid, cluster, session, dipole):
@@ -186,7 +188,7 @@ def test_a_failure_there_is_told_here(grid, cluster, session, dipole):
         return cluster.run(getdp, replace(job, unknowns=job.unknowns + 1), *rest)
 
     with pytest.raises(GetDPError, match="unknowns where the mesh gives") as caught:
-        solve_nominal(dipole(), POINTS, replace(session, run=unsound))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, run=unsound))
     log = session.folder / "getdp-real-failed" / "getdp.log"
     assert str(log) in str(caught.value)
     assert "Dofs" in log.read_text()
@@ -233,10 +235,10 @@ def test_a_scheduler_that_ends(grid, cluster, session, dipole):
         return cluster.run(*rest)
 
     with pytest.raises(SchedulerError, match=r"Dask scheduler .* failed"):
-        solve_nominal(dipole(), POINTS, replace(session, jobs=1, run=ending))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, jobs=1, run=ending))
     cluster.client.close()
     with pytest.raises(SchedulerError, match="closed"):
-        solve_nominal(dipole(), POINTS, replace(session, jobs=1, run=cluster.run))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, jobs=1, run=cluster.run))
 
 
 class Lost:
@@ -258,7 +260,7 @@ class Lost:
 def test_a_client_that_has_given_up(dipole, session):
     lost = Cluster(Lost(), "tcp://nowhere:8786")
     with pytest.raises(SchedulerError, match="first reason"):
-        solve_nominal(dipole(), POINTS, replace(session, run=lost.run))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, run=lost.run))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "tcp://127.0.0.1:no"])

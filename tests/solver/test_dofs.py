@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import GetDPError, PointsOutsideError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import magnetostatics
 from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.field import finite_element_part
@@ -118,7 +119,7 @@ def test_getdps_own_file_is_like_that(dipole, session, monkeypatch):
         return seen[-1][2]
 
     monkeypatch.setattr(magnetostatics, "read_saved", keep)
-    finite_element_part(study, circle(0.05, 5), session, columns=False)
+    finite_element_part(build_magnet(study), circle(0.05, 5), session, columns=False)
     for text, unknowns, solutions in seen:
         real, ours = text.splitlines(), saved(solutions.tolist()).splitlines()
         assert len(real) == len(ours)
@@ -178,9 +179,9 @@ def test_other_numbering_is_noticed(
     study = short_dipole(solver={"route": route, "edge_order": order},
                          mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
     points = circle(0.05, 5, 0.013)
-    finite_element_part(study, points, session, columns=False)
+    finite_element_part(build_magnet(study), points, session, columns=False)
     mesh = None if route == "azimuthal_modes" else verify_mesh(
-        build_mesh(study, session.folder / "again"))
+        build_mesh(build_magnet(study), session.folder / "again"))
 
     def shifted(path, cell_type):
         unknowns = read_unknowns(path, cell_type)
@@ -196,7 +197,7 @@ def test_other_numbering_is_noticed(
     monkeypatch.setattr(magnetostatics, "read_unknowns", shifted)
     monkeypatch.setattr("halbach_fe.solver.azimuthal_modes.read_unknowns", shifted)
     with pytest.raises(GetDPError, match="numbered in another way"):
-        finite_element_part(study, points, session, columns=False)
+        finite_element_part(build_magnet(study), points, session, columns=False)
 
 
 @given(st.sampled_from([("triangle6", 2), ("tetra10", 3), ("quad", 2)]), st.integers(0, 10**6))
@@ -217,9 +218,9 @@ def test_points_are_found_where_they_are(short_dipole, dipole, tmp_path, generat
                         generator.uniform(-0.07, 0.07, (200, 3))])
     r_z = np.column_stack([np.hypot(*points[:, :2].T), points[:, 2], np.zeros(len(points))])
     for mesh, where in (
-            (verify_mesh(build_mesh(short_dipole(), tmp_path / "3d")), points),
-            (verify_mesh(build_mesh(dipole(), tmp_path / "2d")), points * [1, 1, 0]),
-            (verify_mesh(build_meridian(short_dipole(), tmp_path / "rz")), r_z)):
+            (verify_mesh(build_mesh(build_magnet(short_dipole()), tmp_path / "3d")), points),
+            (verify_mesh(build_mesh(build_magnet(dipole()), tmp_path / "2d")), points * [1, 1, 0]),
+            (verify_mesh(build_meridian(build_magnet(short_dipole()), tmp_path / "rz")), r_z)):
         located = locate(mesh, where)
         np.testing.assert_allclose(coordinates(mesh, located),
                                    where[:, :mesh.points.shape[1]], atol=1e-9)

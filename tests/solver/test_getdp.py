@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError, GetDPNotFoundError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.formulations import CROSS_SECTION, edge_elements
 from halbach_fe.solver.getdp import (
     ENVIRONMENT_VARIABLE,
@@ -38,8 +39,8 @@ def staged(dipole, tmp_path):
     study = dipole(mesh__block_size_m=0.03)
     folder = tmp_path / "run"
     folder.mkdir()
-    mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
-    return folder, fill_run_folder(study, mesh, POINTS, folder, CROSS_SECTION)
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path / "mesh"))
+    return folder, fill_run_folder(build_magnet(study), mesh, POINTS, folder, CROSS_SECTION)
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -130,10 +131,10 @@ def test_region_missing_from_the_problem(getdp, staged):
 
 def test_missing_gauge(getdp, short_dipole, tmp_path):
     study = short_dipole()
-    mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path / "mesh"))
     folder = tmp_path / "run"
     folder.mkdir()
-    job = fill_run_folder(study, mesh, POINTS, folder, edge_elements(1))
+    job = fill_run_folder(build_magnet(study), mesh, POINTS, folder, edge_elements(1))
     gauge = ("{ NameOfCoef ae; EntityType EdgesOfTreeIn; EntitySubType StartingOn;\n"
              "        NameOfConstraint TreeGauge; }")
     edit(folder / job.problem, gauge, "")
@@ -196,11 +197,11 @@ def test_unset_run_time_variable(getdp, staged):
 
 def test_point_outside_the_mesh(getdp, dipole, tmp_path):
     study = dipole(mesh__block_size_m=0.03)
-    mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path / "mesh"))
     points = np.vstack([POINTS, [[100.0, 0, 0]]])
     folder = tmp_path / "run"
     folder.mkdir()
-    job = fill_run_folder(study, mesh, points, folder, CROSS_SECTION)
+    job = fill_run_folder(build_magnet(study), mesh, points, folder, CROSS_SECTION)
     with pytest.raises(GetDPError, match=r"point outside the mesh|outside"):
         run(getdp, job, folder)
         read_vectors(folder / FLUX_DENSITY_FILE, points)
@@ -237,8 +238,8 @@ def test_a_deep_run_folder_is_no_long_path(getdp, dipole, tmp_path):
         folder = folder / ("deep" * 10)
     folder.mkdir(parents=True)
     study = dipole(mesh__block_size_m=0.03)
-    mesh = verify_mesh(build_mesh(study, folder / "mesh"))
-    job = fill_run_folder(study, mesh, POINTS, folder, CROSS_SECTION)
+    mesh = verify_mesh(build_mesh(build_magnet(study), folder / "mesh"))
+    job = fill_run_folder(build_magnet(study), mesh, POINTS, folder, CROSS_SECTION)
     run(getdp, job, folder)
     read_vectors(folder / FLUX_DENSITY_FILE, POINTS)
 

@@ -19,6 +19,7 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.temporary_files import remove_orphans, temporary_name
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp_cache as module
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.solver.getdp import run
@@ -53,12 +54,12 @@ def coarse(dipole):
 
 def test_the_same_is_asked_once(coarse, shared):
     session, runs = shared
-    first = solve_nominal(coarse(), POINTS, session)
+    first = solve_nominal(build_magnet(coarse()), POINTS, session)
     assert len(runs) == 2  # real materials and vacuum
     lines = []
     again = replace(session, folder=session.folder.parent / "other",
                     progress=lambda done, total: lines.append((done, total)))
-    assert np.array_equal(solve_nominal(coarse(), POINTS, again), first)
+    assert np.array_equal(solve_nominal(build_magnet(coarse()), POINTS, again), first)
     assert len(runs) == 2
     assert lines[-1] == (2, 2)
     kept = {path.name: path.read_bytes() for path in (session.folder / "getdp-real").iterdir()}
@@ -73,8 +74,9 @@ def test_the_same_is_asked_once(coarse, shared):
     {"iron_ring": {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 100.0}}])
 def test_another_study_is_computed(coarse, shared, change):
     session, runs = shared
-    solve_nominal(coarse(), POINTS, session)
-    solve_nominal(coarse().model_validate(changed_study(coarse(), change)), POINTS, session)
+    solve_nominal(build_magnet(coarse()), POINTS, session)
+    solve_nominal(build_magnet(coarse().model_validate(changed_study(coarse(), change))), POINTS,
+                  session)
     assert len(runs) > 2
 
 
@@ -85,7 +87,7 @@ def changed_study(study, change):
 
 def test_another_getdp_or_job_has_another_entry(coarse, shared, tmp_path):
     session, runs = shared
-    solve_nominal(coarse(), POINTS, session)
+    solve_nominal(build_magnet(coarse()), POINTS, session)
     folder, job, getdp, cache = tmp_path / "run", runs[0], session.getdp, session.cache
     folder.mkdir()
     (folder / "case.pro").write_text("a")
@@ -148,20 +150,21 @@ DAMAGE = {
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 def test_damage_is_seen_and_computed_again(coarse, shared, damage):
     session, runs = shared
-    first = solve_nominal(coarse(), POINTS, session)
+    first = solve_nominal(build_magnet(coarse()), POINTS, session)
     damage(entries(session)[0])
     with pytest.warns(HalbachWarning, match="cache is damaged .* computed again"):
-        again = solve_nominal(coarse(), POINTS, session)
+        again = solve_nominal(build_magnet(coarse()), POINTS, session)
     assert np.array_equal(again, first)
     assert len(runs) == 3
-    assert np.array_equal(solve_nominal(coarse(), POINTS, session), first)  # no warning any more
+    assert np.array_equal(solve_nominal(build_magnet(coarse()), POINTS, session),
+                          first)  # no warning any more
     assert len(runs) == 3
 
 
 def test_a_full_disk_is_no_damage(coarse, shared, monkeypatch):
     """The entry stays; what cannot be written here is the run's own affair."""
     session, runs = shared
-    first = solve_nominal(coarse(), POINTS, session)
+    first = solve_nominal(build_magnet(coarse()), POINTS, session)
     kept = entries(session)
 
     def full(source, target):
@@ -169,7 +172,7 @@ def test_a_full_disk_is_no_damage(coarse, shared, monkeypatch):
 
     with monkeypatch.context() as disk:
         disk.setattr(module, "shutil", SimpleNamespace(copyfile=full, rmtree=shutil.rmtree))
-        assert np.array_equal(solve_nominal(coarse(), POINTS, session), first)
+        assert np.array_equal(solve_nominal(build_magnet(coarse()), POINTS, session), first)
     assert len(runs) == 4
     assert sorted(entries(session)) == sorted(kept)
 
@@ -177,20 +180,20 @@ def test_a_full_disk_is_no_damage(coarse, shared, monkeypatch):
 def test_entries_that_cannot_be_changed_are_used(coarse, shared, monkeypatch):
     """As on a disk that is read-only."""
     session, runs = shared
-    first = solve_nominal(coarse(), POINTS, session)
+    first = solve_nominal(build_magnet(coarse()), POINTS, session)
 
     def refused(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(module.os, "utime", refused)
-    assert np.array_equal(solve_nominal(coarse(), POINTS, session), first)
+    assert np.array_equal(solve_nominal(build_magnet(coarse()), POINTS, session), first)
     assert len(runs) == 2
 
 
 def test_what_is_no_entry_stays(coarse, shared):
     """Whoever names a wrong folder loses nothing."""
     session, _ = shared
-    solve_nominal(coarse(), POINTS, session)
+    solve_nominal(build_magnet(coarse()), POINTS, session)
     folder = session.cache.folder
     (folder / "ff").mkdir(exist_ok=True)
     (folder / "ff" / "letters.txt").write_text("dear")
@@ -206,13 +209,13 @@ def test_what_is_no_entry_stays(coarse, shared):
 def test_damage_that_hashes_would_not_show(coarse, shared):
     """The control: a wrong number with a right hash is found by the verification after it."""
     session, _ = shared
-    solve_nominal(coarse(), POINTS, session)
+    solve_nominal(build_magnet(coarse()), POINTS, session)
     folder = entries(session)[0]
     (folder / "flux_density.txt").write_text("0 0 0 1 2 3\n")
     edit_manifest(folder, lambda data: data["files"].update({"flux_density.txt": {
         "bytes": 12, "sha256": module._digest(folder / "flux_density.txt")}}))
     with pytest.raises(GetDPError, match="rows"):
-        solve_nominal(coarse(), POINTS, session)
+        solve_nominal(build_magnet(coarse()), POINTS, session)
 
 
 def test_a_failure_is_not_kept(coarse, shared):
@@ -224,19 +227,20 @@ def test_a_failure_is_not_kept(coarse, shared):
         return lines
 
     with pytest.raises(GetDPError):
-        solve_nominal(coarse(), POINTS, replace(session, run=failing))
+        solve_nominal(build_magnet(coarse()), POINTS, replace(session, run=failing))
     assert entries(session) == []
 
 
 def test_what_was_not_used_for_longest_goes(coarse, shared):
     session, runs = shared
     for remanence in (1.0, 1.1, 1.2):
-        solve_nominal(coarse(array__remanence_T=remanence), POINTS, session)
+        solve_nominal(build_magnet(coarse(array__remanence_T=remanence)), POINTS, session)
     found = session.cache.entries()
     assert len(found) == len(runs) == 6
     for age, one in enumerate(found):
         os.utime(one.folder / MANIFEST, (1e9 - age, 1e9 - age))
-    solve_nominal(coarse(array__remanence_T=1.0), POINTS, session)  # those are used now
+    solve_nominal(build_magnet(coarse(array__remanence_T=1.0)), POINTS,
+                  session)  # those are used now
     used = {one.folder for one in session.cache.entries()[:2]}
     room = sum(one.bytes for one in found[:2]) * 1.01
     replace(session.cache, limit_bytes=room).trim()
@@ -246,7 +250,7 @@ def test_what_was_not_used_for_longest_goes(coarse, shared):
 def test_an_answer_larger_than_the_cache_is_not_kept(coarse, shared):
     session, runs = shared
     small = replace(session, cache=replace(session.cache, limit_bytes=1000))
-    solve_nominal(coarse(), POINTS, small)
+    solve_nominal(build_magnet(coarse()), POINTS, small)
     assert entries(small) == []
     assert len(runs) == 2
 
@@ -256,7 +260,7 @@ def test_a_cache_that_cannot_be_written_costs_nothing_but_a_warning(coarse, shar
     (tmp_path / "file").write_text("")
     nowhere = replace(session, cache=Cache(tmp_path / "file" / "cache"))
     with pytest.warns(HalbachWarning, match="not kept in the cache"):
-        solve_nominal(coarse(), POINTS, nowhere)
+        solve_nominal(build_magnet(coarse()), POINTS, nowhere)
 
 
 SHARED = """
@@ -299,7 +303,7 @@ def test_processes_share_it(tmp_path):
 def test_removed_while_it_is_read(coarse, shared, monkeypatch):
     """Another process may trim an entry at any moment; that is no damage."""
     session, runs = shared
-    first = solve_nominal(coarse(), POINTS, session)
+    first = solve_nominal(build_magnet(coarse()), POINTS, session)
     true, lock = module._digest, threading.Lock()
 
     def removing(path):
@@ -308,7 +312,7 @@ def test_removed_while_it_is_read(coarse, shared, monkeypatch):
         return true(path)
 
     monkeypatch.setattr(module, "_digest", removing)
-    assert np.array_equal(solve_nominal(coarse(), POINTS, session), first)
+    assert np.array_equal(solve_nominal(build_magnet(coarse()), POINTS, session), first)
     assert len(runs) > 2
 
 
@@ -350,7 +354,7 @@ def test_the_environment_says_where_and_how_much(monkeypatch, tmp_path):
 
 def test_the_verb(coarse, shared, monkeypatch, capsys):
     session, _ = shared
-    solve_nominal(coarse(), POINTS, session)
+    solve_nominal(build_magnet(coarse()), POINTS, session)
     monkeypatch.setenv(LIMIT_VARIABLE, "1")
     at = ["--cache", str(session.cache.folder)]
     assert main(["cache", "ls", *at, "--json"]) == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError, MeshError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix, verify_superposition
 from halbach_fe.solver.closed_form import bore_field, ideal_sectors, layered_bore_field
@@ -21,7 +21,7 @@ IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 
 
 
 def error_2d(study, session, expected, points):
-    found = solve_nominal(study, points, session)[:, :2]
+    found = solve_nominal(build_magnet(study), points, session)[:, :2]
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
@@ -88,8 +88,8 @@ def test_3d_ring_against_magpylib_and_exact_field(short_dipole, session):
     """
     study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"})
     points = in_bore()
-    exact = field_of(blocks_of(study), points)  # itself checked against magpylib
-    found = solve_nominal(study, points, session)
+    exact = field_of(build_magnet(study).blocks, points)  # itself checked against magpylib
+    found = solve_nominal(build_magnet(study), points, session)
     scale = np.abs(exact).max()
     assert np.abs(found - exact).max() / scale < 0.25
     assert np.sqrt(np.mean((found - exact) ** 2)) / scale < 0.06
@@ -106,8 +106,8 @@ def test_3d_error_falls_with_refinement(short_dipole, session):
     for size, layers in ((0.03, 2), (0.015, 4)):
         study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"},
                              mesh={"block_size_m": size, "layers_per_ring": layers, "growth": 1.8})
-        exact = field_of(blocks_of(study), points)
-        found = solve_nominal(study, points, session)
+        exact = field_of(build_magnet(study).blocks, points)
+        found = solve_nominal(build_magnet(study), points, session)
         errors.append(np.sqrt(np.mean((found - exact) ** 2)) / np.abs(exact).max())
     assert errors[1] < 0.67 * errors[0]
     assert errors[1] < 0.03
@@ -121,8 +121,8 @@ def test_3d_one_block_all_components(short_dipole, session):
     """
     study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"})
     points, number = in_bore(), 5
-    found = solve_sources(study, points, [number], session, edge_elements(1))[1:]
-    exact = np.moveaxis(unit_field(blocks_of(study)[number], points), 2, 0)
+    found = solve_sources(build_magnet(study), points, [number], session, edge_elements(1))[1:]
+    exact = np.moveaxis(unit_field(build_magnet(study).blocks[number], points), 2, 0)
     for axis in range(3):
         scale = np.abs(exact[axis]).max()
         assert np.sqrt(np.mean((found[axis] - exact[axis]) ** 2)) < 0.13 * scale, axis
@@ -136,8 +136,8 @@ def test_reaction_in_3d_reduces_the_field_as_it_should(short_dipole, session):
                          mesh={"block_size_m": 0.02, "layers_per_ring": 2})
     points = circle(0.02, 6, 0.01)
     expected = layered_bore_field(SECTORS, 0.104, 0.1865, 1.05, points[:, :2])
-    found = solve_nominal(study, points, session)[:, :2]
-    vacuum = field_of(blocks_of(study), points)[:, :2]
+    found = solve_nominal(build_magnet(study), points, session)[:, :2]
+    vacuum = field_of(build_magnet(study).blocks, points)[:, :2]
     # The whole reaction is 2.4 %; this mesh has it to 7 % (1.6e-3), the exact part is exact.
     assert np.abs(found - expected).max() < 0.004 * np.abs(expected).max()
     assert np.abs(vacuum - expected).max() > 0.015 * np.abs(expected).max()
@@ -149,9 +149,9 @@ def test_rotation(dipole, session):
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
                      [0, 0, 1]])
     points = circle(0.06)
-    plain = solve_nominal(dipole(), points, session)
-    turned = solve_nominal(dipole(array__first_block_angle_deg=120.0,
-                                  array__first_magnetization_angle_deg=210.0),
+    plain = solve_nominal(build_magnet(dipole()), points, session)
+    turned = solve_nominal(build_magnet(dipole(array__first_block_angle_deg=120.0,
+                                  array__first_magnetization_angle_deg=210.0)),
                            points @ turn.T, session)
     np.testing.assert_allclose(turned, plain @ turn.T, atol=4e-4 * np.abs(plain).max())
 
@@ -161,7 +161,7 @@ def test_superposition(dipole, session, method):
     study = dipole(solver={"method": method})
     points = circle(0.075)
     observation = observe(study, points, np.ones((len(points), 3), bool) & [True, True, False])
-    built = response_matrix(study, observation, session)
+    built = response_matrix(build_magnet(study), observation, session)
     assert built.matrix.shape == (48, 32)
     assert built.superposition_error < 1e-9
 
@@ -182,18 +182,19 @@ def test_stored_response_is_used_only_for_the_same_inputs(dipole, session):
     points = circle(0.075, 4)
     measured = np.ones((4, 3), bool) & [True, True, False]
     study = dipole()
-    first = response_matrix(study, observe(study, points, measured), session)
+    first = response_matrix(build_magnet(study), observe(study, points, measured), session)
     stored = session.folder / "response.h5"
     stamp = stored.stat().st_mtime_ns
-    again = response_matrix(study, observe(study, points, measured), session)
+    again = response_matrix(build_magnet(study), observe(study, points, measured), session)
     assert stored.stat().st_mtime_ns == stamp
     np.testing.assert_array_equal(first.matrix, again.matrix)
     other = dipole(array__recoil_permeability=1.1)
-    changed = response_matrix(other, observe(other, points, measured), session)
+    changed = response_matrix(build_magnet(other), observe(other, points, measured), session)
     assert np.abs(changed.matrix - first.matrix).max() > 0
     stored.write_bytes(b"damaged")
     np.testing.assert_array_equal(
-        response_matrix(other, observe(other, points, measured), session).matrix, changed.matrix)
+        response_matrix(build_magnet(other), observe(other, points, measured), session).matrix,
+        changed.matrix)
 
 
 @pytest.mark.parametrize("route", ["edge_elements", "scalar_potential", "azimuthal_modes"])
@@ -201,12 +202,13 @@ def test_one_point_alone(short_dipole, session, route):
     """GetDP's interpolation of a table of one line gives nothing; a study of one point works."""
     study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03)
     points = in_bore(5)
-    alone = solve_nominal(study, points[:1], session)
-    np.testing.assert_allclose(alone[0], solve_nominal(study, points, session)[0], atol=1e-5)
+    alone = solve_nominal(build_magnet(study), points[:1], session)
+    np.testing.assert_allclose(alone[0], solve_nominal(build_magnet(study), points, session)[0],
+                               atol=1e-5)
 
 
 def test_points_in_magnet_or_far_outside_are_refused(dipole, session):
     with pytest.raises(StudyError, match="inside magnet or iron"):
-        solve_nominal(dipole(), circle(0.15), session)
+        solve_nominal(build_magnet(dipole()), circle(0.15), session)
     with pytest.raises(MeshError, match="outside"):
-        solve_nominal(dipole(), circle(75.0), session)
+        solve_nominal(build_magnet(dipole()), circle(75.0), session)

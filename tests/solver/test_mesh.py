@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeshError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
@@ -39,21 +39,21 @@ def volumes(path, dimension):
 def test_shipped_studies_mesh_to_their_volumes(tmp_path, name):
     """Chords cut some per cent off sectors; cuboids and trapezoids are met exactly."""
     study = read_study(ROOT / f"studies/{name}/study.toml")
-    mesh = verify_mesh(build_mesh(study, tmp_path))
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path))
     found = volumes(mesh.path, study.dimension)
     tolerance = 0.02 if study.array.block.shape == "sector" else 1e-6
-    for block, region in zip(blocks_of(study), mesh.regions.blocks, strict=True):
+    for block, region in zip(build_magnet(study).blocks, mesh.regions.blocks, strict=True):
         expected = block.area if study.dimension == 2 else block.volume
         assert found[region.tag] == pytest.approx(expected, rel=tolerance), region.name
 
 
 def test_same_study_same_mesh(tmp_path, dipole, short_dipole):
     for study in (dipole(), short_dipole()):
-        first = build_mesh(study, tmp_path / "a")
-        second = build_mesh(study, tmp_path / "b")
+        first = build_mesh(build_magnet(study), tmp_path / "a")
+        second = build_mesh(build_magnet(study), tmp_path / "b")
         assert first.mesh.read_bytes() == second.mesh.read_bytes()
         assert first.regions.read_bytes() == second.regions.read_bytes()
-    other = build_mesh(short_dipole(mesh__block_size_m=0.031), tmp_path / "c")
+    other = build_mesh(build_magnet(short_dipole(mesh__block_size_m=0.031)), tmp_path / "c")
     assert other.mesh.read_bytes() != first.mesh.read_bytes()
 
 
@@ -65,7 +65,7 @@ def with_regions(files: MeshFiles, change) -> MeshFiles:
 
 
 def test_region_missing_from_the_mesh(tmp_path, dipole):
-    files = build_mesh(dipole(), tmp_path)
+    files = build_mesh(build_magnet(dipole()), tmp_path)
     extra = {"name": "r01s17", "ring": 1, "slot": 17, "tag": 1999}
     with_regions(files, lambda d: d["blocks"].append(extra))
     with pytest.raises(MeshError, match=r"lacks region 1999 \(block r01s17\)"):
@@ -73,13 +73,13 @@ def test_region_missing_from_the_mesh(tmp_path, dipole):
 
 
 def test_region_unknown_to_the_region_file(tmp_path, dipole):
-    files = with_regions(build_mesh(dipole(), tmp_path), lambda d: d["blocks"].pop())
+    files = with_regions(build_mesh(build_magnet(dipole()), tmp_path), lambda d: d["blocks"].pop())
     with pytest.raises(MeshError, match="holds region 1016"):
         verify_mesh(files)
 
 
 def test_mesh_without_outer_boundary(tmp_path, dipole):
-    files = with_regions(build_mesh(dipole(), tmp_path),
+    files = with_regions(build_mesh(build_magnet(dipole()), tmp_path),
                          lambda d: d.update(outer_boundary=11))
     with pytest.raises(MeshError, match="lacks its outer boundary"):
         verify_mesh(files)
@@ -87,7 +87,7 @@ def test_mesh_without_outer_boundary(tmp_path, dipole):
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
 def test_truncated_mesh(tmp_path, dipole, part):
-    files = build_mesh(dipole(), tmp_path)
+    files = build_mesh(build_magnet(dipole()), tmp_path)
     whole = files.mesh.read_bytes()
     files.mesh.write_bytes(whole[: int(part * len(whole))])
     with pytest.raises(MeshError, match=r"truncated|not an MSH"):
@@ -95,7 +95,7 @@ def test_truncated_mesh(tmp_path, dipole, part):
 
 
 def test_damaged_region_file(tmp_path, dipole):
-    files = build_mesh(dipole(), tmp_path)
+    files = build_mesh(build_magnet(dipole()), tmp_path)
     files.regions.write_text("{")
     with pytest.raises(MeshError, match="Mesh the study again"):
         verify_mesh(files)
@@ -104,20 +104,20 @@ def test_damaged_region_file(tmp_path, dipole):
 def test_iron_inside_the_blocks_is_refused(tmp_path, dipole):
     iron = {"inner_radius_m": 0.18, "outer_radius_m": 0.2, "relative_permeability": 100.0}
     with pytest.raises(StudyError, match="where the blocks end"):
-        build_mesh(dipole(iron_ring=iron), tmp_path)
+        build_mesh(build_magnet(dipole(iron_ring=iron)), tmp_path)
 
 
 def test_boundary_inside_the_magnet_is_refused(tmp_path, short_dipole):
     with pytest.raises(StudyError, match=r"open_boundary\.radius_m"):
-        build_mesh(short_dipole(open_boundary={"radius_m": 0.19}), tmp_path)
+        build_mesh(build_magnet(short_dipole(open_boundary={"radius_m": 0.19})), tmp_path)
     with pytest.raises(StudyError, match=r"open_boundary\.half_length_m"):
-        build_mesh(short_dipole(open_boundary={"half_length_m": 0.05}), tmp_path)
+        build_mesh(build_magnet(short_dipole(open_boundary={"half_length_m": 0.05})), tmp_path)
 
 
 def test_gaps_and_shorter_iron_get_layers_of_their_own(tmp_path, short_dipole):
     study = short_dipole(array__ring_gap_m=0.004, iron_ring={
         "inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 100.0,
         "length_m": 0.1})
-    mesh = verify_mesh(build_mesh(study, tmp_path))
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path))
     iron = volumes(mesh.path, 3)[mesh.regions.iron]
     assert iron == pytest.approx(np.pi * (0.2**2 - 0.19**2) * 0.1, rel=0.02)

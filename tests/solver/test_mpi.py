@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.field import solve_nominal
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, run
 from halbach_fe.study.reader import parse_study
@@ -21,8 +22,8 @@ of a conditioned gauge; conjugate gradients stop at 1e-10 of the residual."""
 
 
 def difference(study, session, **other):
-    one = solve_nominal(study, POINTS, session)
-    two = solve_nominal(study, POINTS, replace(session, processes=2, **other))
+    one = solve_nominal(build_magnet(study), POINTS, session)
+    two = solve_nominal(build_magnet(study), POINTS, replace(session, processes=2, **other))
     logs = list(session.folder.glob("getdp-*/getdp.log"))
     assert logs
     assert all("2 nodes" in log.read_text() for log in logs)
@@ -71,10 +72,10 @@ def test_an_mpirun_that_is_none(dipole, session, tmp_path, monkeypatch):
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", str(fake.parent), prepend=":")
     with pytest.raises(GetDPError, match="did not run in the 2 MPI processes"):
-        solve_nominal(dipole(), POINTS, replace(session, processes=2))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, processes=2))
 
 
 def test_no_mpirun(dipole, session, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(GetDPError, match=r"`mpirun` was not found \(Debian: openmpi-bin\)"):
-        solve_nominal(dipole(), POINTS, replace(session, processes=2))
+        solve_nominal(build_magnet(dipole()), POINTS, replace(session, processes=2))

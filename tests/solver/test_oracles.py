@@ -6,7 +6,7 @@ import ngsolve
 import numpy as np
 import pytest
 
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.field import choose_route, finite_element_part
 from halbach_fe.study.reader import parse_study, read_study
@@ -27,7 +27,7 @@ def test_full_array_against_the_vector_potential_in_3d(session, with_iron):
     if not with_iron:
         study = study.with_(iron_ring=None)
     points = points_from(study.observation.positions)[::29]
-    ours = finite_element_part(study, points, session, columns=False).nominal
+    ours = finite_element_part(build_magnet(study), points, session, columns=False).nominal
     with ngsolve.TaskManager():
         dipole = dipole_of(study)
         theirs = oracle.vector_potential(dipole, oracle.eighth(dipole, 0.04), 3, points)
@@ -37,7 +37,7 @@ def test_full_array_against_the_vector_potential_in_3d(session, with_iron):
     # negative controls: the wrong sign, and a magnet displaced by a centimetre
     assert np.linalg.norm(ours + theirs, axis=1).max() > 30e-3 * main_field
     shifted = points + np.array([0, 0, 0.01])
-    moved = finite_element_part(study, shifted, session, columns=False).nominal
+    moved = finite_element_part(build_magnet(study), shifted, session, columns=False).nominal
     assert np.linalg.norm(moved - theirs, axis=1).max() > 1e-3 * main_field
 
 
@@ -51,7 +51,7 @@ def column():
     """1 T along x of one block of two rings, with iron, by NGSolve."""
     study = parse_study(changed(DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.08,
                                 **RINGS))
-    block, dipole = blocks_of(study)[NUMBER], dipole_of(study)
+    block, dipole = build_magnet(study).blocks[NUMBER], dipole_of(study)
     mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     with ngsolve.TaskManager():
         return oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), POINTS).reaction
@@ -64,8 +64,9 @@ def test_a_column_by_every_route_against_ngsolve(short_dipole, session, column, 
     is in part NGSolve's own.
     """
     study = short_dipole(solver__route=route, **RINGS)
-    assert choose_route(study, POINTS) == route
-    ours = finite_element_part(study, POINTS, session).block(NUMBER, slice(None))[:, :, 0]
+    assert choose_route(build_magnet(study), POINTS) == route
+    ours = finite_element_part(build_magnet(study), POINTS, session).block(NUMBER,
+                                                                           slice(None))[:, :, 0]
     scale = np.sqrt(np.mean(column**2))
     assert np.sqrt(np.mean((ours - column) ** 2)) < cap * scale
     assert np.sqrt(np.mean((ours + column) ** 2)) > 1.5 * scale  # the wrong sign

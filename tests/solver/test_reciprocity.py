@@ -9,6 +9,7 @@ import pytest
 import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL, edge_elements
@@ -25,10 +26,11 @@ def dumped(study, formulation, blocks, session):
     """Mesh, located points, unknowns, right-hand sides and solutions of GetDP; its folder."""
     folder = session.folder / "run"
     folder.mkdir(parents=True)
-    mesh = verify_mesh(build_mesh(study, session.folder))
+    mesh = verify_mesh(build_mesh(build_magnet(study), session.folder))
     located = locate(mesh, POINTS)
     count = 1 + study.dimension * len(blocks)
-    job = fill_run_folder(study, mesh, probes_of(mesh, located)[1], folder, formulation, blocks,
+    job = fill_run_folder(build_magnet(study), mesh, probes_of(mesh, located)[1], folder,
+                          formulation, blocks,
                 (0, count - 1))
     job = dataclasses.replace(job, options=(
         *job.options, "-ksp_view_rhs", "binary:rhs.bin::append",

@@ -6,7 +6,8 @@ import magpylib
 import numpy as np
 import pytest
 
-from halbach_fe.geometry.magnet import blocks_of, points_in_material, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.closed_form import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.solver.vacuum_field import field_of, gradient_of, unit_field
 from tests.conftest import circle
@@ -23,7 +24,7 @@ def scattered(study, generator, count=600):
                          generator.uniform(-0.3, 0.3, count)]),
         generator.uniform(-0.4, 0.4, (count, 3)),
     ])
-    return points[~points_in_material(study, points)]
+    return points[~build_magnet(study).contains(points)]
 
 
 def magpylib_block(study, block):
@@ -48,7 +49,7 @@ def test_one_block_against_magpylib(short_dipole, generator, shape):
     """Sign, magnitude, all three components, all three magnetizations."""
     outer = 0.1265 if shape.get("orientation") else 0.1865
     study = short_dipole(array__block=shape, array__outer_radius_m=outer)
-    block = blocks_of(study)[3]
+    block = build_magnet(study).blocks[3]
     points = scattered(study, generator)
     ours = unit_field(block, points)
     for axis in range(3):
@@ -60,7 +61,7 @@ def test_one_block_against_magpylib(short_dipole, generator, shape):
 def test_the_comparison_can_fail(short_dipole, generator):
     """Turning one block's magnetization by a tenth of a degree is seen."""
     study = short_dipole()
-    block, points = blocks_of(study)[3], scattered(study, generator)
+    block, points = build_magnet(study).blocks[3], scattered(study, generator)
     source = magpylib_block(study, block)
     source.polarization = (np.cos(np.radians(0.1)), np.sin(np.radians(0.1)), 0)
     assert np.abs(unit_field(block, points)[:, :, 0] - source.getB(points)).max() > (
@@ -71,11 +72,11 @@ def test_full_array_against_magpylib(short_dipole, generator):
     study = short_dipole(array__recoil_permeability=1.0)
     points = scattered(study, generator, 200)
     expected = np.zeros_like(points)
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         source = magpylib_block(study, block)
         source.polarization = np.array(block.easy_axis) * block.remanence
         expected += source.getB(points)
-    np.testing.assert_allclose(field_of(blocks_of(study), points), expected,
+    np.testing.assert_allclose(field_of(build_magnet(study).blocks, points), expected,
                                atol=10 * MAGPYLIB_ERROR)
 
 
@@ -84,7 +85,8 @@ def test_cross_section_against_closed_form(dipole):
     points = circle(0.09)
     sectors = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)
     series = bore_field(sectors, 0.104, 0.1865, points[:, :2])
-    np.testing.assert_allclose(field_of(blocks_of(dipole()), points)[:, :2], series, atol=1e-13)
+    np.testing.assert_allclose(field_of(build_magnet(dipole()).blocks, points)[:, :2], series,
+                               atol=1e-13)
     layered = layered_bore_field(sectors, 0.104, 0.1865, 1.0, points[:, :2])
     np.testing.assert_allclose(layered, series, atol=1e-13)
 
@@ -99,7 +101,7 @@ def test_segmented_dipole_against_halbach():
 def test_field_obeys_maxwell_in_air(short_dipole, generator):
     """Divergence and curl by central differences; step 1e-4 m leaves h^2/6 B''' ~ 1e-4 T/m."""
     study = short_dipole()
-    block, step = blocks_of(study)[5], 1e-4
+    block, step = build_magnet(study).blocks[5], 1e-4
     points = np.column_stack([generator.uniform(-0.06, 0.06, (50, 2)),
                               generator.uniform(-0.2, 0.2, 50)])
     gradient = np.stack([
@@ -119,7 +121,7 @@ def test_gradient(dipole, short_dipole, dimension):
     (measured 3e-7). At 1.5 mm, a hundredth of the radius, 1e-3 is left. On the axis, which has no
     radial direction, nothing is special.
     """
-    blocks = blocks_of(dipole() if dimension == 2 else short_dipole())
+    blocks = build_magnet(dipole() if dimension == 2 else short_dipole()).blocks
     points = np.vstack([circle(0.075, 5, z) for z in (0.0, 0.05, 0.12)]
                        + [[0, 0, 0.1], [0.1025, 0, 0.02]])
     steps = 1e-5 * np.eye(3)
@@ -135,7 +137,7 @@ def test_gradient(dipole, short_dipole, dimension):
 
 def test_finite_and_continuous_above_an_edge(short_dipole):
     """On the prolongation of a vertical edge, rho = 0, the field is an ordinary number."""
-    block = blocks_of(short_dipole())[0]
+    block = build_magnet(short_dipole()).blocks[0]
     x, y = block.outline[0].start
     there = unit_field(block, np.array([[x, y, 0.3]]))
     nearby = unit_field(block, np.array([[x + 1e-9, y - 1e-9, 0.3]]))
@@ -150,5 +152,5 @@ def test_scaling(short_dipole, generator):
                          array__ring_length_m=0.16)
     points = np.column_stack([generator.uniform(-0.06, 0.06, (20, 2)),
                               generator.uniform(-0.2, 0.2, 20)])
-    np.testing.assert_allclose(field_of(blocks_of(small), points),
-                               field_of(blocks_of(large), 2 * points), atol=1e-12)
+    np.testing.assert_allclose(field_of(build_magnet(small).blocks, points),
+                               field_of(build_magnet(large).blocks, 2 * points), atol=1e-12)

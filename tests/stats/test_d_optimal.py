@@ -10,6 +10,7 @@ import xarray as xr
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.measurement_plan import plan_measurement, spread
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
@@ -56,14 +57,14 @@ def test_plan_in_a_cross_section(dipole, session):
 
     study = dipole(noise=NOISE, observation__components=["x", "y"],
                    plan={"candidates": circles(0.075), "points": 12})
-    same = plan_measurement(study, session)
+    same = plan_measurement(build_magnet(study), session)
     assert len(same.points) == 12
     own = same.baseline_gain[list(same.baseline_counts).index(12)]
     assert own < same.gain[11] * 1.02
     assert same.volume_ratio == pytest.approx(1, abs=0.05)  # measured: 0.99
 
-    wider = plan_measurement(dipole(noise=NOISE, observation__components=["x", "y"],
-                        plan={"candidates": circles(0.05, 0.09), "points": 24}), session)
+    wider = plan_measurement(build_magnet(dipole(noise=NOISE, observation__components=["x", "y"],
+                        plan={"candidates": circles(0.05, 0.09), "points": 24})), session)
     outside = np.isclose(np.hypot(*wider.points[:, :2].T), 0.09)
     assert outside.mean() > 0.8  # measured: 22 of 24; a few farther in average several blocks
     assert wider.same_information < 24
@@ -82,15 +83,15 @@ def test_plan_with_correlated_noise(dipole, session):
                    noise=NOISE | {"position_sd_m": [3e-3, 0.0, 0.0]})
     points = points_from(study.observation.positions)
     observation = observe(study, points, np.ones_like(points, bool))
-    covariance = reading_noise(study, observation, xr.Dataset()).covariance.toarray()
-    model = response_matrix(study, observation, session)
+    covariance = reading_noise(build_magnet(study), observation, xr.Dataset()).covariance.toarray()
+    model = response_matrix(build_magnet(study), observation, session)
     prior = nominal_prior(model.nominal, 2, study.prior.magnitude_sd, study.prior.direction_sd_deg)
     spread = model.matrix @ prior.covariance @ model.matrix.T
 
     def told(noise):
         return np.linalg.slogdet(np.eye(len(noise)) + np.linalg.solve(noise, spread))[1] / 2
 
-    found = plan_measurement(study, session, count=24)
+    found = plan_measurement(build_magnet(study), session, count=24)
     assert found.gain[-1] == pytest.approx(told(covariance), rel=1e-9)
     assert found.baseline_gain[-1] == pytest.approx(told(covariance), rel=1e-9)
     assert told(np.diag(np.diag(covariance))) != pytest.approx(told(covariance), rel=1e-2)
@@ -106,4 +107,4 @@ def test_even_spread():
 
 def test_too_few_candidates(dipole, session):
     with pytest.raises(StudyError, match="at most the number of candidates, 24"):
-        plan_measurement(dipole(noise=NOISE), session, count=25)
+        plan_measurement(build_magnet(dipole(noise=NOISE)), session, count=25)

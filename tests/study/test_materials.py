@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.interpolate import PchipInterpolator
 
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import _key
 from halbach_fe.solver.formulations import CROSS_SECTION
@@ -60,7 +61,8 @@ def test_a_stored_response_is_that_of_the_steels_numbers(dipole, tmp_path, monke
     session = Session(getdp, tmp_path)
 
     def key():
-        return _key(study, observe(study, points, np.ones_like(points, bool)), session)
+        return _key(build_magnet(study), observe(study, points, np.ones_like(points, bool)),
+                    session)
 
     shipped = key()
     assert key() == shipped
@@ -421,8 +423,8 @@ def test_getdp_has_the_same_law(dipole, getdp, tmp_path):
         "curve": {"kind": "steel", "name": "aisi_1010"}})
     folder = tmp_path / "run"
     folder.mkdir()
-    mesh = verify_mesh(build_mesh(study, tmp_path / "mesh"))
-    fill_run_folder(study, mesh, circle(0.07, 2), folder, CROSS_SECTION)
+    mesh = verify_mesh(build_mesh(build_magnet(study), tmp_path / "mesh"))
+    fill_run_folder(build_magnet(study), mesh, circle(0.07, 2), folder, CROSS_SECTION)
     curve = curve_of(study)
     laws = {"nu": curve.reluctivity, "mur": curve.permeability}
     arguments = {name: np.sqrt(np.concatenate([

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import HalbachError, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import curve_of
 from halbach_fe.study.reader import parse_study, read_study
@@ -27,7 +27,7 @@ def iron(**curve):
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.parent.name)
 def test_shipped_studies_are_valid(path):
     study = read_study(path)
-    assert len(blocks_of(study)) == study.array.rings * study.array.blocks_per_ring
+    assert len(build_magnet(study).blocks) == study.array.rings * study.array.blocks_per_ring
 
 
 def test_studies_are_frozen(dipole):
@@ -289,7 +289,7 @@ def test_any_nonsense_gives_one_sentence(nonsense, key):
 
 def test_magnetization_convention(dipole):
     """nu B = H + M: M = B_r / (mu_0 mu_r), not B_r / mu_0."""
-    block = blocks_of(dipole(array__recoil_permeability=1.25))[0]
+    block = build_magnet(dipole(array__recoil_permeability=1.25)).blocks[0]
     assert math.hypot(*block.magnetization) == pytest.approx(1.06 / (MU_0 * 1.25), rel=1e-12)
     assert math.hypot(*block.magnetization) != pytest.approx(1.06 / MU_0, rel=1e-2)
 
@@ -298,7 +298,7 @@ def test_moment_gives_remanence(short_dipole):
     """FASER's 330 A m2 in a full sector of 83.3 mm is 1.06 T."""
     study = short_dipole(array__remanence_T=None, array__block_moment_A_m2=330.0,
                          array__ring_length_m=1 / 12)
-    block = blocks_of(study)[0]
+    block = build_magnet(study).blocks[0]
     volume = math.pi * (0.1865**2 - 0.104**2) / 16 / 12
     assert block.volume == pytest.approx(volume, rel=1e-12)
     assert block.remanence == pytest.approx(MU_0 * 330 / volume, rel=1e-12)
@@ -307,4 +307,4 @@ def test_moment_gives_remanence(short_dipole):
 def test_moment_in_wrong_unit_is_refused(short_dipole):
     study = short_dipole(array__remanence_T=None, array__block_moment_A_m2=330e3)
     with pytest.raises(StudyError, match="block_moment_A_m2"):
-        blocks_of(study)
+        build_magnet(study)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import ExtraMissingError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.field import finite_element_part, solve_nominal
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.synthetic import extras, magpylib_field
@@ -44,7 +44,7 @@ def shape(request):
 def test_vacuum_field_in_3d(short_dipole, shape):
     """Measured 6e-11 T for sectors (magpylib's rounding), 1e-15 T for the others."""
     study = of_shape(short_dipole, shape, array__exceptions=EXCEPTIONS, array__ring_gap_m=0.003)
-    theirs = field_of(blocks_of(study), POINTS)
+    theirs = field_of(build_magnet(study).blocks, POINTS)
     ours = vacuum_field(magnet_of(study).bodies, POINTS)
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
     # negative control: one block of 32 turned by a hundredth of a degree
@@ -56,7 +56,7 @@ def test_vacuum_field_in_3d(short_dipole, shape):
 def test_vacuum_field_in_2d(dipole, shape):
     """Measured 1.5e-9 T for sectors: bodies of 46 m and 93 m, extrapolated."""
     study = of_shape(dipole, shape, array__exceptions=[{"slot": 5, "remanence_T": 1.0}])
-    theirs = field_of(blocks_of(study), POINTS)
+    theirs = field_of(build_magnet(study).blocks, POINTS)
     np.testing.assert_allclose(vacuum_field(magnet_of(study).bodies, POINTS), theirs, atol=1e-8)
 
 
@@ -64,7 +64,7 @@ def test_nominal_magnet_is_the_studys(short_dipole, shape):
     """Volumes, magnetizations and moments; blocks are counted alike."""
     study = of_shape(short_dipole, shape, array__remanence_T=None, array__block_moment_A_m2=30.0,
                      array__recoil_permeability_across=1.2, array__first_block_angle_deg=17.0)
-    bodies, blocks = magnet_of(study).bodies, blocks_of(study)
+    bodies, blocks = magnet_of(study).bodies, build_magnet(study).blocks
     for body, block in zip(bodies, blocks, strict=True):
         assert (body.ring, body.slot) == (block.ring, block.slot)
         assert body.shape.volume == pytest.approx(block.volume, rel=1e-12)
@@ -81,7 +81,7 @@ def test_points_in_material(short_dipole, shape, generator):
                                 "relative_permeability": 100.0})
     points = generator.uniform(-0.21, 0.21, (4000, 3)) * [1, 1, 0.5]
     expected = np.zeros(len(points), bool)
-    for block in blocks_of(study):
+    for block in build_magnet(study).blocks:
         expected |= block.contains(points)
     radius = np.hypot(points[:, 0], points[:, 1])
     expected |= (radius > 0.19) & (radius < 0.2) & (np.abs(points[:, 2]) < 0.08)
@@ -138,7 +138,8 @@ def test_points_in_the_planes_of_faces(short_dipole, shape):
     for off in (0.0, 1e-15, 1e-12, 3e-11, 1e-10, 1e-9, 1e-8):
         points = np.array([[0.05, 0.02, 0.08 + off], [0.05, 0.02, off], [0.05, 0.02, -0.08 - off],
                            [0.07 * np.cos(side + off), 0.07 * np.sin(side + off), 0.01]])
-        np.testing.assert_allclose(vacuum_field(bodies, points), field_of(blocks_of(study), points),
+        np.testing.assert_allclose(vacuum_field(bodies, points),
+                                   field_of(build_magnet(study).blocks, points),
                                    atol=3e-7)
 
 
@@ -178,7 +179,7 @@ def test_reaction_in_2d(dipole, session, iron):
     study = dipole(mesh__block_size_m=0.005, iron_ring=tube(IRONS[iron]),
                    array__recoil_permeability_across=1.15)
     points = circle(0.075)
-    theirs = finite_element_part(study, points, session, columns=False).nominal
+    theirs = finite_element_part(build_magnet(study), points, session, columns=False).nominal
     ours = reaction_field(magnet_of(study), points)
     np.testing.assert_allclose(ours, theirs, atol=2e-5)
     assert np.abs(0.99 * ours - theirs).max() > 1e-4
@@ -199,7 +200,7 @@ def test_iron_that_saturates(dipole, session, curve):
     study = dipole(mesh__block_size_m=0.007, iron_ring=tube({"curve": curve}),
                    array__remanence_T=0.4, array__exceptions=alike)
     points = circle(0.075)
-    theirs = solve_nominal(study, points, session)
+    theirs = solve_nominal(build_magnet(study), points, session)
     magnet = magnet_of(study)
     np.testing.assert_allclose(full_field(magnet, points), theirs, atol=1e-4)
     if curve["kind"] == "brauer":  # negative control
@@ -215,7 +216,7 @@ def test_reaction_in_3d(short_dipole, session, iron):
     """
     study = short_dipole(iron_ring=tube(IRONS[iron]),
                          mesh={"block_size_m": 0.02, "meridian_size_m": 0.005, "growth": 1.3})
-    theirs = finite_element_part(study, POINTS, session, columns=False).nominal
+    theirs = finite_element_part(build_magnet(study), POINTS, session, columns=False).nominal
     ours = reaction_field(magnet_of(study), POINTS)
     cap = {"none": 2e-5, "linear": 6e-5}[iron]
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < cap
@@ -230,7 +231,7 @@ def test_reaction_of_other_shapes(dipole, session, shape):
     """In two dimensions, with gaps; 16 mT, 7 mT and 2 mT. Measured 3e-6 T, 2e-6 T and 3e-7 T."""
     study = of_shape(dipole, shape, mesh__block_size_m=0.004)
     points = circle(0.075)
-    theirs = finite_element_part(study, points, session, columns=False).nominal
+    theirs = finite_element_part(build_magnet(study), points, session, columns=False).nominal
     ours = reaction_field(magnet_of(study), points)
     np.testing.assert_allclose(ours, theirs, atol=2e-5)
     assert np.abs(ours + theirs).max() > 1e-3

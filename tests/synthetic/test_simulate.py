@@ -12,7 +12,7 @@ import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import EXIT_CODES, StudyError
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
@@ -138,7 +138,8 @@ def test_the_truth_is_sealed(campaigns):
     assert f"<td>{largest:.5g}</td>" in text
     # blocks are shown as they were ordered, not as they were drawn
     shown = set(re.findall(r"M = \(([^)]*)\)", text.rpartition("<h2>Pictures")[0]))
-    assert shown == _words(block.magnetization[:2] for block in blocks_of(read_study(study)))
+    assert shown == _words(block.magnetization[:2]
+                           for block in build_magnet(read_study(study)).blocks)
     assert not shown & _words(block["magnetization_A_per_m"][:2] for block in truth["blocks"])
 
 
@@ -231,7 +232,7 @@ def test_block_table_gives_the_magnetizations_back(short_dipole):
     drawn = draw_magnet(study, nominal, np.random.default_rng(1))
     table, calibration = coil_table(study, nominal, drawn.single, 1e-6, np.random.default_rng(2))
     assert calibration == 0  # the prior has no common mode
-    found = prior_from_blocks(study, table).gaussian.mean.reshape(-1, 3)
+    found = prior_from_blocks(build_magnet(study), table).gaussian.mean.reshape(-1, 3)
     true = np.array([body.magnetization for body in drawn.single.bodies])
     size = np.linalg.norm(true[0])
     assert np.linalg.norm(found - true, axis=1).max() < 1.5e-3 * size
@@ -244,7 +245,7 @@ def test_lone_moment(short_dipole):
     mu - 1 and the tensor's 6e-4: measured 1.4e-4 apart. Without N it would be 3e-2.
     """
     study = short_dipole(array__first_block_angle_deg=0.0, array__recoil_permeability=1.1)
-    block, body = blocks_of(study)[0], magnet_of(study).bodies[0]
+    block, body = build_magnet(study).blocks[0], magnet_of(study).bodies[0]
     (tensor,) = demagnetizing_tensors([block])
     expected = block.volume / MU_0 * np.linalg.inv(np.eye(3) + 0.1 * tensor)
     found = moment_matrix(body.shape, body.permeability)
@@ -302,7 +303,7 @@ def test_noise_of_fourier_coefficients(dipole):
         "positions": {"kind": "circles", "radius_m": 0.075, "angles": 24}})
     data = simulate_campaign(study, 1).readings
     observation = observe(study, points_of(data), ~np.isnan(data["B_T"].values))
-    np.testing.assert_allclose(reading_noise(study, observation, data).sd, 1e-4)
+    np.testing.assert_allclose(reading_noise(build_magnet(study), observation, data).sd, 1e-4)
     quiet = simulate_campaign(
         study.with_(noise__regions=(study.noise.regions[0].with_(sigma_T=1e-9),)), 1).readings
     noise = (data["B_T"] - quiet["B_T"]).values
@@ -387,6 +388,6 @@ def test_uncertain_positions_move_the_probe():
     assert np.std(moved) == pytest.approx(1e-4, rel=0.3)  # 72 draws
     assert real_places(study, points, np.random.default_rng(1)) is points
     one, other = (simulate_campaign(each, 2).readings["B_T"].values for each in (study, loose))
-    gradient = gradient_of(blocks_of(study), points)
+    gradient = gradient_of(build_magnet(study).blocks, points)
     spread = np.sqrt(np.mean((gradient[:, :2] ** 2).sum(axis=2))) * 1e-4
     assert np.sqrt(np.nanmean((one - other)[:, :2] ** 2)) == pytest.approx(spread, rel=0.3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -179,7 +179,8 @@ def with_remanence(study: Study) -> Study:
     if study.array.remanence_T is not None:
         return study
     bare = with_array(study, exceptions=())
-    return with_array(study, block_moment_A_m2=None, remanence_T=blocks_of(bare)[0].remanence)
+    return with_array(study, block_moment_A_m2=None,
+                      remanence_T=build_magnet(bare).blocks[0].remanence)
 
 
 def changed(scene: NominalFields, study: Study) -> Floats:

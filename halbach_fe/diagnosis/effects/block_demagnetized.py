@@ -16,7 +16,6 @@ from halbach_fe.diagnosis.effects.base import (
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import blocks_of
 from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
@@ -38,7 +37,7 @@ class BlockDemagnetizedEffect(Effect):
         """See `Effect.signature`."""
         (number,) = blocks_at(scene, place)
         block = scene.blocks[number]
-        whole = blocks_of(as_meant(scene.study))[number].remanence  # whatever it has lost already
+        whole = as_meant(scene.magnet).blocks[number].remanence  # whatever it has lost already
         return -whole * (scene.unit_fields[number] @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

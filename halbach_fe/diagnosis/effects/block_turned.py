@@ -16,8 +16,8 @@ from halbach_fe.diagnosis.effects.base import (
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.geometry.magnet import position_angle_deg
 from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
 

@@ -9,7 +9,8 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import blocks_of, position_angle_deg
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
@@ -41,7 +42,7 @@ class BlocksSwappedEffect(Effect):
         """See `Effect.shortlist`: the exchange of two blocks is a change of their magnetizations,
         whose evidence is a quadratic form of that of all blocks.
         """
-        blocks, size = blocks_of(study), study.dimension
+        blocks, size = build_magnet(study).blocks, study.dimension
         angles = np.radians([position_angle_deg(study.array, block.slot) for block in blocks])
         vectors = mean.reshape(len(blocks), size)
         own = np.array([rotation_about_z(-angle)[:size, :size] @ vector

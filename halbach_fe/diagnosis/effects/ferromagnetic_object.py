@@ -9,7 +9,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import array_half_length
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.external_field import dipole_field
 from halbach_fe.study.magnet import PointDipole
 from halbach_fe.study.model import Study
@@ -31,7 +31,7 @@ class FerromagneticObjectEffect(Effect):
         """See `Effect.places`."""
         if study.dimension == 2:
             return []
-        array, half = study.array, array_half_length(study)
+        array, half = study.array, build_magnet(study).array_half_length
         radii = [array.inner_radius_m, array.outer_radius_m, 1.4 * array.outer_radius_m]
         heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
         ends = [(r, z) for r in radii for z in heights]

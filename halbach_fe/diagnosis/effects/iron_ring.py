@@ -9,7 +9,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import array_outer_radius
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.magnet import IronRing
 from halbach_fe.study.model import Study
 
@@ -44,7 +44,7 @@ class IronRingEffect(Effect):
         """See `Effect.places`."""
         if study.iron_ring is not None:
             return []
-        blocks = array_outer_radius(study)
+        blocks = build_magnet(study).array_outer_radius
         return [Place(at_m=(blocks + gap, blocks + gap + thickness))
                 for gap, thickness in ((0.004, 0.002), (0.004, 0.01), (0.004, 0.025),
                                        (0.02, 0.01))]
@@ -64,7 +64,7 @@ class IronRingEffect(Effect):
         inner, outer = place.at_m
         farther, thicker = values[1:] or (0.0, 0.0)
         thickness = max(outer - inner + thicker, THINNEST_M)
-        inner = max(inner + farther, array_outer_radius(study) + CLEARANCE_M)
+        inner = max(inner + farther, build_magnet(study).array_outer_radius + CLEARANCE_M)
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
             relative_permeability=PERMEABILITY))

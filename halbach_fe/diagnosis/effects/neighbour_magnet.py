@@ -9,7 +9,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import array_half_length
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.external_field import neighbour_field
 from halbach_fe.study.magnet import Neighbour
 from halbach_fe.study.model import Study
@@ -38,18 +38,18 @@ class NeighbourMagnetEffect(Effect):
         """See `Effect.places`."""
         if study.dimension == 2:
             return []
-        length = 2 * array_half_length(study)
+        length = 2 * build_magnet(study).array_half_length
         return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
 
     def signature(self, scene: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return neighbour_field(scene.study, Neighbour(z_m=place.at_m[0]), scene.points,
+        return neighbour_field(scene.magnet, Neighbour(z_m=place.at_m[0]), scene.points,
                                order=4)[None]
 
     def refine(self, scene: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""
         stronger, farther = values[1:]
-        here, beyond = (neighbour_field(scene.study, Neighbour(z_m=_middle(place, one)),
+        here, beyond = (neighbour_field(scene.magnet, Neighbour(z_m=_middle(place, one)),
                                         scene.points) for one in (farther, farther + STEP_M))
         return np.array([here, (1 + stronger) * (beyond - here) / STEP_M])
 

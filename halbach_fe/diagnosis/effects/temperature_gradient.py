@@ -10,7 +10,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
 from halbach_fe.diagnosis.effects.temperature import coefficient
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.magnet import blocks_of
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
 
@@ -33,7 +33,7 @@ class TemperatureGradientEffect(Effect):
         """See `Effect.apply`."""
         found = []
         for slot in range(1, study.array.blocks_per_ring + 1):
-            middle = blocks_of(study)[slot - 1].middle[:2] / study.array.outer_radius_m
+            middle = build_magnet(study).blocks[slot - 1].middle[:2] / study.array.outer_radius_m
             found.append(BlockException(slot=slot, magnetization_factor=float(
                 1.0 + coefficient(study) * (middle @ np.asarray(values)))))
         return with_exceptions(study, found)
