@@ -21,7 +21,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.convergence import assess_convergence
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
-from halbach_fe.stats.noise import independent
+from halbach_fe.stats.noise import independent_noise
 from halbach_fe.stats.pcn import Posterior, Proposal, prior_reference, sample
 from halbach_fe.study.reader import read_study
 
@@ -49,7 +49,7 @@ def posterior_time(note: Note) -> None:
         whitened = matrix / sigma[:, None]
         whitened.T @ whitened
         middle = time.monotonic()
-        linear_gaussian.update(matrix, readings, independent(sigma), prior)
+        linear_gaussian.update(matrix, readings, independent_noise(sigma), prior)
         times.append((middle - started, time.monotonic() - middle))
     product, all_ = np.min(times, axis=0)
     note("inference.posterior_time_over_gram", all_ / product, "ratio",
@@ -98,7 +98,7 @@ def nonlinear(note: Note) -> None:
         model = nonlinear_model(build_magnet(study), update.observation, replace(
             session, folder=session.folder / "pcn"), np.random.default_rng(1))
         target = Posterior(lambda p: model(p, 1e-7), update.readings,
-                           update.noise.plus(model.error), prior)
+                           update.noise.with_independent_errors(model.error), prior)
         common.say(f"the paper's sampler, {PCN_STEPS} steps")
         generator = np.random.default_rng(2)
         chain = sample(target, [Proposal(prior_reference(prior), PCN_STEP)], PCN_STEPS, generator,

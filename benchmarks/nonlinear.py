@@ -22,7 +22,7 @@ from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.field import finite_element_part, vacuum_part
 from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.magnetostatics import fill_run_folder
+from halbach_fe.solver.magnetostatics import RunRequest, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.runs import newton_history
 from halbach_fe.solver.session import Session
@@ -53,9 +53,7 @@ def getdp_seconds(study: Study, samples: np.ndarray, folder: Path) -> float:
     mesh = verify_mesh(build_mesh(build_magnet(study), folder))
     started = time.monotonic()
     job = fill_run_folder(build_magnet(study), mesh, np.array([[0.0123, 0.0321, 0.0]]),
-                          folder / "run",
-                          CROSS_SECTION,
-                samples=samples)
+                          folder / "run", CROSS_SECTION, RunRequest(samples=samples))
     runner.run(find_getdp(), replace(
         job, resolution="Newton", solutions=None, outputs=("newton_flux_density.txt",),
         numbers={"TOLERANCE": LOOP_TOLERANCE, "LINE_SEARCH": 0}), folder / "run")

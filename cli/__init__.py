@@ -3,59 +3,59 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import ast
+import importlib
+import sys
+from collections.abc import Collection, Sequence
 from importlib import metadata
+from pathlib import Path
+from types import ModuleType
 
-from halbach_fe.cli import (
-    cache,
-    common,
-    completion,
-    demagnetization,
-    diagnose,
-    doctor,
-    export,
-    import_map,
-    infer,
-    multipoles,
-    new,
-    plan,
-    prior,
-    schema,
-    shim,
-    simulate_measurement,
-    solve,
-    sort,
-    tolerance,
-    verify,
-)
+from halbach_fe.cli import common
 from halbach_fe.core.errors import EXIT_CODES
 
 VERBS = {
-    "new": new, "solve": solve, "infer": infer, "diagnose": diagnose, "verify": verify,
-    "multipoles": multipoles, "plan": plan, "prior": prior, "shim": shim, "sort": sort,
-    "tolerance": tolerance, "demagnetization": demagnetization,
-    "simulate-measurement": simulate_measurement, "import-map": import_map, "export": export,
-    "cache": cache, "doctor": doctor, "schema": schema, "completion": completion}
+    "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
+    "multipoles": "multipoles", "plan": "plan", "prior": "prior", "shim": "shim", "sort": "sort",
+    "tolerance": "tolerance", "demagnetization": "demagnetization",
+    "simulate-measurement": "simulate_measurement", "import-map": "import_map", "export": "export",
+    "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
+"""Module of each verb."""
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
+def module_of(verb: str) -> ModuleType:
+    """Import the module of a verb."""
+    return importlib.import_module(f"halbach_fe.cli.{VERBS[verb]}")
+
+
+def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
+    """The command line, with the options of some verbs; of the others only their first line.
+
+    Only the modules of these verbs are imported: they may import much.
+    """
     codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
     top = argparse.ArgumentParser(
         prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
         epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument("--version", action="version", version=metadata.version("halbach-fe"))
-    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, module in VERBS.items():
-        text = (module.__doc__ or "").strip()
-        verb = verbs.add_parser(name, help=text.splitlines()[0], description=text,
-                                formatter_class=argparse.RawDescriptionHelpFormatter)
-        verb.set_defaults(parser=top)
-        module.add_arguments(verb)
+        text = _docstring(module)
+        verb = subparsers.add_parser(name, help=text.splitlines()[0], description=text,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name in verbs:
+            module_of(name).add_arguments(verb)
     return top
+
+
+def _docstring(module: str) -> str:
+    """Docstring of a verb's module, without importing it."""
+    source = Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
+    return ast.get_docstring(ast.parse(source)) or ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; return its exit code (`halbach_fe.core.errors.EXIT_CODES`)."""
-    arguments = parser().parse_args(argv)
-    return common.guarded(lambda: VERBS[arguments.verb].run(arguments))
+    words = sys.argv[1:] if argv is None else argv
+    arguments = parser([word for word in words if word in VERBS][:1]).parse_args(words)
+    return common.guarded(lambda: int(module_of(arguments.verb).run(arguments)))

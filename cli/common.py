@@ -1,4 +1,8 @@
-"""What the verbs share: options, progress, tables."""
+"""What the verbs share: options, progress, tables.
+
+Modules of the command line import little at their top, so that help and completion come at once;
+what computes is imported by the functions that use it.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +25,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-import scipy.linalg as linalg
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING
 
 from halbach_fe.core.errors import (
     MAX_QUOTED,
@@ -36,12 +34,15 @@ from halbach_fe.core.errors import (
     HalbachWarning,
     printable,
 )
-from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
-from halbach_fe.response.resource_estimate import TIME_FACTOR, Estimate
-from halbach_fe.solver.dask_cluster import connected
-from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.getdp_cache import Cache, default_cache
-from halbach_fe.solver.session import Session
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from halbach_fe.measurement.block_table import BlockTable
+    from halbach_fe.response.multipoles import MultipoleReference
+    from halbach_fe.response.resource_estimate import Estimate
+    from halbach_fe.solver.getdp_cache import Cache
+    from halbach_fe.solver.session import Session
 
 MAX_ORDER = 100
 """Of a multipole: beyond, nothing is left of it in the bore."""
@@ -62,6 +63,8 @@ def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
 
 def print_estimate(estimate: Estimate, as_json: bool) -> int:
     """Print what a run will take, and warn if memory is not enough; return the exit code."""
+    from halbach_fe.response.resource_estimate import TIME_FACTOR
+
     if as_json:
         print_json(estimate.as_dict())
     else:
@@ -156,7 +159,7 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference-radius-m", type=positive_number, metavar="R",
                         help="reference radius of the multipoles (default: that of the study's "
                         "circle, or two thirds of the bore)")
-    parser.add_argument("--orders", type=orders, default=DEFAULT_ORDERS, metavar="N..M",
+    parser.add_argument("--orders", type=orders, metavar="N..M",
                         help="orders of unwanted multipoles, 1 the dipole, as 2..10 or 3,5,7; the "
                         "magnet's own does not count (default: 1..10)")
     parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
@@ -167,8 +170,39 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def reference(arguments: argparse.Namespace) -> MultipoleReference:
-    """What `add_multipole_arguments` was given."""
-    return MultipoleReference(arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
+    """The reference that the options of `add_multipole_arguments` describe."""
+    from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
+
+    return MultipoleReference(arguments.reference_radius_m, arguments.orders or DEFAULT_ORDERS,
+                              arguments.at_z_m)
+
+
+def add_measurement_arguments(parser: argparse.ArgumentParser) -> None:
+    """--measurements and --blocks."""
+    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
+                        help="measured field map (CSV or HDF5)")
+    parser.add_argument("--blocks", type=Path, metavar="CSV",
+                        help="measured moments of the single blocks, whose prior replaces the "
+                        "study's")
+
+
+def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
+    """--held-out."""
+    parser.add_argument("--held-out", type=Path, metavar="MAP",
+                        help="another map, which is only predicted, at positions of its own")
+
+
+def measurements(
+    arguments: argparse.Namespace,
+) -> tuple[xr.Dataset, BlockTable | None, xr.Dataset | None]:
+    """Read the map, the table of blocks, and the map that is only predicted, as far as given."""
+    from halbach_fe.measurement.block_table import read_blocks
+    from halbach_fe.measurement.field_map import read_map
+
+    held_out = getattr(arguments, "held_out", None)
+    return (read_map(arguments.measurements),
+            read_blocks(arguments.blocks) if arguments.blocks else None,
+            read_map(held_out) if held_out else None)
 
 
 def add_seed_argument(parser: argparse.ArgumentParser) -> None:
@@ -268,27 +302,36 @@ def _claim_buffers() -> None:
     and where it gets nothing it tries forever.
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        import numpy as np
+        import scipy.linalg as linalg
+
         some = np.eye(200)  # numpy and scipy have one each
         linalg.cholesky(some @ some)
 
 
 @contextmanager
 def session(arguments: argparse.Namespace) -> Iterator[Session]:
-    """A session in the output folder; shows progress on a terminal's stderr."""
+    """Open a session in the output folder; progress is shown on a terminal's stderr."""
+    from halbach_fe.solver.dask_cluster import connected
+    from halbach_fe.solver.getdp import find_getdp
+    from halbach_fe.solver.session import Session
+
     getdp = find_getdp(arguments.getdp)
     with progress_bar("solving") as show, ExitStack() as stack:
-        made = Session(
+        opened = Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)
         if arguments.scheduler:
             cluster = stack.enter_context(connected(arguments.scheduler))
-            made = replace(made, run=cluster.run, jobs=arguments.jobs or cluster.cores)
-        yield made
+            opened = replace(opened, run=cluster.run, jobs=arguments.jobs or cluster.cores)
+        yield opened
 
 
 def cache(arguments: argparse.Namespace) -> Cache | None:
     """Where answers of GetDP are kept."""
+    from halbach_fe.solver.getdp_cache import default_cache
+
     return None if arguments.no_cache else default_cache(arguments.cache)
 
 
@@ -296,6 +339,8 @@ def cache(arguments: argparse.Namespace) -> Cache | None:
 def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
     """What runs independent functions: processes of this machine, or the --scheduler's workers."""
     if arguments.scheduler:
+        from halbach_fe.solver.dask_cluster import connected
+
         with connected(arguments.scheduler) as cluster:
             yield cluster.executor
         return
@@ -330,7 +375,16 @@ def jobs(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """What is called with done and total, and shows it on a terminal's stderr."""
+    """A function of done and total that shows them on a terminal's stderr."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
     console = Console(stderr=True)
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
                   MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
@@ -346,20 +400,23 @@ def print_json(value: object) -> None:
 
 def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
     """Print rows of text on stdout, if there are any."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    def cell(value: str) -> Text:
+        """Names of files and columns are no markup, nor commands to the terminal."""
+        return Text(printable(value, MAX_QUOTED))
+
     if not rows:
         return
     console = Console(width=None if sys.stdout.isatty() else 140)
     table = Table(title=title or None, title_justify="left")
     for number, name in enumerate(rows[0]):
-        table.add_column(_text(name), justify="left" if number < 2 else "right")
+        table.add_column(cell(name), justify="left" if number < 2 else "right")
     for row in rows:
-        table.add_row(*map(_text, row.values()))
+        table.add_row(*map(cell, row.values()))
     console.print(table)
-
-
-def _text(value: str) -> Text:
-    """As it is: names of files and columns are no markup, nor commands to the terminal."""
-    return Text(printable(value, MAX_QUOTED))
 
 
 def say(text: str) -> None:

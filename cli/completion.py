@@ -22,5 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    sys.stdout.write(shtab.complete(arguments.parser, shell=arguments.shell) + "\n")
+    import halbach_fe.cli  # the command line imports this verb when it is run
+
+    whole = halbach_fe.cli.parser()
+    sys.stdout.write(shtab.complete(whole, shell=arguments.shell) + "\n")
     return 0

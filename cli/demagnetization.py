@@ -10,36 +10,35 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--across", type=common.positive, default=ACROSS, metavar="N",
-                        help="cells across the thickness of a block (default: %(default)s)")
+    parser.add_argument("--across", type=common.positive, metavar="N",
+                        help="cells across the thickness of a block (default: 6)")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write everything, print the blocks with the least margin."""
+    from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
+    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.demagnetization import (
         demagnetization_summary,
-        worst_blocks,
+        worst_block_table,
         write_demagnetization,
     )
+    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    magnet = build_magnet(read_study(arguments.study))
     with common.session(arguments) as session:
-        found = demagnetization_map(magnet, session, arguments.across)
+        found = demagnetization_map(magnet, session, arguments.across or ACROSS)
     write_demagnetization(found, arguments.output)
     summary = demagnetization_summary(found)
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table(worst_blocks(found.by_block()), "Blocks with the least margin")
+        common.print_table(worst_block_table(found.by_block()), "Blocks with the least margin")
         common.say(f"{100 * found.share_beyond_now:.2g} % of the volume is past the knee at "
                    f"{found.material.temperature_C:g} °C.")
         common.say(f"Report: {arguments.output / 'demagnetization.html'}")

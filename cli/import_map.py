@@ -15,7 +15,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.measurement.field_map import points_of, write_map
 from halbach_fe.measurement.formats import READERS, ImportedFile, import_map
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.units import ANGLES, FIELDS, LENGTHS
 from halbach_fe.study.types import COMPONENTS
 
@@ -41,13 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="where the file's origin is, along the magnet's axes; write it "
                         "--origin-m=-0.5,0,0")
     parser.add_argument("--decimal-comma", action="store_true", help="0,5 is one half")
-    parser.add_argument("--encoding", default=Declared.encoding, help="of text (default: UTF-8)")
+    parser.add_argument("--encoding", default=DeclaredFormat.encoding,
+                        help="of text (default: UTF-8)")
     common.add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, convert, write, print what was understood."""
-    said = Declared(
+    said = DeclaredFormat(
         length_unit=arguments.length_unit, field_unit=arguments.field_unit,
         angle_unit=arguments.angle_unit, columns=arguments.columns,
         component=arguments.component, at=arguments.at, origin_m=arguments.origin_m,

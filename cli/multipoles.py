@@ -1,22 +1,17 @@
 """Compute the multipoles of a magnet, with their standard deviations.
 
-Of the magnet that was measured, from the posterior that `halbach-fe infer` found; without one, what
-the study's prior tells. In 3D of the field integrated along z, and of the circle at --at-z-m, which
-is otherwise in the middle. Writes multipoles.csv, multipoles.json, multipoles.html and its figures.
+Of the magnet that was measured, from the posterior that `halbach-fe infer` found; without one, from
+the study's prior. In 3D there are two tables: of the field integrated along z, and of the circle at
+--at-z-m (default: in the middle). Writes multipoles.csv, multipoles.json, multipoles.html and its
+figures.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.design.tolerance import assembled_prior
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.storage import read_posterior
-from halbach_fe.response.multipoles import multipole_models, text_table
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,20 +24,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve, write everything, print the tables."""
+    from halbach_fe.api import multipoles
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.multipoles import multipoles_summary, write_multipoles
+    from halbach_fe.response.multipoles import text_table
+    from halbach_fe.study.reader import read_study
 
-    study, wanted = read_study(arguments.study), common.reference(arguments)
+    study, limit = read_study(arguments.study), arguments.limit_units
     magnet = build_magnet(study)
-    known = read_posterior(magnet,
-                           arguments.posterior) if arguments.posterior else None
-    references = [wanted]
-    if study.dimension == 3:
-        references = [replace(wanted, z_m=None), replace(wanted, z_m=wanted.z_m or 0.0)]
+    posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
     with common.session(arguments) as session:
-        models = multipole_models(magnet, references, session)
-    magnets = known or {"prior": assembled_prior(magnet, models[0].nominal)}
-    tables = [(model, {name: model.of(one) for name, one in magnets.items()}) for model in models]
-    limit = arguments.limit_units
+        tables = multipoles(magnet, session, common.reference(arguments), posterior).tables
     write_multipoles(study, tables, limit, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(
             {"study file": arguments.study, "posterior": arguments.posterior})})

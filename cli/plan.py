@@ -9,9 +9,6 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.design.measurement_plan import plan_measurement
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,10 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan, write everything, print a summary."""
+    from halbach_fe.design.measurement_plan import plan_measurement
+    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.plan import plan_summary, write_plan  # matplotlib loads when needed
+    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    magnet = build_magnet(read_study(arguments.study))
     with common.session(arguments) as session:
         found = plan_measurement(magnet, session, arguments.points)
     write_plan(magnet, found, arguments.output)

@@ -10,10 +10,6 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,10 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Estimate, write everything, print the table of types."""
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.block_prior import prior_from_blocks
+    from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.report.prior import prior_summary, type_table, write_prior
+    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    magnet = build_magnet(read_study(arguments.study))
     prior = prior_from_blocks(magnet, read_blocks(arguments.blocks))
     write_prior(magnet, prior, arguments.output)
     if arguments.json:

@@ -7,20 +7,10 @@ shim.html and its figures, and study.shimmed.toml, the study with the blocks whe
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError
-from halbach_fe.design.shimming import shim
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.infer import infer
-from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.measurement.field_map import read_map
-from halbach_fe.response.multipoles import multipole_model, text_table
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,28 +35,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Infer, choose, write everything, print moves and multipoles."""
+    from halbach_fe.api import shim
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.infer import infer
+    from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.report.shimming import move_table, shim_summary, write_shim
+    from halbach_fe.response.multipoles import text_table
+    from halbach_fe.study.reader import read_study
 
     if arguments.stock and not arguments.replace:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
                          "replaced; instead it is alone. Add --replace.")
-    study, data = read_study(arguments.study), read_map(arguments.measurements)
-    magnet = build_magnet(study)
-    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
+    magnet = build_magnet(read_study(arguments.study))
+    data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     with common.session(arguments) as session:
-        update = infer(magnet, data, session, blocks)
-        model = multipole_model(magnet, common.reference(arguments), replace(
-            session, folder=arguments.output / "multipoles"))
-    found = shim(update, model, np.random.default_rng(arguments.seed), {
-        "swap": arguments.swaps, "turn": arguments.turns, "replace": arguments.replace},
-        arguments.limit_units, stock)
-    if update.prior_conflict > update.conflict_limit:
+        result = infer(magnet, data, session, blocks)
+        found = shim(result, session, common.reference(arguments), arguments.swaps,
+                     arguments.turns, arguments.replace, arguments.limit_units, stock,
+                     arguments.seed)
+    if result.prior_conflict > result.conflict_limit:
         common.say("warning: prior and map conflict, so that error bars mean little: something is "
                    "missing from the model (halbach-fe diagnose).")
-    write_shim(found, update, arguments.study.read_text(encoding="utf-8"), arguments.output)
+    write_shim(found, result, arguments.study.read_text(encoding="utf-8"), arguments.output)
     if arguments.json:
-        common.print_json(shim_summary(found, update))
+        common.print_json(shim_summary(found, result))
     else:
         common.print_table(move_table(found), "Moves")
         common.print_table(text_table(before=found.before, after=found.after),

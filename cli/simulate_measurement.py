@@ -14,7 +14,12 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.hidden_effects import EFFECTS, Wanted, signature, wanted
+from halbach_fe.synthetic.hidden_effects import (
+    EFFECTS,
+    RequestedEffect,
+    parse_hidden_effect,
+    signature,
+)
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import COIL_SD, simulate_campaign, write_campaign
 
@@ -43,9 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_json_argument(parser)
 
 
-def _effect(text: str) -> Wanted:
+def _effect(text: str) -> RequestedEffect:
     try:
-        return wanted(text)
+        return parse_hidden_effect(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

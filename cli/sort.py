@@ -9,14 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
 from halbach_fe.cli import common
-from halbach_fe.design.sorting import sort_blocks
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.response.multipoles import multipole_model
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,15 +23,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sort, write everything, print the multipoles."""
+    from halbach_fe.api import sort
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.report.sorting import order_table, sort_summary, write_sorted
+    from halbach_fe.study.reader import read_study
 
-    study, table = read_study(arguments.study), read_blocks(arguments.blocks)
-    magnet = build_magnet(study)
-    with common.session(arguments) as session:
-        model = multipole_model(magnet, common.reference(arguments), session)
-    with common.progress_bar("sorting") as show:
-        found = sort_blocks(magnet, table, model,
-                            np.random.default_rng(arguments.seed), show)
+    magnet = build_magnet(read_study(arguments.study))
+    table = read_blocks(arguments.blocks)
+    with common.session(arguments) as session, common.progress_bar("sorting") as show:
+        found = sort(magnet, table, session, common.reference(arguments), arguments.seed, show)
     write_sorted(found, arguments.limit_units, arguments.output)
     if arguments.json:
         common.print_json(sort_summary(found, arguments.limit_units))

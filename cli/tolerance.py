@@ -8,15 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
 from halbach_fe.cli import common
-from halbach_fe.design.tolerance import assembled_prior, predict_tolerance
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.response.multipoles import multipole_model
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,18 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw, write everything, print the quantiles."""
+    from halbach_fe.api import tolerance
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.report.tolerance import quantile_table, tolerance_summary, write_tolerance
+    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    magnet = build_magnet(read_study(arguments.study))
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.session(arguments) as session:
-        model = multipole_model(magnet, common.reference(arguments), session)
-    prior = (prior_from_blocks(magnet, blocks).gaussian if blocks
-             else assembled_prior(magnet, model.nominal))
-    found = predict_tolerance(model, magnet, prior, arguments.draws,
-                              np.random.default_rng(arguments.seed),
-                      arguments.limit_units)
+        found = tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
+                          arguments.limit_units, arguments.seed)
     write_tolerance(found, arguments.output)
     if arguments.json:
         common.print_json(tolerance_summary(found))

@@ -10,10 +10,6 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.response.mesh_convergence import verify
-from halbach_fe.response.resource_estimate import estimate_verify
-from halbach_fe.study.reader import read_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,10 +20,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify, write, print."""
-    from halbach_fe.report.verification import difference_table, verdict, write_verification
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.report.verification import (
+        difference_table,
+        verification_verdict,
+        write_verification,
+    )
+    from halbach_fe.response.mesh_convergence import verify
+    from halbach_fe.response.resource_estimate import estimate_verify
+    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    magnet = build_magnet(read_study(arguments.study))
     if arguments.dry_run:
         return common.print_estimate(estimate_verify(magnet, common.jobs(arguments)),
                                      arguments.json)
@@ -40,6 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         common.print_table(difference_table(found),
                            f"Route {found.route}; relative to {found.main_field_T:.4g} T")
-        common.say(verdict(magnet, found))
+        common.say(verification_verdict(magnet, found))
         common.say(f"Report: {arguments.output / 'verification.html'}")
     return 0

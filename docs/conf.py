@@ -1,5 +1,10 @@
-"""Sphinx settings; the reference is written from the code before every build."""
+"""Sphinx settings.
 
+The reference is written from the code before every build. The table of contents stands here and not
+in index.md, which is read on GitHub too, where a directive would be shown as text.
+"""
+
+import re
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +23,7 @@ myst_heading_anchors = 3
 autosummary_generate = True
 autodoc_typehints = "description"
 napoleon_google_docstring = False
+napoleon_use_ivar = True  # an attribute whose default is a function is not documented twice
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["formulas.css"]
@@ -25,6 +31,18 @@ html_theme = "furo"
 html_title = f"halbach-fe {release}"
 suppress_warnings = ["ref.python"]  # words of shapes are no cross-references
 exclude_patterns = ["_build"]
+
+CONTENTS = {
+    "Start": ("tutorial", "from-python", "glossary"),
+    "Gallery": ("gallery", *(f"gallery/{study}" for study in (
+        "faser", "linear-3d", "nonlinear-2d", "quadrupole", "mri", "sensitivity", "calibration",
+        "diagnosis"))),
+    "How to": ("how-to/own-geometry", "how-to/own-steel", "how-to/own-effect", "how-to/own-map",
+               "how-to/next-magnet", "how-to/many-cores", "how-to/cluster"),
+    "In depth": ("study-file", "file-formats", "theory", "accuracy", "inference", "diagnosis",
+                 "design", "simulated-campaigns", "scaling", "reliability", "security"),
+    "Reference": ("reference/study", "reference/commands", "reference/python")}
+"""Pages of the documentation, by caption in the sidebar."""
 
 
 def inline(translator, node):
@@ -39,7 +57,24 @@ def block(translator, node):
     raise nodes.SkipNode
 
 
+def add_contents(app, page, source):
+    """Append the table of contents to the first page."""
+    if page == app.config.root_doc:
+        source[0] += "".join(
+            "\n".join(["\n```{toctree}", ":hidden:", f":caption: {caption}\n", *pages, "```\n"])
+            for caption, pages in CONTENTS.items())
+
+
+def escape_bars(app, what, name, obj, options, lines):
+    """Keep reStructuredText from taking the bars of an absolute value for a substitution."""
+    lines[:] = [line if line.lstrip().startswith((">>>", "...")) else "".join(
+        part if part.startswith("``") else part.replace("|", "\\|")
+        for part in re.split(r"(``.*?``)", line)) for line in lines]
+
+
 def setup(app):
-    """Write what is generated; draw formulas."""
+    """Connect what writes the reference, adds the table of contents and draws formulas."""
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
+    app.connect("source-read", add_contents)
+    app.connect("autodoc-process-docstring", escape_bars, priority=900)  # after napoleon
     app.connect("builder-inited", lambda app: write_reference(Path(app.srcdir) / "reference"))

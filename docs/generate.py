@@ -1,4 +1,4 @@
-"""The reference, written from the code: keys of a study, commands, exit codes, modules."""
+"""Write the reference from the code: keys of a study, commands, the Python API."""
 
 from __future__ import annotations
 
@@ -7,19 +7,27 @@ import inspect
 from pathlib import Path
 
 from halbach_fe.cli import VERBS, parser
-from halbach_fe.core.errors import EXIT_CODES
 from halbach_fe.study.model import Study
 
-MODULES = ("study", "field_map", "block_table", "update", "diagnose", "effects.base", "observation",
-           "response", "exact_field", "analytic", "inference.linear", "inference.prior",
-           "inference.noise", "inference.sampling", "diagnosis.evidence", "diagnosis.selection")
+MODULES = (
+    "study.reader", "study.model", "study.magnet", "study.measurement", "study.solver",
+    "study.inference", "geometry.magnet", "stats.gaussian", "stats.noise", "stats.linear_gaussian",
+    "stats.pcn", "solver.vacuum_field", "solver.closed_form",
+    "measurement.field_map", "measurement.block_table", "measurement.observation",
+    "response.matrix", "inference.infer", "inference.result",
+    "diagnosis.diagnose", "diagnosis.result", "diagnosis.evidence", "diagnosis.model_selection",
+    "diagnosis.effects.base")
+"""Modules documented after the API, in the order of the rooms."""
 
 
 def write_reference(folder: Path) -> None:
-    """Write all generated pages into a folder."""
+    """Write all generated pages into a folder; pages that have not changed are left alone."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = {"study.md": study_page(), "commands.md": commands_page(),
-             "exit-codes.md": exit_codes_page(), "python.md": python_page()}
+             "python.md": python_page()}
+    for path in folder.glob("*.md"):
+        if path.name not in pages:  # of an earlier version
+            path.unlink()
     for name, text in pages.items():
         path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
@@ -80,16 +88,14 @@ def commands_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def exit_codes_page() -> str:
-    """What the exit codes mean."""
-    rows = "\n".join(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items())
-    return f"# Exit codes\n\n| code | meaning |\n|---|---|\n{rows}\n"
-
-
 def python_page() -> str:
-    """The modules that a script would use."""
-    parts = ["# Python"]
-    for name in MODULES:
-        full = f"halbach_fe.{name}"
-        parts.append(f"## {full}\n\n```{{eval-rst}}\n.. automodule:: {full}\n   :members:\n```")
+    """The Python API, which is the package itself, and then the modules it is made of."""
+    parts = ["# Python", _module("halbach_fe", ":imported-members:")]
+    parts += [_module(f"halbach_fe.{name}") for name in MODULES]
     return "\n\n".join(parts) + "\n"
+
+
+def _module(name: str, *options: str) -> str:
+    """A section with the docstrings of a module's public members."""
+    lines = [f".. automodule:: {name}", "   :members:", *(f"   {option}" for option in options)]
+    return "\n".join([f"## {name}\n", "```{eval-rst}", *lines, "```"])

@@ -1,4 +1,4 @@
-"""The cross-section of an array: blocks of any shape, iron ring, and air out to the boundary."""
+"""Mesh of an array's cross-section: blocks of any shape, iron ring, and air up to the boundary."""
 
 from __future__ import annotations
 
@@ -16,21 +16,34 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.geometry.regions import BlockRegion, Regions
 
-LINE, TRIANGLE = 1, 2  # Gmsh's element types
+LINE, TRIANGLE = 1, 2
+"""Gmsh's element types of straight edges and triangles."""
+
 COUNTED = 4000
-"""Triangles of a mesh that is made to count them: half a second."""
+"""Number of triangles up to which an estimate of a mesh's size builds the mesh itself; finer meshes
+are extrapolated from one of about this size, which takes half a second."""
 
 DRAWN = 64
-"""Blocks drawn at most: a second."""
+"""Number of blocks up to which an estimate of a mesh's size draws all of them; larger rings are
+extrapolated from so many blocks, which takes a second."""
 
 ALONG_CURVES = 0.7
-"""There are more triangles than area and size say, as curves are cut into whole edges, by a number
-that grows with this power of the refinement: measured 0.55 to 0.85 on four cross-sections of
-trapezoids, cubes and sectors, in steps of two; of a quarter of the triangles, an error of 3 %."""
+"""Exponent of the refinement with which the number of excess triangles grows. A mesh has more
+triangles than area and element size imply, because every curve is cut into whole edges. Measured
+are 0.55 to 0.85 on four cross-sections of trapezoids, cubes and sectors, refined by steps of two.
+The excess is about a quarter of all triangles, so that this range means an error of 3 %."""
 
 
 def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
-    """Mesh the cross-section with curved second-order triangles and return its regions."""
+    """Mesh the cross-section with curved second-order triangles and return its regions.
+
+    Raises
+    ------
+    MeshError
+        If Gmsh fails.
+    StudyError
+        If blocks or the iron ring overlap, or the outer boundary is too close.
+    """
     blocks = magnet.blocks
     with gmsh_session(magnet.name):
         radius = boundary_radius(magnet, "cross_section")
@@ -47,10 +60,17 @@ def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
 def draw(
     magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float
 ) -> dict[int, list[int]]:
-    """Draw the first ring's cross-section in a disk of ``radius`` (m); return physical tag ->
-    surfaces (none empty).
+    """Draw the cross-section of the first ring in a disk, and set the element sizes.
 
-    Sizes are set, nothing is meshed yet.
+    Parameters
+    ----------
+    radius : float, in m
+        Radius of the disk, the outer boundary.
+
+    Returns
+    -------
+    dict of int to list of int
+        The Gmsh surfaces of every physical tag; no list is empty. They are not meshed yet.
     """
     occ = gmsh.model.occ
     disk = [(2, occ.addDisk(0, 0, 0, radius, radius))]
@@ -75,7 +95,7 @@ def draw(
 
 
 def _check_shared(surfaces: dict[int, list[int]]) -> None:
-    """No piece of the cross-section may belong to two parts."""
+    """Raise StudyError if a surface belongs to two regions, which then overlap."""
     owner: dict[int, int] = {}
     for tag, pieces in surfaces.items():
         for piece in pieces:
@@ -86,31 +106,31 @@ def _check_shared(surfaces: dict[int, list[int]]) -> None:
 
 
 def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
-    """About how many triangles, and edges on the outer circle, the plane mesh of a study has, for
-    a kind of mesh (`extent.BOUNDARY_RATIO`).
+    """Estimate the numbers of triangles and of edges on the outer circle of the plane mesh.
 
-    Fine meshes and large rings are not made: one with larger elements is, and one or two with some
-    of the blocks, and nothing is written.
+    ``kind`` is the kind of mesh, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`. Small meshes
+    are built and counted. The size of a fine mesh is extrapolated from one with larger elements,
+    that of a large ring from one or two meshes with a part of its blocks. No file is written.
     """
     blocks = magnet.blocks[:magnet.array.blocks_per_ring]
     radius = boundary_radius(magnet, kind)
     wanted = _equilateral(magnet, radius)
     coarser = max(1.0, (wanted / COUNTED) ** 0.5)
     mesh = magnet.study.mesh
-    # not validated: it may be coarser than anybody should ask for
+    # model_copy does not validate: this mesh may be coarser than a study is allowed to ask for
     drawn = magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})}))
     triangles, rim = _counted(drawn, blocks[:DRAWN], radius)
-    more = triangles - _equilateral(drawn, radius)  # along curves
-    if len(blocks) > DRAWN:  # every further one adds the same
+    excess = triangles - _equilateral(drawn, radius)
+    if len(blocks) > DRAWN:  # every further block adds the same number of triangles
         fewer, _ = _counted(drawn, blocks[:DRAWN // 2], radius)
-        more += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
-    return wanted + more * coarser**ALONG_CURVES, rim
+        excess += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
+    return wanted + excess * coarser**ALONG_CURVES, rim
 
 
 def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
-    """Triangles, and edges on the outer circle, of a plane mesh with some of the blocks."""
+    """Return the numbers of triangles and of outer edges of the plane mesh of these blocks."""
     with gmsh_session(magnet.name):
         draw(magnet, blocks, radius)
         gmsh.model.mesh.generate(2)
@@ -120,7 +140,10 @@ def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> 
 
 
 def _equilateral(magnet: Magnet, radius: float) -> float:
-    """Equilateral triangles of the wanted size (see `_set_sizes`) that fill the disk."""
+    """Return the number of equilateral triangles of the wanted size that fill the disk.
+
+    The size depends on the radius as `_set_sizes` has it.
+    """
     mesh, bore = magnet.study.mesh, magnet.array.inner_radius_m
     r = np.concatenate([[0.0], np.geomspace(bore, radius, 2000)])
     middle = (r[1:] + r[:-1]) / 2
@@ -130,7 +153,7 @@ def _equilateral(magnet: Magnet, radius: float) -> float:
 
 
 def outer_curves(radius: float) -> list[int]:
-    """The curves of the outer boundary."""
+    """Return the Gmsh curves on the outer boundary, a circle of ``radius`` (m)."""
     found = []
     for _, curve in gmsh.model.getEntities(1):
         low, high = gmsh.model.getParametrizationBounds(1, curve)
@@ -141,7 +164,7 @@ def outer_curves(radius: float) -> list[int]:
 
 
 def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
-    """The region file's content; block tags count on from FIRST_BLOCK_TAG in block order."""
+    """Return the content of the region file; block tags count up from FIRST_BLOCK_TAG."""
     return Regions(
         study=magnet.name, dimension=magnet.dimension, air=tags.AIR_TAG,
         iron=None if magnet.iron_ring is None else tags.IRON_TAG,
@@ -154,6 +177,7 @@ def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
 
 
 def _surface(outline: Outline) -> int:
+    """Add the surface inside an outline to the Gmsh model; return its tag."""
     occ = gmsh.model.occ
     points = [occ.addPoint(*edge.start, 0) for edge in outline]
     curves = []
@@ -169,9 +193,9 @@ def _surface(outline: Outline) -> int:
 
 
 def _set_sizes(magnet: Magnet) -> None:
-    """Element size: the bore's, the blocks', then growing linearly towards the boundary.
+    """Set the element sizes in Gmsh.
 
-    As fields of Gmsh's own: a Python callback would swallow Ctrl-C in the midst of meshing.
+    The size is constant in the bore and in the magnet, and grows linearly outside. The sizes are Gmsh fields, because a Python callback would swallow Ctrl-C during meshing.
     """
     block_size = magnet.study.mesh.block_size_m
     bore_size = magnet.study.mesh.bore_size_m or block_size

@@ -1,9 +1,9 @@
-"""3D arrays: the cross-section in curved triangles, stacked in layers of tetrahedra along z.
+"""Mesh of a 3D array: the plane mesh of the cross-section, stacked in layers of tetrahedra along z.
 
-All blocks are prisms along z, so one plane mesh serves every ring; each layer decides which of
-its cells are magnet, iron or air. (Extruding a thousand volumes one by one takes Gmsh minutes;
-stacking the plane mesh takes a second.) GetDP 3.2 knows curved elements and elements of second
-order in 3D as tetrahedra only, so every prism of the stack is cut into three.
+All blocks are prisms along z, so that the same plane mesh serves every ring; the height of a layer
+decides which of its cells are magnet, iron or air. (Gmsh takes minutes to extrude a thousand
+volumes; stacking the plane mesh takes a second.) The only curved or second-order elements that
+GetDP 3.2 supports in 3D are tetrahedra, so every prism of the stack is cut into three of them.
 """
 
 from __future__ import annotations
@@ -22,18 +22,35 @@ from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import Regions
 
-TRIANGLE6, TETRAHEDRON10 = 9, 11  # Gmsh's element types
+TRIANGLE6, TETRAHEDRON10 = 9, 11
+"""Gmsh's element types of second-order triangles and tetrahedra."""
+
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))
-TETRAHEDRON_EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3))  # Gmsh's order
-TURNED = [1, 0, 2, 3, 4, 6, 5, 9, 8, 7]  # a tetrahedron with its first two corners exchanged
-# A prism, by corner (of the triangle, sorted) and level. Diagonals of its sides rise towards the
-# larger index, on both sides of a face.
+"""Corners of a triangle's edges, in Gmsh's order of the nodes on edges."""
+
+TETRAHEDRON_EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3))
+"""Corners of a tetrahedron's edges, in Gmsh's order of the nodes on edges."""
+
+TURNED = [1, 0, 2, 3, 4, 6, 5, 9, 8, 7]
+"""Node order of a tetrahedron with two corners exchanged, which inverts its orientation."""
+
+# The three tetrahedra of a prism. A pair is a corner of the triangle (sorted by node index) and a
+# level (0 below, 1 above). The diagonals of the prism's sides rise towards the larger node index,
+# so that the prisms on both sides of a face cut it in the same way.
 CUTS = (((0, 0), (1, 0), (2, 0), (2, 1)), ((0, 0), (1, 0), (1, 1), (2, 1)),
         ((0, 0), (0, 1), (1, 1), (2, 1)))
 
 
 def mesh_3d(magnet: Magnet, mesh_path: Path) -> Regions:
-    """Mesh a 3D study with curved second-order tetrahedra and return its regions."""
+    """Mesh a 3D study with curved second-order tetrahedra and return its regions.
+
+    Raises
+    ------
+    MeshError
+        If Gmsh fails.
+    StudyError
+        If blocks or the iron ring overlap, or the outer boundary is too close.
+    """
     blocks = magnet.blocks
     with gmsh_session(magnet.name):
         surfaces = draw(magnet, blocks, boundary_radius(magnet, "extruded"))
@@ -48,16 +65,16 @@ def mesh_3d(magnet: Magnet, mesh_path: Path) -> Regions:
 
 
 def layers(magnet: Magnet) -> Floats:
-    """z of the layer limits in m, from boundary to boundary.
+    """Return the z limits of the layers in m, ascending from boundary to boundary.
 
-    Layers are uniform within rings and for one bore radius beyond the ends, where readings are
-    dense; then they grow.
+    Layers have equal thickness in the magnet and up to one bore radius beyond its ends, where
+    readings are dense; farther out they grow by ``mesh.growth``.
     """
     assert magnet.array.ring_length_m is not None
     iron_end = magnet.iron_half_length
     thickness = magnet.array.ring_length_m / magnet.study.mesh.layers_per_ring
     limits = {limit for ring in magnet.ring_limits for limit in ring} | {-iron_end, iron_end}
-    # Rounding must not leave slivers between limits that are meant to be equal.
+    # Limits that differ only by rounding would make a sliver: keep one of them.
     stops = sorted(limits)
     stops = [stops[0]] + [b for a, b in pairwise(stops) if b - a > 1e-9]
     z: list[float] = [stops[0]]
@@ -69,6 +86,7 @@ def layers(magnet: Magnet) -> Floats:
 
 
 def _outside_layers(start: float, thickness: float, magnet: Magnet) -> list[float]:
+    """Return the upper limits in m of the layers from z = ``start`` to the outer boundary."""
     boundary = boundary_half_length(magnet, "extruded")
     z, size = [], thickness
     position = start
@@ -105,10 +123,12 @@ def _plane_mesh(surfaces: dict[int, list[int]]) -> tuple[Floats, Ints, Ints]:
 def _stack(
     magnet: Magnet, points: Floats, triangles: Ints, region: Ints, z: Floats
 ) -> None:
-    """Build the 3D mesh as discrete Gmsh entities, one per region, ready to be written.
+    """Build the 3D mesh in Gmsh as discrete entities, one per region, ready to be written.
 
-    Nodes stand on every level and half-way between: those of the triangles' edges half-way are
-    the middles of diagonals.
+    ``points`` (n, 2) in m, ``triangles`` (m, 6) and ``region`` (m,) are the plane mesh, ``z`` the
+    limits of the layers in m. Copies of all plane nodes lie at the limits and half-way between
+    them. Half-way copies of corners are middles of vertical edges; half-way copies of the middles
+    of triangle edges are middles of the diagonals of the prisms' sides.
     """
     count, levels = len(points), len(z)
     heights = np.sort(np.concatenate([z, (z[1:] + z[:-1]) / 2]))
@@ -138,7 +158,19 @@ def _stack(
 
 
 def _tetrahedra(triangles: Ints, count: int) -> Ints:
-    """Cut the prisms on the lowest layer; (3 triangles, 10) nodes, three cells a triangle."""
+    """Cut every prism of the lowest layer into three tetrahedra.
+
+    Parameters
+    ----------
+    triangles : ndarray of int, shape (m, 6)
+    count : int
+        Number of plane nodes: node i at half level k has the number i + k count.
+
+    Returns
+    -------
+    ndarray of int, shape (3 m, 10)
+        Nodes of the tetrahedra in Gmsh's order, with positive orientation.
+    """
     order = np.argsort(triangles[:, :3], axis=1)
     corners = np.take_along_axis(triangles[:, :3], order, axis=1)
     rank = np.argsort(order, axis=1)
@@ -146,7 +178,7 @@ def _tetrahedra(triangles: Ints, count: int) -> Ints:
     for edge, (i, j) in enumerate(TRIANGLE_EDGES):
         opposite = 3 - rank[:, i] - rank[:, j]
         middles[np.arange(len(triangles)), opposite] = triangles[:, 3 + edge]
-    # sorting may have turned the triangle over, and the middle cut is turned by itself
+    # an odd permutation by the sorting inverts the orientation, and so does the second cut
     odd = np.linalg.det(np.eye(3)[order]) < 0
     cells = np.empty((len(triangles), len(CUTS), 10), int)
     for number, cut in enumerate(CUTS):
@@ -162,9 +194,10 @@ def _tetrahedra(triangles: Ints, count: int) -> Ints:
 
 
 def _side_faces(rim: Ints, count: int) -> Ints:
-    """Triangles (2 m, 6) of the lowest layer on the outer cylinder, cut as the tetrahedra are.
+    """Return the triangles (2 m, 6) of the lowest layer on the outer cylinder.
 
-    ``rim`` (m, 3) holds ends, the smaller index first, and middle of the outer edges.
+    They are faces of the tetrahedra. ``rim`` (m, 3) are the nodes of the outer edges: both ends,
+    the smaller index first, then the middle.
     """
     a, b, middle = rim.T
     up = 2 * count
@@ -174,7 +207,10 @@ def _side_faces(rim: Ints, count: int) -> Ints:
 
 
 def _layer_tags(magnet: Magnet, region: Ints, z: float) -> Ints:
-    """Physical tags of plane cells in the layer around height z."""
+    """Return the physical tags (m,) of the cells in the layer around height z (m).
+
+    ``region`` (m,) are the tags of the plane cells: a block's cell is air above or below its ring.
+    """
     result = np.full(len(region), tags.AIR_TAG)
     for ring, (low, high) in enumerate(magnet.ring_limits):
         if low < z < high:
@@ -186,8 +222,9 @@ def _layer_tags(magnet: Magnet, region: Ints, z: float) -> Ints:
 
 
 def _rim(points: Floats, triangles: Ints, radius: float) -> Ints:
-    """Ends, smaller index first, and middle (m, 3) of the plane mesh's edges on the outer
-    circle.
+    """Return the nodes (m, 3) of the edges on the outer circle: both ends, then the middle.
+
+    The end with the smaller index is first. ``radius`` is that of the circle in m.
     """
     edges = np.vstack([triangles[:, [i, j, 3 + edge]]
                        for edge, (i, j) in enumerate(TRIANGLE_EDGES)])

@@ -1,7 +1,7 @@
-"""The (r, z) half-plane of a rotationally symmetric magnet, in rectangles.
+"""Mesh of the (r, z) half-plane of a rotationally symmetric magnet, in rectangles.
 
-For the solver that takes one azimuthal mode at a time: x is r, y is z; a ring of blocks is one
-region, whatever the blocks' angles.
+The azimuthal-mode solver uses it. The mesh's x is r and its y is z. All blocks of a ring form one
+region, because their permeability does not depend on the azimuth.
 """
 
 from __future__ import annotations
@@ -19,13 +19,24 @@ from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import BlockRegion, Regions
 
-LINE, QUADRANGLE = 1, 3  # Gmsh's element types
+LINE, QUADRANGLE = 1, 3
+"""Gmsh's element types of edges and quadrangles."""
+
 _GROWTH = 1.35
-_GRADING, _LEVELS = 0.3, 2  # ratio of neighbours towards a corner, and how many of them
+"""Ratio of the sizes of neighbouring elements towards the outer boundary."""
+
+_GRADING, _LEVELS = 0.3, 2
+"""Refinement at corners of materials: ratio of successive subdivisions, and their number."""
 
 
 def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
-    """Mesh the half-plane with elements of ``size`` (m) at the magnet; return its regions."""
+    """Mesh the half-plane with elements of ``size`` (m) in the magnet; return its regions.
+
+    Raises
+    ------
+    MeshError
+        If Gmsh fails.
+    """
     r, z = _radii(magnet, size), _heights(magnet, size)
     with gmsh_session(magnet.name):
         _build(magnet, r, z)
@@ -40,11 +51,12 @@ def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
 
 
 def grid_size(magnet: Magnet, size: float) -> tuple[int, int]:
-    """Numbers of nodes of the half-plane's mesh along r and z."""
+    """Return the numbers of nodes along r and z of the half-plane's mesh."""
     return len(_radii(magnet, size)), len(_heights(magnet, size))
 
 
 def _radii(magnet: Magnet, size: float) -> Floats:
+    """Return the radii of the grid lines in m, ascending from 0."""
     array, iron = magnet.array, magnet.iron_ring
     stops = [0.0, array.inner_radius_m, array.outer_radius_m]
     if iron is not None:
@@ -54,10 +66,11 @@ def _radii(magnet: Magnet, size: float) -> Floats:
 
 
 def _heights(magnet: Magnet, size: float) -> Floats:
+    """Return the z of the grid lines in m, ascending."""
     end = magnet.half_length
     stops = {limit for ring in magnet.ring_limits for limit in ring} | {-end, end}
     stops |= {-magnet.iron_half_length, magnet.iron_half_length} if magnet.iron_ring else set()
-    # the fringe is as important as the body: one bore radius of uniform elements beyond the ends
+    # uniform elements up to two bore radii beyond the ends: the fringe field matters as much
     boundary = boundary_half_length(magnet, "meridian")
     uniform = min(end + 2 * magnet.array.inner_radius_m, 0.5 * (end + boundary))
     outside = _growing(uniform, size, boundary)
@@ -69,8 +82,9 @@ def _heights(magnet: Magnet, size: float) -> Floats:
 
 
 def _graded(positions: list[float], corners: list[float]) -> Floats:
-    """Cut the elements beside corners of materials, where the field is singular, into ever smaller
-    ones.
+    """Return grid lines with the elements beside corners of materials subdivided geometrically.
+
+    The field is singular at these corners.
     """
     x = np.array(positions)
     added = []
@@ -83,7 +97,10 @@ def _graded(positions: list[float], corners: list[float]) -> Floats:
 
 
 def _uniform(stops: list[float], size: float) -> list[float]:
-    """Subdivide between stops, all included; stops nearer than 1e-9 m are one."""
+    """Return positions at most ``size`` apart that include the stops.
+
+    Stops that are less than 1e-9 m apart count as one.
+    """
     result = [stops[0]]
     for start, stop in pairwise(stops):
         if stop - start > 1e-9:
@@ -93,7 +110,7 @@ def _uniform(stops: list[float], size: float) -> list[float]:
 
 
 def _growing(start: float, size: float, stop: float) -> list[float]:
-    """Positions after ``start`` whose distances grow geometrically up to ``stop``."""
+    """Return positions after ``start`` up to ``stop`` with geometrically growing distances."""
     result, position = [], start
     while position < stop:
         size *= _GROWTH
@@ -103,7 +120,7 @@ def _growing(start: float, size: float, stop: float) -> list[float]:
 
 
 def _build(magnet: Magnet, r: Floats, z: Floats) -> None:
-    """Tensor grid of rectangles as discrete Gmsh entities."""
+    """Build the tensor grid of rectangles in Gmsh as discrete entities, one per region."""
     columns, rows = len(r), len(z)
     points = np.zeros((columns * rows, 3))
     points[:, 0] = np.repeat(r, rows)
@@ -133,6 +150,7 @@ def _build(magnet: Magnet, r: Floats, z: Floats) -> None:
 
 
 def _materials(magnet: Magnet, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return the physical tags (n,) of the materials at points r, z (n,) in m."""
     result = np.full(len(r), tags.AIR_TAG)
     array, iron = magnet.array, magnet.iron_ring
     inside = (r > array.inner_radius_m) & (r < array.outer_radius_m)

@@ -1,4 +1,4 @@
-"""One private Gmsh session: Gmsh keeps global state, so nothing of it may leak."""
+"""Gmsh sessions that leave no state behind: Gmsh's state is global to the process."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import gmsh
 
 from halbach_fe.core.errors import HalbachError, MeshError
 
-_ALONE = threading.Lock()
-"""There is one Gmsh in a process, whatever its threads would like."""
+_GMSH_LOCK = threading.Lock()
+"""Held during a session, because all threads of a process share one Gmsh."""
 
 
 @contextmanager
 def gmsh_session(name: str) -> Iterator[None]:
-    """Start Gmsh quietly and reproducibly, and stop it whatever happens.
+    """Run Gmsh without terminal output and with reproducible options, and finalize it at the end.
 
     Raises
     ------
     MeshError
-        In place of Gmsh's bare exceptions.
+        If Gmsh fails; Gmsh itself raises plain `Exception`.
     """
-    with _ALONE:
+    with _GMSH_LOCK:
         yield from _session(name)
 
 
@@ -35,16 +35,16 @@ def _session(name: str) -> Iterator[None]:
     try:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():
-                signal.signal(number, handler)  # Gmsh resets them
+                signal.signal(number, handler)  # gmsh.initialize replaced them
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("General.NumThreads", 1)  # the same mesh on every machine
-        gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)  # the newest that GetDP reads here
+        gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)  # the newest that GetDP 3.2 reads
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.model.add(name)
         yield
     except HalbachError:
         raise
-    except Exception as error:  # gmsh raises plain Exception
+    except Exception as error:
         raise MeshError(
             f"Gmsh could not mesh study '{name}': {error}. Check radii, gaps and element sizes."
         ) from error
@@ -53,7 +53,7 @@ def _session(name: str) -> Iterator[None]:
 
 
 def write_mesh(path: Path) -> None:
-    """Write the current model; the file appears whole or not at all."""
+    """Write the current model atomically: the file appears complete or not at all."""
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         gmsh.write(str(temporary))

@@ -1,1 +1,88 @@
-"""halbach-fe: finite elements and Bayesian inference for permanent-magnet Halbach arrays."""
+"""Finite elements and Bayesian inference for permanent-magnet Halbach arrays.
+
+Examples
+--------
+>>> import halbach_fe as hf
+>>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+>>> session = hf.Session.open("results")
+>>> hf.solve(magnet, session).flux_density.shape
+(24, 3)
+>>> result = hf.infer(magnet, hf.read_map("map.csv"), session)
+>>> result.kind
+'closed form'
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from halbach_fe.api import MultipoleTables as MultipoleTables
+    from halbach_fe.api import demagnetization as demagnetization
+    from halbach_fe.api import diagnose as diagnose
+    from halbach_fe.api import multipoles as multipoles
+    from halbach_fe.api import plan as plan
+    from halbach_fe.api import shim as shim
+    from halbach_fe.api import simulate_measurement as simulate_measurement
+    from halbach_fe.api import sort as sort
+    from halbach_fe.api import tolerance as tolerance
+    from halbach_fe.core.errors import HalbachError as HalbachError
+    from halbach_fe.core.errors import HalbachWarning as HalbachWarning
+    from halbach_fe.design.demagnetization import DemagnetizationMap as DemagnetizationMap
+    from halbach_fe.design.measurement_plan import MeasurementPlan as MeasurementPlan
+    from halbach_fe.design.shimming import Shim as Shim
+    from halbach_fe.design.sorting import SortedBlocks as SortedBlocks
+    from halbach_fe.design.tolerance import Tolerance as Tolerance
+    from halbach_fe.diagnosis.result import Diagnosis as Diagnosis
+    from halbach_fe.geometry.magnet import Magnet as Magnet
+    from halbach_fe.geometry.magnet import build_magnet as build_magnet
+    from halbach_fe.inference.infer import infer as infer
+    from halbach_fe.inference.result import InferenceResult as InferenceResult
+    from halbach_fe.measurement.block_table import BlockTable as BlockTable
+    from halbach_fe.measurement.block_table import read_blocks as read_blocks
+    from halbach_fe.measurement.field_map import read_map as read_map
+    from halbach_fe.report.write import write_report as write_report
+    from halbach_fe.response.mesh_convergence import Verification as Verification
+    from halbach_fe.response.mesh_convergence import verify as verify
+    from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
+    from halbach_fe.response.solution import Solution as Solution
+    from halbach_fe.response.solution import solve as solve
+    from halbach_fe.solver.session import Session as Session
+    from halbach_fe.study.model import Study as Study
+    from halbach_fe.study.reader import read_study as read_study
+    from halbach_fe.synthetic.simulate import SimulatedCampaign as SimulatedCampaign
+
+_HOME = {
+    "read_study": "study.reader", "build_magnet": "geometry.magnet",
+    "read_map": "measurement.field_map", "read_blocks": "measurement.block_table",
+    "Session": "solver.session",
+    "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
+    "verify": "response.mesh_convergence", "multipoles": "api", "plan": "api", "shim": "api",
+    "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
+    "write_report": "report.write",
+    "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
+    "Solution": "response.solution", "InferenceResult": "inference.result",
+    "Diagnosis": "diagnosis.result", "Verification": "response.mesh_convergence",
+    "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
+    "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
+    "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",
+    "DemagnetizationMap": "design.demagnetization", "SimulatedCampaign": "synthetic.simulate",
+    "HalbachError": "core.errors", "HalbachWarning": "core.errors"}
+"""Module of each name: what is not used is not imported."""
+
+__all__ = list(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of the interface when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'halbach_fe' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"halbach_fe.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Names of the interface."""
+    return sorted([*globals(), *__all__])

@@ -1,1 +1,1 @@
-"""GetDP problem files: plain `.pro` files, and the template of the generated case data."""
+"""GetDP problem files: plain ``.pro`` files, and templates of the case data that are generated."""

@@ -1,1 +1,1 @@
-"""What every other room uses: errors, files, arrays."""
+"""Foundations that all other packages use: error types, safe file access, array types."""

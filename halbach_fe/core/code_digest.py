@@ -1,8 +1,8 @@
-"""A digest of the program's own text, by which stored results are known to be of older code.
+"""A digest of the program's own source code, which reveals results that older code computed.
 
-A response matrix or a chain that an earlier version of a formula computed must not be reused. Which
-files it depends on is found from the import statements themselves, so that no list of folders can
-go out of date.
+A response matrix or a Markov chain that an earlier version of a formula computed must not be
+reused. The files that a result depends on are found from the import statements themselves, so that
+no hand-written list of folders can go out of date.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pathlib import Path
 
 @lru_cache(maxsize=8)
 def code_digest(module: str) -> bytes:
-    """SHA-256 of a module and of all that it imports from its own package, however indirectly.
+    """Return the SHA-256 of a module and of all modules of its package that it imports.
 
-    Where a package is imported, the data files beside its ``__init__`` (templates, GetDP problems)
-    count as well.
+    Indirect imports count too. Where a package is imported, the digest also covers the data files
+    beside its ``__init__`` (templates, GetDP problems).
 
     Examples
     --------
@@ -36,7 +36,7 @@ def code_digest(module: str) -> bytes:
 
 
 def sources(module: str) -> list[Path]:
-    """Files that `code_digest` reads, sorted by the names of their modules."""
+    """Return the files that `code_digest` reads, sorted by the names of their modules."""
     package = module.partition(".")[0]
     found: dict[str, Path] = {}
     waiting = [module]
@@ -60,7 +60,7 @@ def sources(module: str) -> list[Path]:
 
 
 def _path_of(module: str) -> Path | None:
-    """The file of a module; None if the name is that of a class or function within one."""
+    """Return the file of a module, or None if the name is that of a class or function."""
     parent = module.rpartition(".")[0]
     if parent:
         inside = _path_of(parent)
@@ -71,7 +71,10 @@ def _path_of(module: str) -> Path | None:
 
 
 def _imported(path: Path, name: str) -> Iterator[str]:
-    """Modules that a file may import, at its top or inside functions, in absolute imports."""
+    """Yield the names that a file imports absolutely, at its top or inside functions.
+
+    From ``from a import b`` both ``a`` and ``a.b`` follow, because ``b`` may be a module.
+    """
     for node in ast.walk(ast.parse(path.read_bytes(), filename=name)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

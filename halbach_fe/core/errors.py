@@ -1,22 +1,26 @@
-"""The errors a user can cause or meet, each with its own exit code.
+"""The errors that a user can cause or meet, each with its own exit code.
 
-One sentence pattern for all of them, so that they read alike::
+Errors of input share one sentence pattern (see `must_be`)::
 
     Input WHAT of WHERE must be EXPECTED; instead received GIVEN. HINT
 
-An error of any other type that reaches the command line is a bug of ours (exit code 1).
+An error of any other type that reaches the command line is a bug of halbach-fe (exit code 1).
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 MAX_SENTENCE, MAX_QUOTED = 3000, 1000
-"""Characters of an error, and of what it quotes, which may be a path or a list of keys."""
+"""Largest numbers of characters of an error message, and of each text that it quotes (a path or a
+list of keys, for example)."""
 
 
 class HalbachError(Exception):
-    """Base of every error that is reported as one sentence instead of a traceback.
+    """Base of all errors that are reported as one sentence instead of a traceback.
 
-    Whatever it quotes, it is one line of printable text.
+    The message is always one line of printable text, even if it quotes a hostile input.
     """
 
     exit_code = 1
@@ -26,7 +30,7 @@ class HalbachError(Exception):
 
 
 class HalbachWarning(UserWarning):
-    """Something that the user should know of a result that is delivered nevertheless."""
+    """A warning about a result that is delivered nevertheless."""
 
 
 class StudyError(HalbachError):
@@ -36,31 +40,71 @@ class StudyError(HalbachError):
 
 
 class MeasurementError(HalbachError):
-    """A measured map or block table cannot be read, or holds what cannot have been measured."""
+    """A measured map or block table cannot be read, or holds values that no measurement gives."""
 
     exit_code = 4
 
 
 class MeshError(HalbachError):
-    """Gmsh could not mesh the study, or the mesh does not hold what the solve needs."""
+    """Gmsh could not mesh the study, or the mesh lacks regions that the solve needs."""
 
     exit_code = 5
 
 
 class PointsOutsideError(MeshError):
-    """Points lie outside the meshed region."""
+    """Points lie outside the meshed region, where GetDP would print zeros.
+
+    Attributes
+    ----------
+    study : str
+        Name of the study, or of what else was meshed.
+    reason : str
+        Which points lie outside of what.
+    """
+
+    def __init__(self, study: str, reason: str) -> None:
+        self.study, self.reason = study, reason
+        super().__init__(self.sentence(f"`observation.positions` of study {study}"))
+
+    def sentence(self, source: str) -> str:
+        """Return the sentence for points that come from ``source``: a key of the study, a map."""
+        return (f"Input {source} must lie within the meshed region {self.reason} Check the units "
+                "of the points, or enlarge `open_boundary`.")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Support pickling, see `GetDPError`."""
+        return PointsOutsideError, (self.study, self.reason)
 
 
 class GetDPNotFoundError(HalbachError):
-    """No usable GetDP executable."""
+    """No usable GetDP executable was found."""
 
     exit_code = 6
 
 
 class GetDPError(HalbachError):
-    """GetDP failed, or answered with something that did not pass verification."""
+    """GetDP failed, or its output did not pass verification.
+
+    Attributes
+    ----------
+    log : Path or None
+        Log of the run. Whoever moves the run folder says here where the log is then.
+    """
 
     exit_code = 7
+
+    def __init__(self, sentence: str, log: Path | None = None) -> None:
+        super().__init__(sentence)
+        self.sentence = super().__str__()
+        self.log = log
+
+    def __str__(self) -> str:
+        """The sentence, and where the log is."""
+        return self.sentence + ("" if self.log is None else f" Its log is {printable(self.log, MAX_QUOTED)}.")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Support pickling: the error travels from worker processes to the main process."""
+        return type(self), (self.sentence, self.log)
 
 
 class NotConvergedError(GetDPError):
@@ -69,16 +113,18 @@ class NotConvergedError(GetDPError):
     Attributes
     ----------
     residuals : tuple of float
-        Of every step of the last sample, relative to the right-hand side.
+        Residual of every Newton step of the last sample, relative to the right-hand side.
     """
 
-    def __init__(self, message: str, residuals: tuple[float, ...]) -> None:
-        super().__init__(message)
+    def __init__(
+        self, sentence: str, residuals: tuple[float, ...], log: Path | None = None
+    ) -> None:
+        super().__init__(sentence, log)
         self.residuals = residuals
 
-    def __reduce__(self) -> tuple[type[NotConvergedError], tuple[str, tuple[float, ...]]]:
-        """Errors travel from one process to another."""
-        return NotConvergedError, (str(self), self.residuals)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Support pickling, see `GetDPError`."""
+        return NotConvergedError, (self.sentence, self.residuals, self.log)
 
 
 class OutputError(HalbachError):
@@ -88,30 +134,31 @@ class OutputError(HalbachError):
 
 
 class SamplingError(HalbachError):
-    """A posterior was not sampled well enough to be reported."""
+    """The Markov chains did not converge well enough for the posterior to be reported."""
 
     exit_code = 10
 
 
 class ExtraMissingError(HalbachError):
-    """An optional part of the installation is needed and is not there."""
+    """An optional dependency is needed but not installed."""
 
     exit_code = 11
 
 
 class SchedulerError(HalbachError):
-    """The Dask scheduler cannot be reached, or it and its workers failed."""
+    """The Dask scheduler cannot be reached, or the scheduler or its workers failed."""
 
     exit_code = 12
 
 
 class CheckFailedError(HalbachError):
-    """A self-check ran and its figure was out of bounds."""
+    """A self-check ran, and its result was outside the accepted limits."""
 
     exit_code = 9
 
 
 OUT_OF_MEMORY = 13
+"""Exit code if memory runs out; Python raises MemoryError, so no class above stands for it."""
 
 EXIT_CODES: dict[int, str] = {
     0: "success",
@@ -133,11 +180,14 @@ EXIT_CODES: dict[int, str] = {
 
 
 NO_BREAK_SPACES = "\u00a0\u202f"
-"""Before units; Python does not count them among what can be printed."""
+"""Spaces that separate numbers from units. `str.isprintable` is False for them."""
 
 
 def printable(text: object, most: int) -> str:
-    """What a terminal can print on one line without doing anything else; ? for other characters."""
+    """Return text as one line of at most ``most`` characters that is safe to print on a terminal.
+
+    ``?`` replaces control characters, which could otherwise act on the terminal.
+    """
     try:
         line = str(text)
     except ValueError:  # Python does not print integers of more than 4300 digits
@@ -147,7 +197,7 @@ def printable(text: object, most: int) -> str:
 
 
 def must_be(what: str, where: str, expected: str, received: object, hint: str = "") -> str:
-    """Return the project's error sentence: what, where, what was expected, what to do."""
+    """Return an error sentence: which input, where, what was expected, received, and what to do."""
     sentence = (f"Input {printable(what, MAX_QUOTED)} of {where} must be {expected}; instead "
                 f"received {printable(received, MAX_QUOTED)}.")
     return f"{sentence} {hint}" if hint else sentence

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Reading of input files, and atomic writing: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ from halbach_fe.core.temporary_files import remove_orphans, temporary_name
 
 
 def file_bytes(path: Path, where: str) -> bytes:
-    """Content of a file of measurements; MeasurementError if there is none."""
+    """Return the content of a file of measurements.
+
+    Raises
+    ------
+    MeasurementError
+        If the file cannot be read or is empty; ``where`` names it in the message.
+    """
     try:
         raw = path.read_bytes()
     except OSError as error:
@@ -30,12 +36,12 @@ def file_bytes(path: Path, where: str) -> bytes:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, moved there when the block succeeds.
+    """Yield a temporary path beside ``path``; rename it to ``path`` when the block succeeds.
 
     Raises
     ------
     OutputError
-        If the file cannot be written; nothing is left behind.
+        If the file cannot be written. The temporary file is removed in every case.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +67,7 @@ def _write_bytes(content: bytes, path: Path) -> None:
 
 
 def make_folder(folder: Path) -> Path:
-    """Make a folder and its parents if need be; raise OutputError if that cannot be."""
+    """Create a folder and its parents where they do not exist; raise OutputError on failure."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -70,6 +76,6 @@ def make_folder(folder: Path) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically; raise OutputError on failure."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

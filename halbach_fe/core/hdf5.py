@@ -1,4 +1,4 @@
-"""Labelled data written as HDF5."""
+"""Atomic writing of labelled data as HDF5."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from halbach_fe.core.files import _write_bytes, atomic
 
 
 def write_hdf5(data: xr.Dataset, path: Path) -> None:
-    """Write any labelled data as HDF5, whole or not at all; raise OutputError."""
+    """Write labelled data as an HDF5 file atomically; raise OutputError on failure."""
     with atomic(path) as temporary:
         _write_bytes(_hdf5(data), temporary)
 
 
 def _hdf5(data: xr.Dataset) -> bytes:
-    """HDF5 in memory: the library crashes when a disk fills up under its open file."""
+    """Return the HDF5 file in memory: the HDF5 library crashes if the disk fills up under it."""
     buffer = io.BytesIO()
     data.to_netcdf(buffer, engine="h5netcdf")
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Numbers as text files have them."""
+"""Parsing of numbers in text files."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import math
 import re
 
 MAX_CELL = 60
-"""Characters; no number has more, and patterns are slow on longer ones."""
+"""Most characters of a cell that is parsed: no number is longer, and matching the pattern is slow
+on long text."""
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d{1,4})?", re.ASCII)
-"""As programs print them, Fortran's D included."""
+"""Decimal numbers as programs print them, including Fortran's exponent letter D."""
 
 
 def parse_number(cell: str) -> float:
-    """The number in a cell.
+    """Return the finite number in a cell of a table.
 
     Raises
     ------
     ValueError
-        If it is none, or not finite; also for ``1_000`` and digits of other scripts, which Python
-        would take.
+        If the cell holds no number, or an infinite one. ``1_000`` and digits of other scripts are
+        refused as well, although Python's `float` accepts them.
     """
     if len(cell) > MAX_CELL or not NUMBER.fullmatch(cell):
         raise ValueError(cell)

@@ -1,8 +1,9 @@
-"""Names of files and folders in the making, and what is left of them when a process was killed.
+"""Names of unfinished files and folders, and removal of those that killed processes left behind.
 
-Whatever is written appears whole or not at all: it is made under a name of its own beside its
-place, and renamed. A process that is killed cannot tidy up; who comes next sees by the name that
-nobody works on it any more.
+Output appears complete or not at all: it is written under a temporary name in the same folder and
+then renamed. A process that is killed cannot remove its unfinished output. The temporary name holds
+the machine and the process number, so that a later process can tell that nobody works on it any
+more.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ _NAME = re.compile(r"\..+~(?P<host>[^~]+)~(?P<process>\d+)~")
 
 
 def temporary_name(name: str) -> str:
-    """How the name of something begins while this process is making it."""
+    """Return the first part of a file's or folder's name while this process writes it."""
     return f".{name}~{_here()}~{os.getpid()}~"
 
 
 def remove_orphans(folder: Path) -> None:
-    """Remove what processes of this machine that are gone were making in a folder."""
+    """Remove unfinished output from a folder if a process of this machine that has ended left it.
+
+    Output of processes on other machines, which may share the folder, stays.
+    """
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             match = _NAME.match(path.name)
@@ -35,17 +39,18 @@ def remove_orphans(folder: Path) -> None:
 
 
 def _here() -> str:
-    """The machine, and the name space of its process numbers: a container has its own."""
+    """Return the name of the machine and of its process name space (containers have their own)."""
     with contextlib.suppress(OSError):
         return f"{socket.gethostname()}-{os.stat('/proc/self/ns/pid').st_ino}"
     return socket.gethostname()
 
 
 def _runs(process: int) -> bool:
+    """Tell whether a process of this number runs, as far as that can be known."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # another's, or no number of a process
+    except (PermissionError, OverflowError):  # another user's process, or an impossible number
         pass
     return True

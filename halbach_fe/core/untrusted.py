@@ -1,8 +1,9 @@
-"""Files that libraries read for us, and what these must not do with files of unknown origin.
+"""Safe reading of HDF5 files and meshes of unknown origin.
 
-Whatever a library raises becomes ValueError with one line; what it prints or warns of is dropped.
-HDF5 files can name other files to take data from, and can promise any amount of data: both are
-refused before anything is read. No such file holds code: nothing here unpickles.
+The libraries h5py, xarray and meshio parse these files. Any exception that they raise becomes a
+ValueError of one line; their output and warnings are suppressed. An HDF5 file can refer to data in
+other files, and can declare far more data than it holds: both are refused before data is read. None
+of these functions executes code from a file (no unpickling).
 """
 
 from __future__ import annotations
@@ -22,28 +23,30 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-SMALL = 1 << 26
-"""Bytes of data that any file may promise."""
+ALWAYS_ALLOWED_BYTES = 1 << 26
+"""Size of the uncompressed data that an HDF5 file of any size may declare."""
 
-MOST_COMPRESSED = 100
-"""Times a file's size, of data in it, beyond `SMALL`. Ours are not compressed at all."""
+MAX_COMPRESSION_RATIO = 100
+"""Largest ratio of declared data to the file's size, if it is more than `ALWAYS_ALLOWED_BYTES`.
+Files that halbach-fe writes are not compressed at all."""
 
-_ALONE = threading.RLock()
-"""Where output goes, and whether there are warnings, is one thing for all threads."""
+_OUTPUT_LOCK = threading.RLock()
+"""Held while output and warnings are suppressed, because both are global to the process."""
 
 MAX_OBJECTS = 10_000
-"""Of an HDF5 file; groups may contain one another without end."""
+"""Largest number of groups and datasets of an HDF5 file: groups can contain one another in an
+endless cycle."""
 
 
 def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
-    """Labelled data of an HDF5 file, or one of its groups, in memory.
+    """Read the labelled data of an HDF5 file, or of one of its groups, into memory.
 
     Raises
     ------
     OSError
-        If there is no such file.
+        If the file cannot be opened.
     ValueError
-        If it is damaged, or refused as `open_hdf5` says.
+        If the file is damaged, or refused for a reason that `open_hdf5` lists.
     """
     with path.open("rb") as file, open_hdf5(file):
         pass
@@ -53,7 +56,7 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Values of just this shape, all of them finite; ValueError for any others."""
+    """Return values as floats; raise ValueError if their shape differs or one is not finite."""
     values = np.asarray(data.values, float)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"it must be {shape} finite numbers")
@@ -62,40 +65,42 @@ def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float
 
 @contextlib.contextmanager
 def open_hdf5(file: BinaryIO) -> Iterator[Any]:
-    """Open an HDF5 file.
+    """Open an HDF5 file as an `h5py.File` after checking that it is safe to read.
 
     Raises
     ------
     ValueError
-        If they are damaged, take data from other files (external links, external storage, virtual
-        datasets), hold objects that are no text, or promise more than a file of this size can hold.
+        If the file is damaged, takes data from other files (external links, external storage,
+        virtual datasets), holds data that are neither numbers nor text, or declares more data
+        than a file of its size can hold.
     """
     with _refusing():
         size = _check_heaps(file)
         opened = h5py.File(file, "r")
     with opened, np.errstate(all="ignore"):
         with _refusing():
-            _check(opened, max(SMALL, MOST_COMPRESSED * size))
+            _check(opened, max(ALWAYS_ALLOWED_BYTES, MAX_COMPRESSION_RATIO * size))
         yield opened
 
 
 def read_mesh(path: Path) -> meshio.Mesh:
-    """A file that meshio reads.
+    """Read a mesh or table file with meshio.
 
     Raises
     ------
     ValueError
-        If meshio does not, or ends the program, as it does for some.
+        If meshio cannot read the file. (It calls `sys.exit` for some damaged files.)
     """
     with _refusing():
         return meshio.read(path)
 
 
 def _check_heaps(file: BinaryIO) -> int:
-    """Refuse heaps in which HDF5 2.0 would go round for ever; return the size of the file.
+    """Refuse global heaps on which HDF5 2.0 would loop for ever; return the size of the file.
 
-    A heap is a chain of objects, each with index and length in 16 bytes before it; one of index 0
-    is free space, its length that of all (HDF5 File Format Specification, III.E).
+    A global heap is a sequence of objects, each after a header of 16 bytes with its index and
+    length. The object of index 0 is the free space; its length includes the header (HDF5 File
+    Format Specification, III.E), so that a length below 16 never moves a reader forward.
     """
     raw = file.read()
     for heap in re.finditer(rb"GCOL\x01\0{3}", raw):
@@ -111,6 +116,7 @@ def _check_heaps(file: BinaryIO) -> int:
 
 
 def _check(file: Any, limit: int) -> None:
+    """Raise ValueError if an open file is unsafe, or declares more than ``limit`` bytes of data."""
     if file.id.get_create_plist().get_sizes() != (8, 8):
         raise ValueError("its addresses are not of eight bytes")
     waiting, found, promised = [file], 0, 0
@@ -118,7 +124,7 @@ def _check(file: Any, limit: int) -> None:
         group = waiting.pop()
         for name in group:
             link = group.get(name, getlink=True)
-            if isinstance(link, h5py.SoftLink):  # what it is another name of comes by itself
+            if isinstance(link, h5py.SoftLink):  # an alias: its target is visited by its own name
                 continue
             if not isinstance(link, h5py.HardLink):
                 raise ValueError(f"`{name}` is in another file")
@@ -139,7 +145,7 @@ def _check(file: Any, limit: int) -> None:
 
 
 def _check_kind(kind: np.dtype[Any], name: str) -> None:
-    """Refuse what is neither numbers nor text: fields that overlap crash the HDF5 library."""
+    """Refuse types other than numbers and text: overlapping compound fields crash HDF5."""
     if h5py.check_string_dtype(kind) is None and (kind.kind not in "biufcS" or (
             kind.itemsize > (16 if kind.kind == "c" else 8))):
         raise ValueError(f"`{name}` holds neither numbers nor text")
@@ -147,16 +153,16 @@ def _check_kind(kind: np.dtype[Any], name: str) -> None:
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    """Turn what a library does with a bad file into one ValueError."""
+    """Turn any exception of a library into a ValueError of one line, and suppress its output."""
     silent = io.StringIO()
     try:
-        with (_ALONE, warnings.catch_warnings(), contextlib.redirect_stdout(silent),
+        with (_OUTPUT_LOCK, warnings.catch_warnings(), contextlib.redirect_stdout(silent),
               contextlib.redirect_stderr(silent)):
             warnings.simplefilter("ignore")
             yield
     except MemoryError:
         raise
-    except SystemExit:  # meshio's way to say so
+    except SystemExit:  # meshio ends the program on some damaged files
         raise ValueError("damaged") from None
     except Exception as error:
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__

@@ -1,1 +1,1 @@
-"""What follows for the magnet: tolerances, sorting, shimming, plans, demagnetization."""
+"""Design tasks: tolerances, sorting and shimming of blocks, measurement plans, demagnetization."""

@@ -1,8 +1,9 @@
-"""How near the blocks are to losing magnetization: H along the easy axis against the knee.
+"""The demagnetization margin: H along the easy axis compared with the knee of the B-H curve.
 
-Inside a block ``mu_0 H`` is the exact field of all blocks in vacuum, as their surface charge makes
-it, and the finite-element reaction of permeability and iron. Along the edges it is logarithmic:
-the least value grows with ever smaller cells, the share of the volume does not.
+Inside a block ``mu_0 H`` is the sum of the exact field of all blocks in vacuum, from their magnetic
+surface charge, and the finite-element reaction field of the permeability of the blocks and of the
+iron. H diverges logarithmically at the edges of blocks. The smallest margin therefore depends on
+the size of the cells, but the share of the volume past the knee converges.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import atomic
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import places_in
@@ -30,13 +32,14 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
 ORDER = 6
-"""Gauss points per panel, panels being no longer than half a cell: 1e-6 of the field."""
+"""Gauss points per panel of surface charge. A panel is at most half as long as a cell, so that the
+error is 1e-6 of the field."""
 
 ACROSS = 6
-"""Cells across the thickness of a block, unless one says otherwise."""
+"""Default number of cells across the radial thickness of a block."""
 
 SHARES = (0.0, 0.01)
-"""Of the magnet's volume, of which it is said at what temperature they are past the knee."""
+"""Shares of the magnet's volume for which the limit temperature is reported."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,12 @@ class Cells:
     ----------
     vertices : ndarray, shape (v, 3), in m
     corners : ndarray, shape (cells, 8), or in 2D (cells, 4)
-        Vertices of each, as VTK orders them.
+        Numbers of the vertices of each cell, in VTK's order.
     block : ndarray, shape (cells,)
-        Number of each cell's block, from 0.
+        Number of the block that each cell belongs to, counted from 0.
     middles : ndarray, shape (cells, 3), in m
-    volumes : ndarray, shape (cells,)
-        In m^3, in 2D in m^2.
+        Centres of the cells, where H is computed.
+    volumes : ndarray, shape (cells,), in m^3 (in 2D areas in m^2)
     """
 
     vertices: Floats
@@ -63,19 +66,20 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class DemagnetizationMap:
-    """H in the blocks of a magnet at a temperature, against the knee there.
+class DemagnetizationMap(ShownInNotebook):
+    """H in the blocks of a magnet at a given temperature, compared with the knee.
 
     Attributes
     ----------
     magnet : Magnet
-        As it was given, not at temperature.
+        The magnet with its remanence at the reference temperature.
     material : Demagnetization
+        The study's demagnetization data of the material.
     blocks : tuple of MagnetBlock
-        At temperature.
+        Blocks with their remanence at the material's temperature.
     cells : Cells
     along : ndarray, shape (cells,), in A/m
-        H along the magnetization: negative where it is driven back.
+        H along the magnetization; negative where H opposes the magnetization.
     """
 
     magnet: Magnet
@@ -86,25 +90,25 @@ class DemagnetizationMap:
 
     @property
     def study(self) -> Study:
-        """The study whose magnet it is."""
+        """The study of the magnet."""
         return self.magnet.study
 
     @property
     def margin(self) -> Floats:
-        """What is left to the knee, (cells,) in A/m; negative beyond it."""
+        """Margin between H and the knee, (cells,) in A/m; negative past the knee."""
         return self.along + knee(self.material, self.material.temperature_C)
 
     @property
     def share_beyond_now(self) -> float:
-        """Share of the volume past the knee at the map's temperature."""
+        """Share of the volume that is past the knee at the temperature of the map."""
         volumes = self.cells.volumes
         return float(volumes[self.margin < 0].sum() / volumes.sum())
 
     def share_beyond(self, temperature_C: Floats) -> Floats:
-        """Share of the volume past the knee, at each of (t,) temperatures.
+        """Return the share of the volume past the knee, for temperatures (t,) in °C.
 
-        Away from the map's temperature H is taken to change as the remanence does, which it does
-        in vacuum and in iron of constant permeability.
+        H is assumed to be proportional to the remanence when the temperature changes. This is exact
+        without iron and for iron of constant permeability.
         """
         weight = self.cells.volumes / self.cells.volumes.sum()
         grown = (remanence_factor(self.material, temperature_C)
@@ -114,12 +118,14 @@ class DemagnetizationMap:
                          for g, h in zip(grown, limit, strict=True)])
 
     def limit_temperature(self, share: float) -> float:
-        """Temperature in °C above which more than a share of the volume is past the knee; infinite
-        if none is.
+        """Return the highest temperature in °C with at most a share of the volume past the knee.
+
+        It is infinite if more of the volume is past the knee at no temperature.
         """
         material = self.material
         at_reference = -self.along / remanence_factor(material, material.temperature_C)
-        # -along (1 + alpha d) = knee (1 + beta d)
+        # solve -along (1 + alpha d) = knee (1 + beta d) for the temperature difference d of each
+        # cell, where alpha and beta are the coefficients of remanence and coercivity
         rate = (at_reference * material.remanence_coefficient_per_K
                 - knee(material, material.reference_temperature_C)
                 * material.coercivity_coefficient_per_K)
@@ -132,7 +138,7 @@ class DemagnetizationMap:
         return float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
 
     def by_block(self) -> list[dict[str, float | int]]:
-        """What a table says of each block that is magnetized."""
+        """Return a row per magnetized block: H, margins, and the coercivity that it would need."""
         share_of_coercivity = float(knee(self.material, self.material.temperature_C)
                                     / self.material.intrinsic_coercivity_A_per_m)
         rows: list[dict[str, float | int]] = []
@@ -153,13 +159,13 @@ class DemagnetizationMap:
 
 
 def remanence_factor(material: Demagnetization, temperature_C: Floats | float) -> Floats:
-    """Remanence over that at the reference temperature."""
+    """Return the remanence relative to that at the reference temperature."""
     return np.asarray(1 + material.remanence_coefficient_per_K * (
         np.asarray(temperature_C) - material.reference_temperature_C))
 
 
 def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
-    """|H| of the knee in A/m; not below 0."""
+    """Return |H| of the knee in A/m, at least 0."""
     factor = 1 + material.coercivity_coefficient_per_K * (
         np.asarray(temperature_C) - material.reference_temperature_C)
     return np.asarray(material.squareness * material.intrinsic_coercivity_A_per_m
@@ -168,17 +174,20 @@ def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
 
 def demagnetization_map(magnet: Magnet, session: Session,
                         across: int = ACROSS) -> DemagnetizationMap:
-    """Compute H in all blocks of the nominal magnet, at the study's temperature.
+    """Compute H in all blocks of the nominal magnet, at the temperature that the study states.
 
     Parameters
     ----------
+    magnet : Magnet
+    session : Session
     across : int
-        Cells across the thickness of a block; the other sides are cut into cells about as long.
+        Number of cells across the radial thickness of a block. In the other directions the cells
+        have about the same length.
 
     Raises
     ------
     StudyError
-        If the study does not say what its material withstands, or nothing is magnetized.
+        If the study has no demagnetization data of its material, or no block is magnetized.
     """
     material = magnet.study.demagnetization
     if material is None:
@@ -200,15 +209,15 @@ def demagnetization_map(magnet: Magnet, session: Session,
 
 
 def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
-    """The magnet with the remanence that its blocks have at the material's temperature."""
+    """Return the magnet whose blocks have the remanence of the material's temperature."""
     factor = float(remanence_factor(material, material.temperature_C))
     return magnet.with_(array__exceptions=(
         *magnet.array.exceptions, BlockException(magnetization_factor=factor)))
 
 
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
-    """Cut blocks, chosen by number, into cells."""
-    parts = [_cut_one(blocks[number], across) for number in numbers]
+    """Divide the blocks with the given numbers into cells, ``across`` the radial thickness."""
+    parts = [_cut_block(blocks[number], across) for number in numbers]
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _, _ in parts)])
     return Cells(
         np.vstack([vertices for vertices, _, _, _ in parts]),
@@ -219,7 +228,8 @@ def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> C
         np.concatenate([volumes for _, _, _, volumes in parts]))
 
 
-def _cut_one(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Floats]:
+def _cut_block(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Floats]:
+    """Return vertices, corners, centres and volumes of the cells of a block, as in `Cells`."""
     half = np.array([0.5])
     (inner,), (outer,) = places_in(block.outline, np.array([0.0, 1.0]), half)
     size = float(np.hypot(*(outer - inner))) / across
@@ -242,19 +252,20 @@ def _cut_one(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Flo
                      number[:, :-1, 1:]], axis=-1)
     corners = (face if infinite else np.concatenate([face[:-1], face[1:]], axis=-1))
     corners = corners.reshape(-1, corners.shape[-1])
-    one, two, three, four = vertices[corners[:, :4]].swapaxes(0, 1)
-    area = np.linalg.norm(np.cross(three - one, four - two), axis=1) / 2
+    first, second, third, fourth = vertices[corners[:, :4]].swapaxes(0, 1)
+    area = np.linalg.norm(np.cross(third - first, fourth - second), axis=1) / 2  # of its diagonals
     return vertices, corners, middles, area if infinite else area * (z[1] - z[0])
 
 
 def _count(length: float, size: float) -> int:
+    """Return the number of cells of about a given size along a length."""
     return max(1, round(length / size))
 
 
 def _field_strength(
     magnet: Magnet, blocks: Sequence[MagnetBlock], cells: Cells, session: Session
 ) -> Floats:
-    """H (cells, 3) in A/m."""
+    """Return H (cells, 3) in A/m at the centres of the cells."""
     points = cells.middles
     field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
     if not magnet.is_vacuum:
@@ -265,15 +276,16 @@ def _field_strength(
         else:
             field += solve_sources(reacting, points, (), session, formulation, anywhere=True)[0]
         if magnet.dimension == 2:
-            # so far mu_0 H_vacuum + (mu_0 mu_r H + B_r) - (mu_0 H_vacuum + B_r); the scalar
-            # potential gives mu_0 H itself
+            # In 2D the vector potential gives the reaction as the change of B, so that ``field`` is
+            # mu_0 H_vacuum + (mu_0 mu_r H + B_r) - (mu_0 H_vacuum + B_r) = mu_0 mu_r H. The scalar
+            # potential of 3D gives mu_0 H itself.
             tensors = np.array([block.recoil_tensor for block in blocks])[cells.block]
             field = np.linalg.solve(tensors, field[..., None])[..., 0]
     return (field + external_field(magnet, points)) / MU_0
 
 
 def write_vtu(found: DemagnetizationMap, path: Path) -> None:
-    """Write the cells with H along the magnetization, the margin and ring and slot, as VTU."""
+    """Write a VTU file of the cells with H along the magnetization, margin, ring and slot."""
     cells = found.cells
     kind = "quad" if cells.corners.shape[1] == 4 else "hexahedron"
     ring, slot = (np.array([getattr(block, name) for block in found.blocks])[cells.block]
@@ -283,5 +295,3 @@ def write_vtu(found: DemagnetizationMap, path: Path) -> None:
         "ring": [ring], "slot": [slot]})
     with atomic(path) as temporary:
         meshio.write(temporary, mesh, file_format="vtu")
-
-

@@ -1,5 +1,6 @@
-"""A measurement plan: the positions that tell most about a study's magnetizations, compared with
-the positions of the study.
+"""Measurement plans: positions with the most information about the magnetizations of a study.
+
+Positions are chosen by greedy D-optimal design, and compared with the study's own positions.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
@@ -24,27 +26,38 @@ from halbach_fe.stats.linear_gaussian import posterior
 from halbach_fe.stats.noise import NoiseCovariance
 
 CURVE_POINTS = 100
-"""Numbers of points for which the study's own positions are judged."""
+"""Number of subsets, of increasing size, of the study's positions whose information is computed."""
 
 
 @dataclass(frozen=True)
-class MeasurementPlan:
-    """Positions chosen one after another, and what they and the study's own tell.
+class MeasurementPlan(ShownInNotebook):
+    """Positions of a measurement plan, and its information compared with the study's positions.
 
     Attributes
     ----------
+    magnet : Magnet
     parameters : tuple of str
-    candidates, points, baseline : ndarray, shape (n, 3), in m
-        What was chosen from, what was chosen, in order, and the study's positions.
-    gain : ndarray
-        Expected information in nats after every chosen position.
-    baseline_counts, baseline_gain : ndarray
-        Numbers of the study's positions, spread evenly, and what they tell.
-    nominal, prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
-        Nominal magnetization; sd before, after the plan, and after as many of the study's
-        positions.
+        Names of the components of the magnetizations.
+    candidates : ndarray, shape (n, 3), in m
+        Positions among which the plan chooses.
+    points : ndarray, shape (count, 3), in m
+        Chosen positions, in the order of choice.
+    baseline : ndarray, shape (m, 3), in m
+        Positions of the study.
+    gain : ndarray, shape (count,)
+        Expected information in nats of the first 1, 2, ... chosen positions.
+    baseline_counts : ndarray of int
+        Numbers of positions in evenly spread subsets of the study's positions.
+    baseline_gain : ndarray
+        Expected information in nats of these subsets.
+    nominal : ndarray, shape (parameters,), in A/m
+        Nominal magnetization.
+    prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
+        Standard deviation of the prior, of the posterior for the plan, and of the posterior for
+        equally many evenly spread positions of the study (all of them if the plan has more).
     """
 
+    magnet: Magnet
     parameters: tuple[str, ...]
     candidates: Floats
     points: Floats
@@ -59,14 +72,18 @@ class MeasurementPlan:
 
     @property
     def same_information(self) -> int | None:
-        """How many chosen positions tell as much as all of the study's; None if all tell less."""
+        """Smallest number of chosen positions with the information of all the study's positions.
+
+        None if all chosen positions together have less information.
+        """
         enough = np.flatnonzero(self.gain >= self.baseline_gain[-1])
         return int(enough[0]) + 1 if len(enough) else None
 
     @property
     def volume_ratio(self) -> float:
-        """Mean sd (geometric, over the posterior's axes) after the plan over that after as many of
-        the study's positions.
+        """Ratio of the geometric mean sd for the plan to that for the study's positions.
+
+        The mean is over the principal axes of the posterior; both have equally many positions.
         """
         count = min(len(self.gain), len(self.baseline))
         own = self.baseline_gain[np.searchsorted(self.baseline_counts, count)]
@@ -80,21 +97,23 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     Parameters
     ----------
     count : int, optional
-        How many; default the study's ``plan.points``, else as many as the study
-        measures.
+        Number of positions to choose. Default: the study's ``plan.points``, else the number of
+        positions that the study measures.
 
     Raises
     ------
     StudyError
-        If there are fewer candidates, or the study does not observe flux densities.
+        If there are fewer candidates than positions to choose, a position is outside of the region
+        where the field is computed, or the study does not observe flux densities.
     """
     if magnet.study.observation.quantity != "flux_density":
         raise StudyError(
             f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
-            f"instead it is {magnet.study.observation.quantity}. Plan the points first.")
+            f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
+            "flux densities.")
     baseline = points_from(magnet.study.observation.positions)
     sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
-    places: list[Floats] = [points_from(one) for one in sets]
+    places: list[Floats] = [points_from(positions) for positions in sets]
     candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
     wanted = count or magnet.study.plan.points or len(baseline)
     if wanted > len(candidates):
@@ -102,18 +121,15 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
             f"Input `plan.points` of study {magnet.name} must be at most the number of candidates, "
             f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
     check_points(magnet, baseline)
-    try:
-        check_points(magnet, candidates)
-    except StudyError as error:
-        raise StudyError(str(error).replace("observation.positions", "plan.candidates")) from None
+    check_points(magnet, candidates, "plan.candidates")
     points = np.vstack([baseline, candidates])
     observation = observe(magnet.study, points, np.ones_like(points, bool))
     noise = reading_noise(magnet, observation, xr.Dataset())
     model = response_matrix(magnet, observation, session)
-    errors = noise.plus(model.error)
+    errors = noise.with_independent_errors(model.error)
     prior = nominal_prior(model.nominal, magnet.dimension, magnet.study.prior.magnitude_sd,
                         magnet.study.prior.direction_sd_deg, magnet.study.prior.common_mode_sd)
-    size = len(observation) // len(points)  # readings at a point, which alone may be correlated
+    size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)
     same = min(wanted, len(baseline))
@@ -124,19 +140,22 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
 
     def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
-        return _posterior(model.matrix[index], errors.part(index), prior).sd
+        return _posterior(model.matrix[index], errors.subset(index), prior).sd
 
     return MeasurementPlan(
-        model.parameters, candidates, candidates[chosen], baseline, gain, counts, np.array(own),
-        model.nominal, prior.sd, sd_after(chosen + len(baseline)),
+        magnet, model.parameters, candidates, candidates[chosen], baseline, gain, counts,
+        np.array(own), model.nominal, prior.sd, sd_after(chosen + len(baseline)),
         sd_after(spread(len(baseline), same)))
 
 
 def spread(total: int, count: int) -> Ints:
-    """``count`` of ``total`` indices, evenly."""
+    """Return ``count`` evenly spread indices out of ``total``."""
     return np.floor(np.arange(count) * total / count).astype(int)
 
 
 def _posterior(matrix: Floats, noise: NoiseCovariance, prior: Gaussian) -> Gaussian:
-    """What remains to be known; it does not depend on the readings."""
+    """Return the posterior for readings equal to their prior mean.
+
+    Its covariance is that for any readings, because the model is linear.
+    """
     return posterior(matrix, matrix @ prior.mean, noise, prior)

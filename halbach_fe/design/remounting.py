@@ -1,8 +1,13 @@
-"""How blocks can be mounted in other places: the rotations that leave a block's shape as it is.
+"""Slots into which blocks can be moved, and the rotations that leave a block's shape unchanged.
 
-A sector or a trapezoid can be turned end for end, by 180 degrees about its radial axis; a cuboid
-about each of its axes, by 90 degrees where two sides are equal. A block fits a slot if, carried
-there in its own axes and turned so, its nominal magnetization points where that slot's should.
+A sector or a trapezoid can be turned by 180 degrees about its radial axis. A cuboid can be turned
+by 180 degrees about each of its axes, and by 90 degrees about an axis across which the two sides
+are equal. A block fits a slot if its nominal magnetization points in the direction that the design
+requires there, after the block is moved to the slot (in the orientation of its shape there) and
+turned by one of these rotations.
+
+The "own axes" of a block are the axes of its shape: radial (or along the design magnetization),
+transverse and along z.
 """
 
 from __future__ import annotations
@@ -22,61 +27,80 @@ from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.magnet import BlockException
 
-DIRECTION = np.radians(2.0)
-"""How far a nominal magnetization may be from where it should point. Exceptions of a study turn
-blocks by less; what a move does to the field is computed from the real magnetizations anyway."""
+LARGEST_ANGLE = np.radians(2.0)
+"""Largest angle in rad between the nominal magnetization of a block that fits a slot and the
+direction that the design requires there. Rotations in the exceptions of a study are smaller. The
+effect of a move on the field is computed from the inferred magnetizations, whatever this angle
+is."""
 
 SAME_SIZE = 1e-6
-"""Relative difference of a cuboid's sides that are equal."""
+"""Relative difference up to which two sides of a cuboid count as equal."""
 
 EXACT = 1e-9
-"""Relative, of matrices that must be the same: rounding leaves 1e-15."""
+"""Tolerance for matrices and properties that must be equal; rounding errors are 1e-15."""
 
 
 @dataclass(frozen=True)
 class Mounts:
-    """Slots, and what fits them.
+    """Slots of a magnet, and the data that decide which blocks fit them.
 
     Attributes
     ----------
     places : tuple of (ring, slot)
+        Ring and slot of each slot, both counted from 1.
     frames : ndarray, shape (slots, 3, 3)
-        From the own axes of a slot's shape to the magnet's.
+        Rotations from the own axes of a slot's shape to the axes of the magnet.
     turns : ndarray, shape (turns, 3, 3)
-        Rotations of a block in its own axes that leave its shape as it is, the first none.
-    wanted, there : ndarray, shape (slots, 3)
-        Nominal directions in own axes: as designed, and of the block that is there (0 if none is).
-    kinds, kinds_there : ndarray of int, shape (slots,)
-        Blocks of the same remanence and permeability have the same number.
+        Rotations of a block, in its own axes, that leave its shape unchanged. The first is the
+        identity.
+    designed : ndarray, shape (slots, 3)
+        Directions of the design magnetization of each slot, in own axes.
+    current : ndarray, shape (slots, 3)
+        Directions of the nominal magnetization of the block that is in each slot now, in own axes;
+        0 where the block is missing.
+    kinds, current_kinds : ndarray of int, shape (slots,)
+        Kind of block that the design requires in each slot, and kind of the block that is there
+        now. Blocks of the same remanence and recoil permeabilities are of the same kind.
     """
 
     places: tuple[tuple[int, int], ...]
     frames: Floats
     turns: Floats
-    wanted: Floats
-    there: Floats
+    designed: Floats
+    current: Floats
     kinds: Ints
-    kinds_there: Ints
+    current_kinds: Ints
 
     def fits(self, directions: Floats, kinds: Ints) -> NDArray[np.bool_]:
-        """Which blocks fit where, (turns, slots, blocks), by their nominal direction in own axes
-        (blocks, 3) and kind (blocks,).
+        """Return which blocks fit which slots, shape (turns, slots, blocks).
+
+        Parameters
+        ----------
+        directions : ndarray, shape (blocks, 3)
+            Directions of the nominal magnetizations of the blocks, in own axes.
+        kinds : ndarray of int, shape (blocks,)
         """
-        alike = self.kinds[:, None] == kinds
-        return np.array([alike & (self.wanted @ turn @ directions.T > np.cos(DIRECTION))
+        same_kind = self.kinds[:, None] == kinds
+        return np.array([same_kind & (self.designed @ turn @ directions.T > np.cos(LARGEST_ANGLE))
                          for turn in self.turns])
 
     def carried(self, to: Ints, turn: Ints) -> Floats:
-        """From own axes of a block to the magnet's, (n, 3, 3), in some slots and by some turns."""
+        """Return rotations (n, 3, 3) from the own axes of moved blocks to the axes of the magnet.
+
+        Parameters
+        ----------
+        to, turn : ndarray of int, shape (n,)
+            Numbers of the slots, and of the turns (see `turns`).
+        """
         return np.asarray(self.frames[to] @ self.turns[turn])
 
     def turn_deg(self, turn: int) -> tuple[float, float, float]:
-        """A turn as a rotation vector along the block's own axes, in degrees."""
+        """Return a turn as a rotation vector along the block's own axes, in degrees."""
         return rotation_deg(self.turns[turn])
 
 
 def mounts_of(magnet: Magnet) -> Mounts:
-    """Slots of a study as its blocks stand in them."""
+    """Return the slots of a magnet with its present blocks."""
     meant, built = as_meant(magnet).blocks, magnet.blocks
     frames = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
                        for block in meant])
@@ -89,8 +113,12 @@ def mounts_of(magnet: Magnet) -> Mounts:
 
 
 def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
-    """Rotations (n, 3, 3) that leave a cuboid of some sides as it is, or (None) a block with an
-    inner and an outer face; the first is none at all.
+    """Return the rotations (n, 3, 3) that leave a shape unchanged; the first is the identity.
+
+    Parameters
+    ----------
+    sides : tuple of float, or None
+        Sides of a cuboid; None for a shape whose inner and outer face differ, such as a sector.
     """
     turns = Rotation.create_group("O").as_matrix().round()
     if sides is None:
@@ -104,42 +132,53 @@ def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
 
 
 def _sides(magnet: Magnet) -> tuple[float, float, float] | None:
+    """Return the sides in m of cuboid blocks, or None for blocks of another shape."""
     array = magnet.array
     if array.block.shape != "cuboid":
         return None
-    # in a cross-section no other side is as long as that along z
+    # in 2D the block is infinitely long: any length along z that differs from the other sides
     length = array.ring_length_m if magnet.dimension == 3 else None
     return (array.outer_radius_m - array.inner_radius_m, array.block.width_m,
             length or 2 * array.outer_radius_m + array.block.width_m)
 
 
 def _directions(blocks: Sequence[MagnetBlock], frames: Floats) -> Floats:
-    """Of the nominal magnetizations, in own axes; 0 of a block that is missing."""
+    """Return directions of the nominal magnetizations in own axes; 0 for missing blocks."""
     vectors = np.array([block.magnetization for block in blocks])
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.einsum("nji,nj->ni", frames, vectors / np.where(size > 0, size, 1.0))
 
 
 def _kinds(blocks: Sequence[MagnetBlock]) -> Ints:
-    kinds = [tuple(float(f"{value:.9g}") for value in _own(block)[:3]) for block in blocks]
+    """Return equal numbers for blocks of equal remanence and recoil permeabilities."""
+    kinds = [tuple(float(f"{value:.9g}") for value in _properties(block)[:3]) for block in blocks]
     numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds))}
     return np.array([numbers[kind] for kind in kinds])
 
 
 def rotation_deg(turn: Floats) -> tuple[float, float, float]:
-    """Rotation vector in degrees of a matrix (3, 3), without rounding errors."""
+    """Return the rotation vector in degrees of a matrix (3, 3), rounded to 1e-9 degrees."""
     x, y, z = (np.degrees(Rotation.from_matrix(turn).as_rotvec()).round(9) + 0.0).tolist()
     return x, y, z
 
 
 def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magnet | None:
-    """The study with blocks in other places, or None if its exceptions cannot express that.
+    """Return the magnet after blocks are moved.
+
+    The moves are entered in the study as exceptions (``mounted_from`` and ``rotation_deg``).
 
     Parameters
     ----------
+    magnet : Magnet
     moved : iterable of (int, int, ndarray)
-        Where to and where from (slots counted from 0, ring by ring), and the matrix (3, 3) from
-        the magnetization there to the one here, along the magnet's axes.
+        For each moved block, its new and its old slot (counted from 0, ring by ring), and the
+        matrix (3, 3) that maps its magnetization in the old slot to that in the new slot, along
+        the axes of the magnet.
+
+    Returns
+    -------
+    Magnet or None
+        None if the exceptions of a study cannot express the moves.
     """
     array, before, old = magnet.array, mountings(magnet), magnet.blocks
     moved = list(moved)
@@ -159,13 +198,13 @@ def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magne
     after, new = mountings(changed), changed.blocks
     for to, (source, meant, total) in expected.items():
         same = after[to][0] == meant and np.allclose(after[to][1], total, 0, EXACT)
-        if not same or new[to].shift != old[to].shift or not np.allclose(
-                _own(new[to]), _own(old[source]), EXACT, 0):
+        if not same or new[to].displacement_m != old[to].displacement_m or not np.allclose(
+                _properties(new[to]), _properties(old[source]), EXACT, 0):
             return None
     return changed
 
 
-def _own(block: MagnetBlock) -> tuple[float, ...]:
-    """What a block takes along."""
+def _properties(block: MagnetBlock) -> tuple[float, ...]:
+    """Return the properties that a block keeps when it is moved."""
     return (block.remanence, block.recoil_permeability, block.recoil_permeability_across,
             block.gradient, block.corner_loss)

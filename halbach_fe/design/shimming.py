@@ -1,17 +1,22 @@
-"""Which blocks to swap, turn or replace so that unwanted multipoles become small.
+"""Shimming: which blocks to swap, turn or replace so that unwanted multipoles become small.
 
-Multipoles are linear in the magnetizations, and a block that is moved takes its own along: the
-effect of every move is a product of columns that are computed once, those of moves in different
-slots add up, and every one of a hundred thousand swaps is tried in a moment. A slot takes part in
-one move at most. Moves are taken one after another, each for the largest expected fall of
-``sum |c_n|^2``, until it is no larger than its own standard deviation; then each is exchanged for a
-better one as long as there is any.
+The multipole coefficients are linear in the magnetizations, and a moved block keeps its
+magnetization in its own axes. The effect of a move is therefore a product of matrices that are
+computed once, and the effects of moves in different slots add up, so that a hundred thousand swaps
+are evaluated quickly. A slot takes part in at most one move. Moves are added one after another,
+each time the one with the largest expected decrease of ``sum |c_n|^2``, until this decrease is no
+larger than its own standard deviation. Then each move is replaced by a better one as long as that
+lowers the sum.
 
-What is known of the moved blocks is what the posterior says, exactly transformed. If the blocks
-were measured before they were mounted, p is a block's own magnetization w and the turn u = t x w
-that its mounting gave it; taking it out undoes u, mounting it again brings another. With the prior
-``p ~ N(m_0, C_0)`` and ``u ~ N(0, U)`` a part of it, ``u = K (p - m_0) + e``, ``K = U C_0^-1``,
-``e ~ N(0, U - U C_0^-1 U)``, whatever was read since.
+The distribution of the moved blocks is the transformed posterior, which is exact. If the blocks
+were measured before they were mounted, the magnetization of a mounted block is ``p = w + u``. Here
+w is the magnetization of the block itself, and ``u = t x w`` the change by the small angles t of
+its mounting. Taking the block out removes u, and mounting it again adds another, independent one.
+With the prior ``p ~ N(m_0, C_0)``, of which ``u ~ N(0, U)`` is a part,
+
+    ``u = K (p - m_0) + e``,  ``K = U C_0^-1``,  ``e ~ N(0, U - U C_0^-1 U)``,
+
+and e is independent of the readings, which depend on p only.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ import scipy.linalg as linalg
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
@@ -33,33 +39,34 @@ from halbach_fe.inference.block_prior import loose_blocks, types_of
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles, met
-from halbach_fe.stats.gaussian import nominal_prior, rotated
+from halbach_fe.stats.gaussian import nominal_prior, rotation_roots
 from halbach_fe.study.model import Study
 
 Kind = Literal["swap", "turn", "replace"]
 
 GAIN_SDS = 1.0
-"""A move is worth its work if it is expected to gain more than so many standard deviations of what
-it gains."""
+"""Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
+the move is made."""
 
 SURE = 0.95
-"""Probability that all multipoles are within the limit at which no more is done."""
+"""Probability that all multipoles are within the limit, at which the search ends."""
 
 DRAWS = 4000
-"""For that probability: known to 0.3 %."""
+"""Number of samples from which that probability is estimated, with a standard error of 0.3 %."""
 
 SHORTLIST = 24
-"""Moves of each kind, the best by the mean, whose gain is computed with its uncertainty."""
+"""Number of moves of each kind, the best by an approximate gain, whose exact gain is computed."""
 
 AT_ONCE = 100_000
-"""Moves that are tried at a time."""
+"""Number of moves that are evaluated at a time, which limits the memory."""
 
 BETTER = 1e-6
-"""Relative fall of the sum for which one move is exchanged for another."""
+"""Smallest relative decrease of the sum for which a move is replaced by another."""
 
 STOPS = {"target": "the limit is met", "uncertainty": "further moves would gain less than the "
-         "uncertainty of what they gain", "budget": "as many moves as were allowed",
-         "nothing": "no other block fits anywhere"}
+         "uncertainty of what they gain", "budget": "the allowed number of moves is reached",
+         "nothing": "no other block fits into any slot"}
+"""Reasons for the end of the search, in words."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +76,12 @@ class Placement:
     Attributes
     ----------
     to : int
-        Slot from 0, ring by ring.
+        The new slot, counted from 0, ring by ring.
     block : int
-        The slot that it stood in, or the number of slots and more for a spare block.
+        The slot that the block was in, or, for spare blocks, the number of slots plus the number of
+        the spare block.
     turn : int
-        Of `Mounts.turns`.
+        Number of the block's rotation in `Mounts.turns`.
     """
 
     to: int
@@ -83,7 +91,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Move:
-    """A swap (two placements), a turn or a replacement (one)."""
+    """A swap (two placements), a turn or a replacement (one placement each)."""
 
     kind: Kind
     placements: tuple[Placement, ...]
@@ -91,7 +99,10 @@ class Move:
 
 @dataclass(frozen=True)
 class Step:
-    """A move, what it gains in the sum of |c_n|^2 in units^2, and the multipoles after it."""
+    """A move, its expected gain, and the multipoles after it.
+
+    The gain is the decrease of ``sum |c_n|^2`` in units^2, with its standard deviation.
+    """
 
     move: Move
     gain: float
@@ -100,20 +111,31 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Shim:
-    """Moves in their order, and what they do.
+class Shim(ShownInNotebook):
+    """Moves of blocks in their order, and the multipoles before and after.
 
     Attributes
     ----------
+    result : InferenceResult
+        The inference from which the moves are chosen.
+    model : MultipoleModel
+    mounts : Mounts
+        The slots of the magnet.
+    spares : tuple of str
+        Names of the spare blocks.
+    before : Multipoles
+    steps : tuple of Step
     stop : str
-        A key of `STOPS`.
+        Reason for the end of the search, a key of `STOPS`.
     tried : dict
-        How many moves of each kind there are.
+        Number of possible moves of each kind.
+    limit : float or None
+        Limit of all |c_n| in units of 1e-4.
     within : tuple of two floats, or None
-        Probability that all multipoles are within the limit, before and after.
+        Probabilities that all multipoles are within the limit, before and after the moves.
     """
 
-    magnet: Magnet
+    result: InferenceResult
     model: MultipoleModel
     mounts: Mounts
     spares: tuple[str, ...]
@@ -126,46 +148,55 @@ class Shim:
 
     @property
     def after(self) -> Multipoles:
-        """Multipoles when all is done."""
+        """Multipoles after all moves."""
         return self.steps[-1].after if self.steps else self.before
 
     @property
+    def magnet(self) -> Magnet:
+        """The measured magnet, before the moves."""
+        return self.result.magnet
+
+    @property
     def study(self) -> Study:
-        """The study whose magnet it is."""
+        """The study of the measured magnet."""
         return self.magnet.study
 
     @cached_property
     def shimmed_study(self) -> Study | None:
-        """The study with the blocks that were moved, or None if it cannot say that: of a block
-        that was replaced it has nothing to say.
+        """The study with the moves of blocks as exceptions, or None if it cannot express them.
+
+        Replacements are left out, because a study does not identify individual blocks.
         """
         slots = len(self.mounts.places)
-        moved = [(one.to, one.block, self.matrix(one)) for step in self.steps
-                 for one in step.move.placements if one.block < slots]
+        moved = [(placement.to, placement.block, self.matrix(placement)) for step in self.steps
+                 for placement in step.move.placements if placement.block < slots]
         changed = remounted(self.magnet, moved) if moved else None
         return None if changed is None else changed.study
 
     def matrix(self, placement: Placement) -> Floats:
-        """From a block's magnetization where it stood to that where it goes, (3, 3)."""
+        """Return the rotation (3, 3) of a block's magnetization from its old to its new slot."""
         carried = self.mounts.carried(np.array([placement.to]), np.array([placement.turn]))[0]
         return carried @ self.mounts.frames[placement.block].T
 
 
 @dataclass(frozen=True)
-class Spares:
-    """Blocks that may replace others; what is known of each is independent.
+class SpareBlocks:
+    """Spare blocks that may replace others, with independent uncertainties.
 
     Attributes
     ----------
     names : tuple of str
     mean : ndarray, shape (n, 3), in A/m
-        Along the own axes of their shape.
-    covariance : ndarray, shape (n, 3, 3)
+        Means of the magnetizations in own axes (see `halbach_fe.design.remounting`).
+    covariance : ndarray, shape (n, 3, 3), in A^2/m^2
+        Covariances of the magnetizations in own axes.
     direction : ndarray, shape (n, 3)
-        Nominal, in own axes.
+        Directions of the nominal magnetizations in own axes.
     kind : ndarray of int, shape (n,)
+        Kinds of the blocks as in `Mounts.kinds`.
     slot : ndarray of int, shape (n,)
-        The only one that it can go to, from 0; -1 for none in particular.
+        The only slot, counted from 0, that a block may go into; -1 for blocks without such a
+        restriction.
     """
 
     names: tuple[str, ...]
@@ -178,27 +209,43 @@ class Spares:
 
 @dataclass(frozen=True)
 class _Goal:
-    """Limit for every |c_n|, if there is one, and standard normal numbers (draws, 2 k)."""
+    """The limit of every |c_n|, and standard normal numbers (draws, 2 k) to test it with."""
 
     limit: float | None
     normals: Floats
 
     def within(self, known: Multipoles) -> float:
-        """Probability that no multipole is above the limit; 0 without one."""
+        """Return the probability that no multipole is above the limit; 0 without a limit."""
         return 0.0 if self.limit is None else met(known.sizes_of(self.normals), self.limit)
 
     def met(self, known: Multipoles) -> bool:
-        """Whether no more has to be done."""
+        """Return whether the multipoles are within the limit with sufficient probability."""
         return self.within(known) >= SURE
 
 
 @dataclass(frozen=True)
-class _Bench:
-    """All that is needed to try moves; S slots, B blocks with the spares, D dimensions.
+class _MoveModel:
+    """Distribution of the blocks in their slots and taken out, from which moves are evaluated.
 
-    ``placed`` and ``loose`` are the roots of what is known of the blocks as they stand (S, D, q)
-    and once they are taken out (B, D, q, in own axes), with the same q columns; ``own`` (B, D, D)
-    the root of what every block has for itself when it is mounted.
+    S is the number of slots, B that of blocks including the spare ones, D the dimension.
+
+    Attributes
+    ----------
+    model : MultipoleModel
+    mounts : Mounts
+    mean : ndarray, shape (S, D), in A/m
+        Posterior mean of the mounted blocks, along the axes of the magnet.
+    placed : ndarray, shape (S, D, q), in A/m
+        Covariance factor of the mounted blocks, along the axes of the magnet.
+    loose_mean : ndarray, shape (B, D), in A/m
+        Mean of the blocks once they are taken out, in own axes.
+    loose : ndarray, shape (B, D, q), in A/m
+        Covariance factor of the same, with the same q columns as ``placed``.
+    own : ndarray, shape (B, D, D), in A/m
+        Covariance factor of the independent error of each block when it is mounted again, in own
+        axes; for spare blocks it includes their own uncertainty.
+    fits : ndarray of bool, shape (turns, S, B)
+        Which blocks fit which slots by which turns.
     """
 
     model: MultipoleModel
@@ -212,71 +259,89 @@ class _Bench:
 
     @property
     def size(self) -> int:
-        """Dimensions."""
+        """Dimension of the magnet, D."""
         return self.mean.shape[1]
 
     @cached_property
     def columns(self) -> Complexes:
-        """The model's matrix, (1 + k, S, D)."""
+        """The matrix of the multipole model, shape (1 + k, S, D)."""
         return self.model.matrix.reshape(len(self.model.matrix), *self.mean.shape)
 
     @cached_property
     def start(self) -> tuple[Complexes, Complexes]:
-        """Mean (1 + k,) and root (1 + k, q) of the magnet as it is."""
+        """Mean (1 + k,) and covariance factor (1 + k, q) of C_n without moves."""
         matrix = self.model.matrix
         return (self.model.offset + matrix @ self.mean.ravel(),
                 matrix @ self.placed.reshape(self.mean.size, -1))
 
     def carried(self, to: Ints, turn: Ints) -> Floats:
-        """See `Mounts.carried`, in the magnet's dimensions."""
+        """Return `Mounts.carried` reduced to the dimension of the magnet, (n, D, D)."""
         return self.mounts.carried(to, turn)[:, :self.size, :self.size]
 
     def coefficients(self, moves: Sequence[Move]) -> tuple[Complexes, Complexes]:
-        """Mean and root of C after some moves, exactly."""
+        """Return mean and covariance factor of C_n after moves, which are exact."""
         return reduce(self.moved, moves, self.start)
 
     def moved(
         self, before: tuple[Complexes, Complexes], move: Move
     ) -> tuple[Complexes, Complexes]:
-        """Mean and root of C after one more move; the columns that it adds to the root come
-        behind those that were there.
+        """Return mean and covariance factor of C_n after a further move.
+
+        The independent errors of the newly mounted blocks are appended to the factor as columns.
         """
         mean, root = before
         width = self.start[1].shape[1]
         root, fresh = root[:, :width], [root[:, width:]]
-        for one in move.placements:
-            columns = self.columns[:, one.to]
-            carried = columns @ self.carried(np.array([one.to]), np.array([one.turn]))[0]
-            mean = mean + carried @ self.loose_mean[one.block] - columns @ self.mean[one.to]
-            root = root + carried @ self.loose[one.block] - columns @ self.placed[one.to]
-            fresh.append(carried @ self.own[one.block])
+        for placement in move.placements:
+            to, block = placement.to, placement.block
+            columns = self.columns[:, to]
+            carried = columns @ self.carried(np.array([to]), np.array([placement.turn]))[0]
+            mean = mean + carried @ self.loose_mean[block] - columns @ self.mean[to]
+            root = root + carried @ self.loose[block] - columns @ self.placed[to]
+            fresh.append(carried @ self.own[block])
         return mean, np.hstack([root, *fresh])
 
     def multipoles(self, moves: Sequence[Move]) -> Multipoles:
-        """Multipoles after some moves."""
+        """Return the multipoles after moves."""
         return self.model.known(*self.coefficients(moves))
 
     def gains(
         self, chosen: Sequence[Move], further: Sequence[Move]
     ) -> list[tuple[float, float]]:
-        """What each further move would gain, and its standard deviation; see `gain`."""
+        """Return expected gain and its standard deviation of each further move (see `gain`)."""
         state = self.coefficients(chosen)
         now = self.model.known(*state)
         return [gain(now, self.model.known(*self.moved(state, move))) for move in further]
 
 
 @dataclass(frozen=True)
-class _Candidates:
-    """Moves of one kind: their placements' numbers (n, 1 or 2) in a `_Field`."""
+class _CandidateMoves:
+    """All possible moves of a kind.
+
+    Attributes
+    ----------
+    kind : str
+    parts : ndarray of int, shape (n, 1) or, for swaps, (n, 2)
+        Numbers of the placements of each move in `_Placements`.
+    """
 
     kind: Kind
     parts: Ints
 
 
 @dataclass(frozen=True)
-class _Field:
-    """All placements, ``to``, ``block`` and ``turn`` (n,), what each changes of b_n, a_n (n, 2 k),
-    and the variance that it adds to them in all (n,).
+class _Placements:
+    """All possible placements of blocks, and their effects.
+
+    Attributes
+    ----------
+    to, block, turn : ndarray of int, shape (n,)
+        See `Placement`.
+    change : ndarray, shape (n, 2 k)
+        Change of the mean of b_n and a_n, in units.
+    noise : ndarray, shape (n,)
+        Variance that the independent error of the mounted block adds to ``sum |c_n|^2``, in
+        units^2.
     """
 
     to: Ints
@@ -286,75 +351,82 @@ class _Field:
     noise: Floats
 
     def move(self, kind: Kind, parts: Ints) -> Move:
-        """One of the candidates."""
+        """Return the move that consists of the placements with the given numbers."""
         return Move(kind, tuple(Placement(int(self.to[i]), int(self.block[i]), int(self.turn[i]))
                                 for i in parts))
 
 
 def shim(
-    update: InferenceResult, model: MultipoleModel, generator: np.random.Generator,
+    result: InferenceResult, model: MultipoleModel, generator: np.random.Generator,
     budget: Mapping[Kind, int], limit: float | None = None, stock: BlockTable | None = None,
 ) -> Shim:
-    """Choose moves.
+    """Choose moves that make the unwanted multipoles of a measured magnet small.
 
     Parameters
     ----------
-    update : Update
-        Whose posterior tells what the blocks are.
+    result : InferenceResult
+        The inference whose posterior describes the blocks.
     model : MultipoleModel
-        Of the same study.
-    generator : numpy Generator
-        For the probability that the limit is met.
+        Multipoles of the same study.
+    generator : numpy.random.Generator
+        Draws the samples from which the probability of meeting the limit is estimated.
     budget : mapping
-        How many moves of each kind are allowed.
+        Largest number of moves of each kind.
     limit : float, optional
-        For every |c_n|, in units of 1e-4; without it multipoles are made as small as is worth it.
+        Limit of every |c_n|, in units of 1e-4. The search ends when it is met. Without a limit it
+        ends when further moves would gain too little.
     stock : BlockTable, optional
-        Measured blocks to replace others with; without it nominal ones, of the study's prior.
+        Measured blocks that may replace others. Default: new blocks that are distributed as in the
+        study's prior.
 
     Raises
     ------
     MeasurementError
         If the stock does not fit the study.
     """
-    magnet = update.magnet
+    magnet = result.magnet
     mounts = mounts_of(magnet)
-    spares = _stock(magnet, mounts, stock) if stock else _nominal(magnet, mounts)
+    spares = _measured_spares(magnet, mounts, stock) if stock else _nominal_spares(magnet, mounts)
     if not budget.get("replace"):
-        spares = _none()
-    bench = _bench(update, model, mounts, spares)
-    field = _field(bench)
-    candidates = [one for one in _candidates(field, len(mounts.places)) if budget.get(one.kind)]
-    before = model.of(update.posterior)
+        spares = _no_spares()
+    move_model = _build_move_model(result, model, mounts, spares)
+    placements = _possible_placements(move_model)
+    candidates = [moves for moves in _candidate_moves(placements, len(mounts.places))
+                  if budget.get(moves.kind)]
+    before = model.of(result.posterior)
     goal = _Goal(limit, generator.standard_normal((DRAWS, len(before.mean))))
-    moves, stop = _search(bench, field, candidates, budget, goal)
-    steps = _steps(bench, moves, goal)
+    chosen, stop = _search(move_model, placements, candidates, budget, goal)
+    steps = _steps_by_gain(move_model, chosen, goal)
     within = None
     if limit is not None:
         within = goal.within(before), goal.within(steps[-1].after if steps else before)
-    return Shim(magnet, model, mounts, spares.names, before, steps, stop,
-                {one.kind: len(one.parts) for one in candidates}, limit, within)
+    return Shim(result, model, mounts, spares.names, before, steps, stop,
+                {moves.kind: len(moves.parts) for moves in candidates}, limit, within)
 
 
-def taken_out(update: InferenceResult) -> tuple[Floats, Floats, Floats]:
-    """What is known of the blocks once they are out of their mounts, and as they stand.
+def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:
+    """Return the distribution of the blocks once they are taken out of their mounts.
+
+    In the notation of this module's docstring, the magnetization of mounted blocks is p and that
+    of blocks that are taken out is w.
 
     Returns
     -------
     mean : ndarray, shape (m,), in A/m
-        Of w, along the magnet's axes.
+        Mean of w, along the axes of the magnet.
     loose, placed : ndarray, shape (m, q), in A/m
-        Roots of w and of p with common columns.
+        Covariance factors of w and of p. Their columns belong to the same independent variables, so
+        that they also give the covariance between w and p.
     """
-    study, after = update.study, update.posterior
+    study, after = result.study, result.posterior
     sd, root = np.radians(study.prior.mounting_sd_deg), np.asarray(after.root)
-    if not sd or update.measured_blocks is None:  # then no mounting is part of the prior
+    if not sd or result.measured_blocks is None:  # the prior has no mounting errors
         return after.mean, root, root
-    before = update.prior
+    before = result.prior
     turns = linalg.block_diag(*_turn_covariance(
         before.mean.reshape(-1, study.dimension), sd))
     share = _times_inverse(turns, before.covariance)
-    rest = _root(turns - share @ turns)
+    rest = _covariance_root(turns - share @ turns)
     whole = np.eye(len(share)) - share
     return (after.mean - share @ (after.mean - before.mean),
             np.hstack([whole @ root, -rest]),
@@ -362,7 +434,10 @@ def taken_out(update: InferenceResult) -> tuple[Floats, Floats, Floats]:
 
 
 def _times_inverse(matrix: Floats, covariance: Floats) -> Floats:
-    """Matrix times the inverse of a covariance, or, of a missing block, its pseudo-inverse."""
+    """Return a matrix times the inverse of a covariance.
+
+    If the covariance is singular, as with missing blocks, it is the pseudo-inverse.
+    """
     try:
         return np.asarray(linalg.cho_solve(linalg.cho_factor(covariance), matrix.T).T)
     except linalg.LinAlgError:
@@ -370,45 +445,52 @@ def _times_inverse(matrix: Floats, covariance: Floats) -> Floats:
 
 
 def _turn_covariance(vectors: Floats, sd: float) -> Floats:
-    """Covariances (n, d, d) of what turns of an sd in rad do to magnetizations (n, d)."""
-    root = rotated(vectors, sd)
+    """Return covariances (n, d, d) of the change of magnetizations (n, d) by random rotations.
+
+    ``sd`` is the standard deviation of the angles about each axis, in rad.
+    """
+    root = rotation_roots(vectors, sd)
     return np.asarray(root @ root.transpose(0, 2, 1))
 
 
-def _root(covariance: Floats) -> Floats:
-    """A root (..., d, d) of covariances that may be singular."""
+def _covariance_root(covariance: Floats) -> Floats:
+    """Return a square root (..., d, d) of covariances, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0))[..., None, :])
 
 
-def _bench(update: InferenceResult, model: MultipoleModel, mounts: Mounts,
-           spares: Spares) -> _Bench:
-    size, count = update.study.dimension, len(mounts.places)
-    mean, loose, placed = taken_out(update)
+def _build_move_model(
+    result: InferenceResult, model: MultipoleModel, mounts: Mounts, spares: SpareBlocks
+) -> _MoveModel:
+    """Transform the posterior of the mounted blocks to own axes, and append the spare blocks."""
+    size, count = result.study.dimension, len(mounts.places)
+    mean, loose, placed = taken_out(result)
     back = mounts.frames[:, :size, :size].transpose(0, 2, 1)
     own_mean = np.vstack([np.einsum("nij,nj->ni", back, mean.reshape(count, size)),
                           spares.mean[:, :size]])
     columns = loose.shape[1]
     own_loose = np.concatenate([back @ loose.reshape(count, size, columns),
                                 np.zeros((len(spares.names), size, columns))])
-    alone = _turn_covariance(own_mean, np.radians(update.study.prior.mounting_sd_deg))
+    alone = _turn_covariance(own_mean, np.radians(result.study.prior.mounting_sd_deg))
     alone[count:] += spares.covariance[:, :size, :size]
-    fits = mounts.fits(np.vstack([mounts.there, spares.direction]),
-                       np.concatenate([mounts.kinds_there, spares.kind]))
-    bound = np.flatnonzero(spares.slot >= 0)  # nominal spares are for one slot, as it was meant
+    fits = mounts.fits(np.vstack([mounts.current, spares.direction]),
+                       np.concatenate([mounts.current_kinds, spares.kind]))
+    bound = np.flatnonzero(spares.slot >= 0)  # only into their own slot, and not turned
     fits[:, :, count + bound] = False
     fits[0, spares.slot[bound], count + bound] = True
-    return _Bench(model, mounts, update.posterior.mean.reshape(count, size),
-                  placed.reshape(count, size, columns), own_mean, own_loose, _root(alone), fits)
+    return _MoveModel(
+        model, mounts, result.posterior.mean.reshape(count, size),
+        placed.reshape(count, size, columns), own_mean, own_loose, _covariance_root(alone), fits)
 
 
-def _none() -> Spares:
-    return Spares((), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, int),
-                  np.zeros(0, int))
+def _no_spares() -> SpareBlocks:
+    """Return an empty set of spare blocks."""
+    return SpareBlocks((), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)),
+                       np.zeros(0, int), np.zeros(0, int))
 
 
-def _nominal(magnet: Magnet, mounts: Mounts) -> Spares:
-    """A new block for every slot, of which no more is known than the study's prior says."""
+def _nominal_spares(magnet: Magnet, mounts: Mounts) -> SpareBlocks:
+    """Return a new block for every slot, distributed as in the study's prior."""
     size, settings = magnet.dimension, magnet.study.prior
     vectors = np.array([block.magnetization for block in as_meant(magnet).blocks])
     prior = nominal_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
@@ -418,53 +500,60 @@ def _nominal(magnet: Magnet, mounts: Mounts) -> Spares:
     for number, rows in enumerate(roots):
         back = mounts.frames[number, :size, :size].T
         own[number, :size, :size] = back @ rows @ rows.T @ back.T
-    return Spares(("nominal",) * len(vectors), np.einsum("nji,nj->ni", mounts.frames, vectors), own,
-                  mounts.wanted, mounts.kinds, np.arange(len(vectors)))
+    mean = np.einsum("nji,nj->ni", mounts.frames, vectors)
+    return SpareBlocks(("nominal",) * len(vectors), mean, own, mounts.designed, mounts.kinds,
+                       np.arange(len(vectors)))
 
 
-def _stock(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spares:
-    """Measured blocks; the calibration of their coil counts as an error of each."""
+def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> SpareBlocks:
+    """Return the blocks of a table; the error of their coil's calibration counts for each block.
+
+    The calibration error is common to all blocks. It is treated as independent here, because
+    `SpareBlocks` have independent uncertainties.
+    """
     size = magnet.dimension
     mean, root = loose_blocks(magnet, table)
     first = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
     own, spread = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     own[:, :size], spread[:, :size, :size] = mean, root
-    covariance = spread @ spread.transpose(0, 2,
-                                           1) + magnet.study.prior.common_mode_sd**2 * np.einsum(
-        "ni,nj->nij", own, own)
-    return Spares(table.serial, own, covariance, mounts.wanted[first], mounts.kinds[first],
-                  np.full(len(table), -1))
+    common = magnet.study.prior.common_mode_sd**2 * np.einsum("ni,nj->nij", own, own)
+    covariance = spread @ spread.transpose(0, 2, 1) + common
+    return SpareBlocks(table.serial, own, covariance, mounts.designed[first], mounts.kinds[first],
+                       np.full(len(table), -1))
 
 
-def _field(bench: _Bench) -> _Field:
-    """All placements of blocks where they fit, but for those that change nothing."""
-    stay = np.zeros_like(bench.fits)
-    every = np.arange(len(bench.mean))
+def _possible_placements(move_model: _MoveModel) -> _Placements:
+    """Return all placements of blocks in slots that they fit, without those that change nothing."""
+    stay = np.zeros_like(move_model.fits)
+    every = np.arange(len(move_model.mean))
     stay[0, every, every] = True
-    turn, to, block = np.nonzero(bench.fits & ~stay)
-    carried = bench.carried(to, turn)
-    scaled = bench.model.scaled(float(abs(bench.start[0][0]))).reshape(-1, *bench.mean.shape)
-    new = np.einsum("nij,nj->ni", carried, bench.loose_mean[block]) - bench.mean[to]
+    turn, to, block = np.nonzero(move_model.fits & ~stay)
+    carried = move_model.carried(to, turn)
+    main = float(abs(move_model.start[0][0]))
+    scaled = move_model.model.scaled(main).reshape(-1, *move_model.mean.shape)
+    new = np.einsum("nij,nj->ni", carried, move_model.loose_mean[block]) - move_model.mean[to]
     change, noise = np.empty((len(to), len(scaled))), np.empty(len(to))
     for first in range(0, len(to), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         columns = np.moveaxis(scaled[:, to[part]], 0, 1)
         change[part] = np.einsum("nki,ni->nk", columns, new[part])
-        noise[part] = np.sum((columns @ (carried[part] @ bench.own[block[part]]))**2, axis=(1, 2))
-    return _Field(to, block, turn, change, noise)
+        error = columns @ (carried[part] @ move_model.own[block[part]])
+        noise[part] = np.sum(error**2, axis=(1, 2))
+    return _Placements(to, block, turn, change, noise)
 
 
-def _candidates(field: _Field, slots: int) -> list[_Candidates]:
-    """All moves: of every two placements that exchange two blocks, a swap."""
-    number = np.arange(len(field.to))
-    inside = field.block < slots
-    turns = number[inside & (field.block == field.to)]
+def _candidate_moves(placements: _Placements, slots: int) -> list[_CandidateMoves]:
+    """Return all moves of each kind; a swap is a pair of placements that exchange two blocks."""
+    number = np.arange(len(placements.to))
+    inside = placements.block < slots
+    turns = number[inside & (placements.block == placements.to)]
     spare = number[~inside]
-    moved = number[inside & (field.block != field.to)]
-    # placements of i in j, and those of j in i, next to each other by the pair {i, j}
-    low, high = (np.minimum(field.to, field.block), np.maximum(field.to, field.block))
-    up = moved[field.to[moved] < field.block[moved]]
-    down = moved[field.to[moved] > field.block[moved]]
+    moved = number[inside & (placements.block != placements.to)]
+    # Join the placements of block i in slot j with those of block j in slot i by the pair {i, j}.
+    low = np.minimum(placements.to, placements.block)
+    high = np.maximum(placements.to, placements.block)
+    up = moved[placements.to[moved] < placements.block[moved]]
+    down = moved[placements.to[moved] > placements.block[moved]]
     key = low * slots + high
     down = down[np.argsort(key[down], kind="stable")]
     start, stop = (np.searchsorted(key[down], key[up], side) for side in ("left", "right"))
@@ -472,102 +561,115 @@ def _candidates(field: _Field, slots: int) -> list[_Candidates]:
     first = np.repeat(up, count)
     offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     second = down[np.repeat(start, count) + offset]
-    return [_Candidates("swap", np.column_stack([first, second])),
-            _Candidates("turn", turns[:, None]), _Candidates("replace", spare[:, None])]
+    return [_CandidateMoves("swap", np.column_stack([first, second])),
+            _CandidateMoves("turn", turns[:, None]), _CandidateMoves("replace", spare[:, None])]
 
 
 def _search(
-    bench: _Bench, field: _Field, candidates: Sequence[_Candidates], budget: Mapping[Kind, int],
-    goal: _Goal,
+    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
+    budget: Mapping[Kind, int], goal: _Goal,
 ) -> tuple[list[Move], str]:
-    """Moves one after another, then each again as long as that is better; and why no more."""
+    """Return the chosen moves, and the reason for the end of the search (a key of `STOPS`).
+
+    Moves are added and then replaced by better ones, alternately, until none can be added.
+    """
     chosen: list[Move] = []
     stop = "nothing"
     while True:
         count = len(chosen)
-        chosen, stop = _greedy(bench, field, candidates, budget, goal, chosen)
+        chosen, stop = _add_moves(move_model, placements, candidates, budget, goal, chosen)
         if len(chosen) == count:
             return chosen, stop
-        chosen = _exchanged(bench, field, candidates, chosen)
+        chosen = _exchange_moves(move_model, placements, candidates, chosen)
 
 
-def _greedy(
-    bench: _Bench, field: _Field, candidates: Sequence[_Candidates], budget: Mapping[Kind, int],
-    goal: _Goal, chosen: list[Move],
+def _add_moves(
+    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
+    budget: Mapping[Kind, int], goal: _Goal, chosen: list[Move],
 ) -> tuple[list[Move], str]:
-    """More moves, each for the largest expected gain; and why it stopped."""
+    """Add the moves of largest expected gain one by one; return them and why no more are added."""
     while True:
-        now = bench.multipoles(chosen)
+        now = move_model.multipoles(chosen)
         if goal.met(now):
             return chosen, "target"
-        left = [one for one in candidates
-                if sum(move.kind == one.kind for move in chosen) < budget[one.kind]]
+        left = [moves for moves in candidates
+                if sum(move.kind == moves.kind for move in chosen) < budget[moves.kind]]
         if candidates and not left:
             return chosen, "budget"
-        shortlist = [move for one in left
-                     for move in _best(bench, field, one, chosen, SHORTLIST)]
+        shortlist = [move for moves in left
+                     for move in _best_moves(move_model, placements, moves, chosen, SHORTLIST)]
         if not shortlist:
             return chosen, "nothing"
-        gains = bench.gains(chosen, shortlist)
+        gains = move_model.gains(chosen, shortlist)
         best = int(np.argmax([expected for expected, _ in gains]))
         if gains[best][0] <= GAIN_SDS * gains[best][1]:
             return chosen, "uncertainty"
         chosen = [*chosen, shortlist[best]]
 
 
-def _exchanged(
-    bench: _Bench, field: _Field, candidates: Sequence[_Candidates], chosen: list[Move]
+def _exchange_moves(
+    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
+    chosen: list[Move],
 ) -> list[Move]:
-    """Every move again, given the others, until none can be better."""
+    """Replace each move by the best of its kind, given the others, until no move improves."""
     better = True
     while better:
         better = False
         for move in list(chosen):
-            others = [one for one in chosen if one is not move]
-            kind = next(one for one in candidates if one.kind == move.kind)
-            found = _best(bench, field, kind, others, 1)
-            now = bench.multipoles(chosen).expected_square
-            if found and bench.multipoles([*others, found[0]]).expected_square < (
+            others = [other for other in chosen if other is not move]
+            kind = next(moves for moves in candidates if moves.kind == move.kind)
+            found = _best_moves(move_model, placements, kind, others, 1)
+            now = move_model.multipoles(chosen).expected_square
+            if found and move_model.multipoles([*others, found[0]]).expected_square < (
                     1 - BETTER) * now:
                 chosen, better = [*others, found[0]], True
     return chosen
 
 
-def _best(
-    bench: _Bench, field: _Field, candidates: _Candidates, chosen: Sequence[Move], count: int
+def _best_moves(
+    move_model: _MoveModel, placements: _Placements, candidates: _CandidateMoves,
+    chosen: Sequence[Move], count: int,
 ) -> list[Move]:
-    """The best moves of a kind by the mean, in slots and with blocks that are free."""
-    used = [one for move in chosen for one in move.placements]
-    free = ~(np.isin(field.to, [one.to for one in used])
-             | np.isin(field.block, [one.block for one in used]))
+    """Return the best moves of a kind, with slots and blocks that no chosen move uses.
+
+    They are ranked by the sum of squares of the mean after the move plus the variance that
+    mounting adds. The change of the remaining variance is neglected.
+    """
+    used = [placement for move in chosen for placement in move.placements]
+    free = ~(np.isin(placements.to, [placement.to for placement in used])
+             | np.isin(placements.block, [placement.block for placement in used]))
     parts = candidates.parts[free[candidates.parts].all(axis=1)]
     if not len(parts):
         return []
-    mean, _ = bench.coefficients(chosen)
-    # with the main multipole that the changes are scaled by: moves hardly change it
-    now = bench.model.units(np.concatenate([[abs(bench.start[0][0])], mean[1:]]))
+    mean, _ = move_model.coefficients(chosen)
+    # Moves hardly change the main multipole: use that by which `_Placements.change` is scaled.
+    now = move_model.model.units(np.concatenate([[abs(move_model.start[0][0])], mean[1:]]))
     score = np.empty(len(parts))
     for first in range(0, len(parts), AT_ONCE):
-        some = parts[first:first + AT_ONCE]
-        after = now + field.change[some].sum(axis=1)
-        score[first:first + AT_ONCE] = np.einsum("ij,ij->i", after, after) + field.noise[some].sum(
-            axis=1)
-    few = np.argpartition(score, count)[:count] if count < len(score) else np.arange(len(score))
-    return [field.move(candidates.kind, parts[i]) for i in few[np.argsort(score[few])]]
+        batch = parts[first:first + AT_ONCE]
+        after = now + placements.change[batch].sum(axis=1)
+        score[first:first + AT_ONCE] = (
+            np.einsum("ij,ij->i", after, after) + placements.noise[batch].sum(axis=1))
+    best = np.argpartition(score, count)[:count] if count < len(score) else np.arange(len(score))
+    return [placements.move(candidates.kind, parts[i]) for i in best[np.argsort(score[best])]]
 
 
-def _steps(
-    bench: _Bench, moves: Sequence[Move], goal: _Goal
+def _steps_by_gain(
+    move_model: _MoveModel, moves: Sequence[Move], goal: _Goal
 ) -> tuple[Step, ...]:
-    """The moves in the order of what they gain, as far as that is worth it, or as is needed."""
+    """Return the moves in the order of their gain.
+
+    The list ends as soon as the limit is met. Moves at its end whose gain is not worth the work
+    (see `GAIN_SDS`) are left out.
+    """
     left, steps = list(moves), []
-    now = bench.multipoles([])
+    now = move_model.multipoles([])
     done: list[Move] = []
     while left and not goal.met(now):
-        gains = bench.gains(done, left)
+        gains = move_model.gains(done, left)
         best = int(np.argmax([expected for expected, _ in gains]))
         done.append(left.pop(best))
-        now = bench.multipoles(done)
+        now = move_model.multipoles(done)
         steps.append(Step(done[-1], *gains[best], now))
     while steps and steps[-1].gain <= GAIN_SDS * steps[-1].gain_sd:
         steps.pop()
@@ -575,15 +677,17 @@ def _steps(
 
 
 def gain(before: Multipoles, after: Multipoles) -> tuple[float, float]:
-    """Expected fall of the sum of |c_n|^2 in units^2, and its standard deviation.
+    """Return the expected decrease of ``sum |c_n|^2`` in units^2, and its standard deviation.
 
-    Of normal x = (before, after) and ``x' A x``: mean ``m' A m + tr(A C)``, variance
-    ``4 m' A C A m + 2 tr(A C A C)`` (A. M. Mathai, S. B. Provost, Quadratic Forms in Random
-    Variables, 1992, sec. 3.2). The columns of both roots are the same as far as both have them.
+    The decrease is a quadratic form ``x' A x`` of the normal vector x = (before, after) with mean m
+    and covariance C. Its mean is ``m' A m + tr(A C)`` and its variance ``4 m' A C A m +
+    2 tr(A C A C)`` (A. M. Mathai, S. B. Provost, Quadratic Forms in Random Variables, 1992, sec.
+    3.2). Columns of the two covariance factors with the same number belong to the same independent
+    variable.
     """
     width = max(before.root.shape[1], after.root.shape[1])
-    root = np.vstack([np.pad(one.root, ((0, 0), (0, width - one.root.shape[1])))
-                      for one in (before, after)])
+    root = np.vstack([np.pad(known.root, ((0, 0), (0, width - known.root.shape[1])))
+                      for known in (before, after)])
     mean = np.concatenate([before.mean, after.mean])
     sign = np.repeat([1.0, -1.0], len(before.mean))
     product = sign[:, None] * (root @ root.T)

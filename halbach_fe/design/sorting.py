@@ -1,9 +1,12 @@
-"""Which of the measured blocks should go into which slot, before the magnet is assembled.
+"""Sorting: the assignment of measured blocks to slots, before the magnet is assembled.
 
-The multipoles are sums over the slots of what a block does there. From a random order, slot after
-slot makes the exchange with another of its type, or with a block left over, that lowers
-``sum |c_n|^2`` most, until none lowers it; the best of several random starts counts. All exchanges
-of a slot are tried at once, by columns that are computed once.
+The multipoles are sums over the slots of the contributions of the blocks in them. The search starts
+from a random assignment. It visits one slot after another, and makes the exchange with another slot
+of the same type, or with a block left over, that lowers ``sum |c_n|^2`` most, until no exchange
+lowers the sum. The best of several random starts is the result. All exchanges of a slot are
+evaluated at once from the contribution of every block in every slot, which is computed beforehand.
+
+An "order" is an assignment: an array (slots,) with the row of the table of the block in each slot.
 """
 
 from __future__ import annotations
@@ -16,37 +19,43 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import facing_angle_deg
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import as_mounted, loose_blocks, types_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles
-from halbach_fe.stats.gaussian import rotated
+from halbach_fe.stats.gaussian import rotation_roots
 from halbach_fe.study.model import Study
 
 STARTS = 20
-RANDOM_ORDERS = 2000
+"""Number of random assignments from which the search starts."""
 
-ENOUGH = 1e-3
-"""An exchange that lowers the sum by less than this part of its variance, which no order can
-change, is not worth it."""
+RANDOM_ORDERS = 2000
+"""Number of random assignments with which the result is compared."""
+
+WORTHWHILE = 1e-3
+"""Smallest decrease of ``sum |c_n|^2`` for which blocks are exchanged, relative to the contribution
+of the measurement's uncertainty to that sum, which no assignment changes."""
 
 
 @dataclass(frozen=True)
-class Sorted:
-    """A table of blocks with their slots, and what comes of it.
+class SortedBlocks(ShownInNotebook):
+    """Measured blocks assigned to slots, and the multipoles that result.
 
     Attributes
     ----------
+    study : Study
+    model : MultipoleModel
     table : BlockTable
-        With ring and slot; blocks left over have none.
+        The table of blocks with ring and slot of each; those of blocks left over are 0.
     best, numbered : Multipoles
-        Of this order, and of that in which the table has them.
+        Multipoles of this assignment, and of the blocks in the order of the given table.
     random : ndarray, shape (orders,)
-        Root mean square of |c_n| in units, of the mean of random orders.
-    reference : str
-        What the table's own order is.
+        Root mean square of the |c_n| of the mean for random assignments, in units.
+    own_order : str
+        Description of the order of the given table.
     """
 
     study: Study
@@ -59,20 +68,33 @@ class Sorted:
 
     @property
     def left_over(self) -> int:
-        """Blocks without a slot."""
+        """Number of blocks without a slot."""
         return int(np.sum(self.table.ring == 0))
 
 
 @dataclass(frozen=True)
-class _Bench:
-    """What every block does in every slot of its type.
+class _SlotResponses:
+    """Contribution of every block to the multipoles in every slot.
+
+    The contributions have no meaning for slots of a type that is not the block's.
 
     Attributes
     ----------
+    model : MultipoleModel
+    vectors : ndarray, shape (blocks, D), in A/m
+        Measured magnetizations in the own axes of the blocks.
+    roots : ndarray, shape (blocks, D, D), in A/m
+        Covariance factors (square roots) of the measurements.
+    turns : ndarray, shape (slots, D, D)
+        Rotations from the own axes of a block in a slot to the axes of the magnet.
     mean : ndarray of complex, shape (1 + k, blocks, slots)
-        Of C; meaningless in slots of other types.
+        Contributions to the coefficients C_n, the main one first.
     unwanted : ndarray, shape (blocks, slots, 2 k)
-        The same in units of the nominal main multipole.
+        Contributions to b_n and a_n, in units of the main multipole of blocks of average strength.
+    offset : ndarray, shape (2 k,)
+        The part of b_n and a_n that does not depend on the blocks.
+    types, slot_types : ndarray of int, shape (blocks,) and (slots,)
+        Number of the type of each block, and of the blocks that each slot takes.
     """
 
     model: MultipoleModel
@@ -86,7 +108,7 @@ class _Bench:
     slot_types: Ints
 
     def total(self, order: Ints) -> Floats:
-        """b_n, a_n (2 k,) of an order, the block in each slot (slots,)."""
+        """Return b_n and a_n (2 k,) of an order (slots,), the block in each slot."""
         return np.asarray(
             self.offset + self.unwanted[order, np.arange(len(order))].sum(axis=0))
 
@@ -94,37 +116,52 @@ class _Bench:
 def sort_blocks(
     magnet: Magnet, table: BlockTable, model: MultipoleModel, generator: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Sorted:
-    """Assign blocks to slots within each type.
+) -> SortedBlocks:
+    """Assign measured blocks to slots of their type such that unwanted multipoles are small.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    table : BlockTable
+        The measured blocks.
+    model : MultipoleModel
+        Multipoles to make small.
+    generator : numpy.random.Generator
+    progress : callable, optional
+        Is called with the number of starts done and their total number.
 
     Raises
     ------
     MeasurementError
         If the table does not fit the study, or has too few blocks of a type.
     """
-    bench = _bench(magnet, table, model)
-    _check_numbers(magnet, table)
+    responses = _slot_responses(magnet, table, model)
+    _check_block_counts(magnet, table)
     if len(set(table.type)) == len(table):
-        warnings.warn(f"Every block of study {magnet.name} is of a type of its own and fits one "
-                      "slot only: there is nothing to sort. Say in prior.types which slots take "
-                      "the same blocks, or measure spare ones.", HalbachWarning, stacklevel=2)
-    tolerance = ENOUGH * float(np.sum(_known(magnet, bench, _numbered(bench)).root ** 2))
-    best, least = _numbered(bench), np.inf
+        warnings.warn(f"Every block of study {magnet.name} is of a different type and fits only "
+                      "one slot: there is nothing to sort. State in prior.types which slots take "
+                      "the same blocks, or measure spare blocks.", HalbachWarning, stacklevel=2)
+    tolerance = WORTHWHILE * float(np.sum(
+        _multipoles_of(magnet, responses, _table_order(responses)).root ** 2))
+    best, least = _table_order(responses), np.inf
     for start in range(STARTS):
-        order, square = _descent(bench, _random(bench, generator), tolerance)
+        order, square = _descent(responses, _random_order(responses, generator), tolerance)
         if square < least:
             best, least = order, square
         progress(start + 1, STARTS)
-    placed = _as_placed(table, magnet)
-    own = _numbered(bench) if placed is None else placed
-    totals = np.array([bench.total(_random(bench, generator)) for _ in range(RANDOM_ORDERS)])
-    return Sorted(
-        magnet.study, model, _with_places(magnet, table, best), _known(magnet, bench, best),
-        _known(magnet, bench, own), np.sqrt(np.sum(totals**2, axis=1) / len(model.orders)),
+    placed = _placed_order(table, magnet)
+    own = _table_order(responses) if placed is None else placed
+    totals = np.array([responses.total(_random_order(responses, generator))
+                       for _ in range(RANDOM_ORDERS)])
+    return SortedBlocks(
+        magnet.study, model, _with_places(magnet, table, best),
+        _multipoles_of(magnet, responses, best), _multipoles_of(magnet, responses, own),
+        np.sqrt(np.sum(totals**2, axis=1) / len(model.orders)),
         "as numbered" if placed is None else "as placed in the table")
 
 
-def _bench(magnet: Magnet, table: BlockTable, model: MultipoleModel) -> _Bench:
+def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) -> _SlotResponses:
+    """Compute the contribution of every block to the multipoles in every slot."""
     size, blocks = magnet.dimension, magnet.blocks
     vectors, roots = loose_blocks(magnet, table)
     turns = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
@@ -134,72 +171,82 @@ def _bench(magnet: Magnet, table: BlockTable, model: MultipoleModel) -> _Bench:
     mean = np.einsum("ksj,bj->kbs", carried, vectors)
     labels = {label: number for number, label in enumerate(types_of(magnet))}
     of_slot = {slot: labels[label] for label, slots in types_of(magnet).items() for slot in slots}
-    # with the main multipole that the blocks have on average
+    # The order hardly changes the main multipole: scale it with the blocks' median strength.
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))
-                                      / np.median(_sizes(model.nominal, size)))
+                                      / np.median(_magnitudes(model.nominal, size)))
 
     def units(values: Complexes) -> Floats:
         return 1e4 / main * np.concatenate([values[1:].real, values[1:].imag])
 
-    return _Bench(model, vectors, roots, turns, mean, np.moveaxis(units(mean), 0, 2),
-                  units(model.offset), np.array([labels[label] for label in table.type]),
-                  np.array([of_slot[block.slot] for block in blocks]))
+    return _SlotResponses(
+        model, vectors, roots, turns, mean, np.moveaxis(units(mean), 0, 2), units(model.offset),
+        np.array([labels[label] for label in table.type]),
+        np.array([of_slot[block.slot] for block in blocks]))
 
 
-def _sizes(vectors: Floats, size: int) -> Floats:
-    return np.linalg.norm(vectors.reshape(-1, size), axis=1)
+def _magnitudes(vectors: Floats, dimension: int) -> Floats:
+    """Return the magnitudes of magnetizations, given as a vector of all their components."""
+    return np.linalg.norm(vectors.reshape(-1, dimension), axis=1)
 
 
-def _check_numbers(magnet: Magnet, table: BlockTable) -> None:
+def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
+    """Raise a MeasurementError if the table has too few blocks of a type."""
     for label, slots in types_of(magnet).items():
-        needed, there = len(slots) * magnet.array.rings, table.type.count(label)
-        if there < needed:
+        needed, measured = len(slots) * magnet.array.rings, table.type.count(label)
+        if measured < needed:
             raise MeasurementError(must_be(
                 f"blocks of type {label}", table.source, f"enough for the {needed} slots of that "
-                "type", str(there), "Measure more, or join types in the study's prior.types."))
+                "type", str(measured),
+                "Measure more blocks, or join types in the study's prior.types."))
 
 
-def _numbered(bench: _Bench) -> Ints:
-    """Blocks of each type in the order of the table, the block in each slot (slots,)."""
-    order = np.empty(len(bench.slot_types), int)
-    for number in np.unique(bench.slot_types):
-        slots = np.flatnonzero(bench.slot_types == number)
-        order[slots] = np.flatnonzero(bench.types == number)[:len(slots)]
+def _table_order(responses: _SlotResponses) -> Ints:
+    """Return the assignment (slots,) that takes the blocks of each type in the table's order."""
+    order = np.empty(len(responses.slot_types), int)
+    for number in np.unique(responses.slot_types):
+        slots = np.flatnonzero(responses.slot_types == number)
+        order[slots] = np.flatnonzero(responses.types == number)[:len(slots)]
     return order
 
 
-def _random(bench: _Bench, generator: np.random.Generator) -> Ints:
-    order = np.empty(len(bench.slot_types), int)
-    for number in np.unique(bench.slot_types):
-        slots = np.flatnonzero(bench.slot_types == number)
-        members = generator.permutation(np.flatnonzero(bench.types == number))
+def _random_order(responses: _SlotResponses, generator: np.random.Generator) -> Ints:
+    """Return an assignment (slots,) that takes the blocks of each type in random order."""
+    order = np.empty(len(responses.slot_types), int)
+    for number in np.unique(responses.slot_types):
+        slots = np.flatnonzero(responses.slot_types == number)
+        members = generator.permutation(np.flatnonzero(responses.types == number))
         order[slots] = members[:len(slots)]
     return order
 
 
-def _as_placed(table: BlockTable, magnet: Magnet) -> Ints | None:
-    """The order that the table itself has, if every slot has a block."""
-    there = {place: row for row, place in enumerate(table.places) if place[0]}
+def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
+    """Return the assignment by the table's own rings and slots, or None if a slot has no block."""
+    row_of = {place: row for row, place in enumerate(table.places) if place[0]}
     places = [(block.ring, block.slot) for block in magnet.blocks]
-    if not all(place in there for place in places):
+    if not all(place in row_of for place in places):
         return None
-    return np.array([there[place] for place in places])
+    return np.array([row_of[place] for place in places])
 
 
-def _descent(bench: _Bench, order: Ints, tolerance: float) -> tuple[Ints, float]:
-    """The order with the best exchange made for one slot after another, until none gains more than
-    the tolerance; and its sum of squares.
+def _descent(responses: _SlotResponses, order: Ints, tolerance: float) -> tuple[Ints, float]:
+    """Improve an order by exchanges until none gains more than a tolerance.
+
+    Returns
+    -------
+    order : ndarray of int, shape (slots,)
+    square : float
+        Its ``sum |c_n|^2`` in units^2, without the uncertainty.
     """
     order = order.copy()
-    now, idle, slot = bench.total(order), 0, 0
-    peers = [np.flatnonzero(bench.slot_types == number) for number in bench.slot_types]
+    now, idle, slot = responses.total(order), 0, 0
+    peers = [np.flatnonzero(responses.slot_types == number) for number in responses.slot_types]
     while idle < len(order):
-        gain, block, other = _best_exchange(bench, order, slot, peers[slot], now)
+        gain, block, other = _best_exchange(responses, order, slot, peers[slot], now)
         if gain > tolerance:
             if other is not None:
                 order[other] = order[slot]
             order[slot] = block
-            now, idle = bench.total(order), 0
+            now, idle = responses.total(order), 0
         else:
             idle += 1
         slot = (slot + 1) % len(order)
@@ -207,44 +254,66 @@ def _descent(bench: _Bench, order: Ints, tolerance: float) -> tuple[Ints, float]
 
 
 def _best_exchange(
-    bench: _Bench, order: Ints, slot: int, peers: Ints, now: Floats
+    responses: _SlotResponses, order: Ints, slot: int, peers: Ints, now: Floats
 ) -> tuple[float, int, int | None]:
-    """What the best exchange of a slot's block gains; its new block, and the slot that gets the old
-    one, None if that is left over.
+    """Find the exchange of the block in a slot that lowers the sum of squares most.
+
+    Parameters
+    ----------
+    order : ndarray of int, shape (slots,)
+    slot : int
+    peers : ndarray of int
+        The slots that take the same type of block.
+    now : ndarray, shape (2 k,)
+        b_n and a_n of the order.
+
+    Returns
+    -------
+    gain : float
+        Decrease of ``sum |c_n|^2`` in units^2.
+    block : int
+        New block of the slot.
+    other : int or None
+        The slot that gets the old block; None if the old block is left over.
     """
     own, others = order[slot], order[peers]
-    spare = np.setdiff1d(np.flatnonzero(bench.types == bench.slot_types[slot]), others)
-    unwanted = bench.unwanted
+    spare = np.setdiff1d(np.flatnonzero(responses.types == responses.slot_types[slot]), others)
+    unwanted = responses.unwanted
     both = (unwanted[others, slot] + unwanted[own, peers] - unwanted[own, slot]
             - unwanted[others, peers])
     changes = np.vstack([both, unwanted[spare, slot] - unwanted[own, slot]])
     falls = -(2 * changes @ now + np.einsum("ik,ik->i", changes, changes))
-    falls[:len(peers)][peers == slot] = -np.inf  # the block with itself
+    falls[:len(peers)][peers == slot] = -np.inf  # exchange of the block with itself
     best = int(np.argmax(falls))
     if best < len(peers):
         return float(falls[best]), int(others[best]), int(peers[best])
     return float(falls[best]), int(spare[best - len(peers)]), None
 
 
-def _known(magnet: Magnet, bench: _Bench, order: Ints) -> Multipoles:
-    """Multipoles of an order, with what the table, the coil's calibration and the mounting leave
-    open.
+def _multipoles_of(magnet: Magnet, responses: _SlotResponses, order: Ints) -> Multipoles:
+    """Return the multipoles of an order with their uncertainty.
+
+    The uncertainty is that of the measured moments, of the coil's calibration and of the mounting.
     """
-    every, size = np.arange(len(order)), bench.vectors.shape[1]
-    columns = bench.model.matrix.reshape(len(bench.model.matrix), len(order), size)
-    carried = np.einsum("ksi,sij->ksj", columns, bench.turns)
-    vectors = bench.vectors[order]
-    mean = bench.model.offset + bench.mean[:, order, every].sum(axis=1)
-    own = np.einsum("ksi,sij->ksj", carried, bench.roots[order]).reshape(len(mean), -1)
+    every, size = np.arange(len(order)), responses.vectors.shape[1]
+    columns = responses.model.matrix.reshape(len(responses.model.matrix), len(order), size)
+    carried = np.einsum("ksi,sij->ksj", columns, responses.turns)
+    vectors = responses.vectors[order]
+    mean = responses.model.offset + responses.mean[:, order, every].sum(axis=1)
+    own = np.einsum("ksi,sij->ksj", carried, responses.roots[order]).reshape(len(mean), -1)
     common = magnet.study.prior.common_mode_sd * np.einsum("ksi,si->k", carried, vectors)
-    turns = np.einsum("ksi,sia->ksa", carried, rotated(
+    turns = np.einsum("ksi,sia->ksa", carried, rotation_roots(
         vectors, np.radians(magnet.study.prior.mounting_sd_deg)))
-    return bench.model.known(mean, np.hstack([
+    return responses.model.known(mean, np.hstack([
         own, common[:, None], turns.reshape(len(mean), -1)]))
 
 
 def _with_places(magnet: Magnet, table: BlockTable, order: Ints) -> BlockTable:
-    """The table with ring and slot; blocks left over have none, and the axes of the first slot."""
+    """Return the table with ring and slot of each block, and moments in the axes of these slots.
+
+    Ring and slot of blocks that are left over are 0, and their moments are in the axes of the first
+    slot of their type.
+    """
     ring, slot = np.zeros(len(table), int), np.zeros(len(table), int)
     places = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
     for number, (row, block) in enumerate(zip(order, magnet.blocks, strict=True)):

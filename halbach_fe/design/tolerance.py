@@ -1,8 +1,8 @@
-"""Multipoles of magnets whose blocks are drawn from the prior: what to expect of the next one.
+"""Multipoles of magnets whose blocks are drawn from the prior: what the tolerances allow.
 
-They are linear in the magnetizations but for the main one that they are divided by, so that their
-covariance has a closed form; sizes |c_n|, their quantiles and the share of magnets within a limit
-come from samples of C itself.
+The coefficients C_n are linear in the magnetizations. Multipoles are C_n divided by the main
+coefficient; linearized in the latter, their mean and covariance have a closed form. The magnitudes
+|c_n|, their quantiles and the share of magnets within a limit are computed from samples of C_n.
 """
 
 from __future__ import annotations
@@ -13,28 +13,36 @@ import numpy as np
 import scipy.linalg as linalg
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
-from halbach_fe.stats.gaussian import Gaussian, beside, by_block, nominal_prior, rotated
+from halbach_fe.stats.gaussian import (
+    Gaussian,
+    block_diagonal_root,
+    nominal_prior,
+    rotation_roots,
+    stacked_root,
+)
 from halbach_fe.study.model import Study
 
 QUANTILES = (0.05, 0.5, 0.95, 0.99)
+"""Probabilities of the quantiles of |c_n| that are reported."""
 
 
 @dataclass(frozen=True)
-class Tolerance:
-    """Multipoles of magnets from one prior.
+class Tolerance(ShownInNotebook):
+    """Multipoles of magnets whose blocks are drawn from a prior.
 
     Attributes
     ----------
     known : Multipoles
-        Mean and covariance, in closed form.
+        Mean and covariance in closed form.
     sizes : ndarray, shape (draws, k)
-        |c_n| in units.
+        |c_n| of the samples, in units of 1e-4.
     main : ndarray, shape (draws,)
-        |C_N| in T or T m.
+        |C_N| of the samples, in T, or T m if integrated along z.
     limit : float or None
-        In units.
+        Limit of all |c_n|, in units of 1e-4.
     """
 
     study: Study
@@ -46,17 +54,20 @@ class Tolerance:
 
     @property
     def quantiles(self) -> Floats:
-        """|c_n| that so many magnets stay below, (`QUANTILES`, k)."""
+        """Quantiles of |c_n| in units, shape (len(`QUANTILES`), k)."""
         return np.quantile(self.sizes, QUANTILES, axis=0)
 
     @property
     def share(self) -> float | None:
-        """Of magnets all of whose multipoles are within the limit."""
+        """Share of magnets whose multipoles are all within the limit; None without a limit."""
         return None if self.limit is None else met(self.sizes, self.limit)
 
     @property
     def share_sd(self) -> float | None:
-        """Of that share, by the number of draws; by the rule of succession, not 0 for none."""
+        """Standard error of `share`, which follows from the number of draws.
+
+        It uses Laplace's rule of succession, so that it is not 0 if the share is 0 or 1.
+        """
         if self.share is None:
             return None
         count = len(self.sizes)
@@ -65,41 +76,48 @@ class Tolerance:
 
     @property
     def shares(self) -> Floats | None:
-        """By order (k,): of magnets within the limit."""
+        """Share of magnets within the limit for each order, (k,); None without a limit."""
         return None if self.limit is None else np.mean(self.sizes <= self.limit, axis=0)
 
 
 def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
-    """The study's prior of magnets as they are assembled: blocks, calibration, and mounting.
+    """Return the study's prior of the magnetizations of assembled magnets.
+
+    It has the tolerances of the blocks, the error that they share, and the random angles by which
+    blocks are turned when they are mounted.
 
     Parameters
     ----------
+    magnet : Magnet
     nominal : ndarray, shape (parameters,), in A/m
+        Nominal magnetizations.
     """
     settings, size = magnet.study.prior, magnet.dimension
     blocks = nominal_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
                          settings.common_mode_sd)
-    turns = rotated(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return Gaussian(blocks.mean, beside(blocks.root, by_block(turns)))
+    turns = rotation_roots(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
+    return Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns)))
 
 
 def predict_tolerance(
     model: MultipoleModel, magnet: Magnet, prior: Gaussian, draws: int,
     generator: np.random.Generator, limit: float | None = None,
 ) -> Tolerance:
-    """Draw magnets from a prior.
+    """Compute the distribution of the multipoles of magnets from a prior.
 
     Parameters
     ----------
     prior : Gaussian
-        Of the parameters in A/m, mounting included.
+        Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
+        Number of samples.
+    generator : numpy.random.Generator
     limit : float, optional
-        For every |c_n|, in units of 1e-4.
+        Limit of every |c_n|, in units of 1e-4.
     """
     mean = model.offset + model.matrix @ prior.mean
     root = model.matrix @ prior.root
-    # as many columns as there are numbers do for the same covariance
+    # a QR decomposition reduces the covariance factor to a square one of the same covariance
     parts = np.vstack([root.real, root.imag])
     (small,) = linalg.qr(parts.T, mode="r")
     drawn = generator.standard_normal((draws, len(small))) @ small
@@ -107,5 +125,4 @@ def predict_tolerance(
     coefficients = mean + drawn[:, :count] + 1j * drawn[:, count:]
     sizes = np.hypot(*model.units(coefficients).reshape(draws, 2, -1).swapaxes(0, 1))
     return Tolerance(magnet.study, model, model.known(mean, root), sizes,
-                     np.abs(coefficients[:, 0]),
-                     limit)
+                     np.abs(coefficients[:, 0]), limit)

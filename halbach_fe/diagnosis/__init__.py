@@ -1,1 +1,1 @@
-"""Where a model and a measurement disagree, and which missing effect explains it."""
+"""Find which missing effects explain the disagreement between a model and a measured map."""

@@ -1,12 +1,17 @@
-"""From a disagreement to its name: which effects a study lacks, and the study that has them.
+"""Find the effects that a study lacks, and return the study with these effects added.
 
-First what spoils all else is put right: a map that was misread, and single readings that are off.
-Where the solver's own error explains the misfit, that is all there is to say.
-Then effects are searched with their signatures, linear and cheap; those found go into the study in
-full and are solved for again, which moves the point of linearization, until nothing changes: a
-Gauss-Newton method whose model is the real one. In every round all effects compete anew, the found
-ones with their signatures at that point. Positions that shake are noise, with which all is judged
-once more.
+The diagnosis corrects gross errors of the map (units, axes, wrong magnet) before any inference, and
+excludes outliers after the first one. If the solver's own error explains the misfit, it stops
+there.
+
+Otherwise it iterates. In every round all effects of the catalogue compete by their linear
+signatures, which are cheap to compute. The selected effects enter the study in full, the study is
+solved again, and the signatures of these effects are computed anew at that point. This is a
+Gauss-Newton method in which the finite-element model takes the place of the linearized one. The
+iteration has converged when a round changes neither the selection nor the amplitudes.
+
+Random errors of the probe's positions are noise rather than an effect: their size is estimated in
+every round, and the comparison is repeated with that noise until it no longer changes.
 """
 
 from __future__ import annotations
@@ -55,135 +60,175 @@ from halbach_fe.measurement.instrument import map_time
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
-MOST_ROUNDS = 8
-SETTLED = 0.2
-"""Of an amplitude's standard deviation: less between rounds is no change."""
+MAX_ROUNDS = 8
+"""Largest number of rounds, each of which solves the model once."""
+CONVERGENCE_TOLERANCE = 0.2
+"""Largest change of an amplitude between rounds that counts as converged, in units of the
+amplitude's posterior standard deviation."""
 
 ON_AXIS_M = 1e-6
-"""Distance from the axis below which a point has no angle."""
+"""Distance from the axis below which a point has no azimuth."""
 
 
 def diagnose(
     study: Study, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
-    effects: Sequence[Effect] | None = None, unseen: xr.Dataset | None = None,
+    effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
     say: Say = lambda text: None, solver: NominalSolver | None = None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain a map.
 
     Parameters
     ----------
+    study : Study
+    data : Dataset
+        The map, as `halbach_fe.measurement.field_map.read_map` returns it.
+    session : Session
+        Its folder receives a subfolder for each round.
+    blocks : BlockTable, optional
+        Measured blocks, whose prior takes the place of the study's.
     effects : sequence of Effect, optional
-        To choose from; default the whole catalogue.
-    unseen : Dataset, optional
-        Another map, which is only predicted.
+        The candidate effects; default the whole catalogue.
+    validation_map : Dataset, optional
+        Another map, which is predicted but not used for the inference.
+    say : callable, optional
+        Called with a line of text on each step, to report progress.
     solver : callable, optional
-        Of nominal magnets, see `memoized_solver`; default one of its own.
+        Solver for the fields of nominal magnets, see `memoized_solver`. Several diagnoses may share
+        one, so that equal magnets are solved once.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    MeasurementError
+        If a map or the blocks do not fit the study.
     """
     effects = catalogue() if effects is None else effects
-    gross, read, start = _read_right(study, data, blocks, effects)
-    for one in gross:
-        say(f"gross error: {one.reading.text}")
-    if blocks is not None and read.array.rings != study.array.rings:
-        nowhere = np.zeros_like(blocks.ring)  # which ring is which is not known then
-        blocks = replace(blocks, ring=nowhere, slot=nowhere)
+    gross_errors, corrected, start = _correct_map_errors(study, data, blocks, effects)
+    for error in gross_errors:
+        say(f"gross error: {error.convention.text}")
+    if blocks is not None and corrected.array.rings != study.array.rings:
+        unplaced = np.zeros_like(blocks.ring)  # the table's rings are not those of this magnet
+        blocks = replace(blocks, ring=unplaced, slot=unplaced)
     signatures: Signatures = {}
-    solver = solver or memoized_solver(replace(_room(session, "signatures"), progress=None))
-    times = np.concatenate([map_time(one) for one in (data, unseen) if one is not None])
+    solver = solver or memoized_solver(replace(_subsession(session, "signatures"), progress=None))
+    times = np.concatenate([map_time(each) for each in (data, validation_map) if each is not None])
     first: tuple[InferenceResult, Search] | None = None
-    named, vibration, at_rest = start, None, True
+    identified, position_noise, converged = start, None, True
     outliers: tuple[Outlier, ...] = ()
-    numerical: SolverErrorExplanation | None = None
+    solver_error: SolverErrorExplanation | None = None
 
     def updated(name: str) -> InferenceResult:
-        changed = with_position_noise(apply_effects(read, named), vibration)
-        return infer(build_magnet(changed), data, _room(session, name), blocks,
-                     unseen=unseen)
+        changed = with_position_noise(apply_effects(corrected, identified), position_noise)
+        return infer(build_magnet(changed), data, _subsession(session, name), blocks,
+                     validation_map=validation_map)
 
-    for number in range(MOST_ROUNDS):
-        say(f"round {number + 1}: the model with "
-            f"{', '.join(one.found.candidate.name for one in named) or 'nothing added'}")
+    for number in range(MAX_ROUNDS):
+        names = ", ".join(effect.selection.candidate.name for effect in identified)
+        say(f"round {number + 1}: the model with {names or 'no effect added'}")
         update = updated(f"round-{number + 1}")
         if number == 0:
             outliers = outliers_of(update)
         if number == 0 and outliers:
-            say(f"outliers: {len(outliers)}; without them")
-            read = excluding(read, outliers)
+            say(f"outliers: {len(outliers)} readings are excluded")
+            corrected = excluding(corrected, outliers)
             update = updated("without-outliers")
-        known = (first[0] if first else update).prior.mean
-        search = score_hypotheses(read, start, update, known, times, solver, effects, named,
-                                  signatures,
-                      session.progress or (lambda done, total: None))
+        prior_mean = (first[0] if first else update).prior.mean
+        search = score_hypotheses(
+            corrected, start, update, prior_mean, times, solver, effects, identified, signatures,
+            session.progress or (lambda done, total: None))
         first = first or (update, search)
-        numerical = None if named else explain_by_solver_error(update)
-        if numerical:
+        solver_error = None if identified else explain_by_solver_error(update)
+        if solver_error:
             say("the solver's own error explains the misfit")
             break
-        shaken = estimate_position_noise(update, search.marginal, search.columns, search.training,
-                                         vibration)
-        if not has_settled(vibration, shaken):
-            say(f"vibration: {1e3 * shaken.sd_m if shaken else 0:.2g} mm; with it in the noise")
-            vibration = shaken
-            signatures.clear()  # whitened by the noise that it was
+        estimate = estimate_position_noise(update, search.marginal, search.columns, search.training,
+                                           position_noise)
+        if not has_settled(position_noise, estimate):
+            say(f"vibration: positions with a standard deviation of "
+                f"{1e3 * estimate.sd_m if estimate else 0:.2g} mm are added to the noise")
+            position_noise = estimate
+            signatures.clear()  # they were whitened by the previous noise
             continue
-        found = identify_effects(read, search, update.observation.map_points)
-        at_rest = _settled(named, found)
-        if at_rest:
+        found = identify_effects(corrected, search, update.observation.map_points)
+        converged = _has_converged(identified, found)
+        if converged:
             break
-        named = found
+        identified = found
     assert first is not None
-    rest = None if numerical else find_unknown_cause(search, update, named)
-    if rest is not None and rest.alone:
-        named, vibration, (update, search) = start, None, first
+    unknown = None if solver_error else find_unknown_cause(search, update, identified)
+    if unknown is not None and unknown.alone:
+        identified, position_noise, (update, search) = start, None, first
     return Diagnosis(
-        read=read, before=first[0], after=update, named=named, unknown=rest,
+        corrected_study=corrected, before=first[0], after=update, identified=identified,
+        unknown=unknown,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),
-        left_out_before=loo_residuals(first[1].marginal, first[1].training),
-        left_out_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
-        gross=gross, outliers=outliers, vibration=vibration, numerical=numerical,
-        at_rest=at_rest)
+        loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
+        loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
+        gross_errors=gross_errors, outliers=outliers, position_noise=position_noise,
+        solver_error=solver_error, converged=converged)
 
 
-def _read_right(
+def _correct_map_errors(
     study: Study, data: xr.Dataset, blocks: BlockTable | None, effects: Sequence[Effect]
 ) -> tuple[tuple[GrossError, ...], Study, tuple[IdentifiedEffect, ...]]:
-    """Gross errors and the study that reads the map right; of points that were elsewhere by what an
-    effect of the catalogue can be, that effect, with which a search is to start.
+    """Find the gross errors of a map and correct the study for them.
+
+    Returns
+    -------
+    errors : tuple of GrossError
+    study : Study
+        The study whose instrument or magnet is corrected for these errors.
+    start : tuple of IdentifiedEffect
+        Effects from which the search starts. An error of the points' positions that is also an
+        effect of the catalogue (`wrong_radius`, `wrong_line`) is not corrected in the study but
+        returned here, so that the search refines its amplitude.
     """
     found = find_gross_errors(study, data, blocks)
-    known = {effect.name: effect for effect in effects}
+    catalogued = {effect.name: effect for effect in effects}
     start: tuple[IdentifiedEffect, ...] = ()
-    if found and found[-1].start and found[-1].start.keys() <= known.keys():
+    if found and found[-1].start and found[-1].start.keys() <= catalogued.keys():
         start = tuple(
-            IdentifiedEffect(Hypothesis(known[name], Place()), np.array(values),
-                             np.zeros(len(values)),
-                  SelectedEffect(Candidate(name, "", ()), 0.0, 0.0, ()))
+            IdentifiedEffect(
+                Hypothesis(catalogued[name], Place()), np.array(values), np.zeros(len(values)),
+                SelectedEffect(Candidate(name, "", ()), 0.0, 0.0, ()))
             for name, values in found[-1].start.items())
         found = found[:-1]
-    for one in found:
-        study = one.apply(study)
+    for error in found:
+        study = error.apply(study)
     return found, study, start
 
 
-def _settled(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:
-    """Tell whether a round changed nothing."""
-    before = {one.hypothesis: one for one in old}
-    return before.keys() == {one.hypothesis for one in new} and all(
-        _alike(before[one.hypothesis], one) for one in new)
+def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:
+    """Tell whether a round changed neither the selected effects nor their amplitudes."""
+    before = {effect.hypothesis: effect for effect in old}
+    return before.keys() == {effect.hypothesis for effect in new} and all(
+        _same_amplitudes(before[effect.hypothesis], effect) for effect in new)
 
 
-def _alike(one: IdentifiedEffect, other: IdentifiedEffect) -> bool:
-    """Tell whether amplitudes are the same; of what is there or not the strength does not count."""
-    if len(one.values) != len(other.values):
+def _same_amplitudes(old: IdentifiedEffect, new: IdentifiedEffect) -> bool:
+    """Tell whether the amplitudes of an effect agree within the convergence tolerance.
+
+    The first amplitude of an effect that is applied in full is a switch (1 if the effect is
+    present), and is not compared.
+    """
+    if len(old.values) != len(new.values):
         return False
-    close = np.abs(one.values - other.values) <= SETTLED * other.sd
-    return bool(close[one.hypothesis.effect.discrete:].all())
+    close = np.abs(old.values - new.values) <= CONVERGENCE_TOLERANCE * new.sd
+    return bool(close[old.hypothesis.effect.applied_in_full:].all())
 
 
 def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> list[ResidualGroup]:
-    """Disagreement by z window, angle, radius, component."""
+    """Return chi-squared of the training readings grouped by z window, azimuth, radius and
+    component.
+
+    Kinds of groups with one member only or with more than 40 are left out.
+    """
     chosen = ~update.held_out
     x, y, z = update.observation.positions[chosen].T
     angle, radius = np.degrees(np.arctan2(y, x)) % 360, np.hypot(x, y)
@@ -191,15 +236,16 @@ def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> li
     window = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, 11)
     members = {
         "z": [f"{edges[k]:.3f} ... {edges[k + 1]:.3f} m" for k in window],
-        "angle": [f"{30 * int(one // 30)} ... {30 * int(one // 30) + 30} deg"
+        "angle": [f"{30 * int(azimuth // 30)} ... {30 * int(azimuth // 30) + 30} deg"
                   if distance > ON_AXIS_M else "on the axis"
-                  for one, distance in zip(angle, radius, strict=True)],
-        "radius": [f"{one:.4f} m" for one in radius],
+                  for azimuth, distance in zip(angle, radius, strict=True)],
+        "radius": [f"{distance:.4f} m" for distance in radius],
         "label": [label for label, keep in zip(update.observation.labels, chosen, strict=True)
                   if keep]}
     used = {kind: names for kind, names in members.items() if 1 < len(set(names)) <= 40}
     return residual_groups(marginal, residual, used)
 
 
-def _room(session: Session, name: str) -> Session:
+def _subsession(session: Session, name: str) -> Session:
+    """Return a session that works in a subfolder."""
     return replace(session, folder=session.folder / name)

@@ -1,15 +1,15 @@
-"""How well missing effects explain a residual, whatever the blocks may be.
+"""The evidence of missing effects, with the magnetizations of the blocks integrated out.
 
-Readings are ``r = H (p - mu_0) + J theta + noise``, r being their residual from the prior mean,
-p ~ N(mu_0, C_0) the magnetizations and theta ~ N(m, s^2) the amplitudes of the effects whose
+Readings are ``r = H (p - mu_0) + J theta + noise``, where r is their residual from the prior mean,
+p ~ N(mu_0, C_0) are the magnetizations and theta ~ N(m, s^2) the amplitudes of the effects whose
 signatures are the columns of J. With p integrated out, r has the covariance
-``S = Sigma + H C_0 H'``; all that a set of effects needs is then
+``S = Sigma + H C_0 H'``. The log evidence of any set of effects then follows from
 
-    A = J' S^-1 J,    b = J' S^-1 r,    c = r' S^-1 r,
+    A = J' S^-1 J,    b = J' S^-1 r,    c = r' S^-1 r
 
-of which the log evidence of any set is a determinant and a quadratic form (C. M. Bishop, Pattern
-Recognition and Machine Learning, eq. 2.115; the Woodbury identity for S). Amplitudes count in units
-of their prior standard deviation. Thousands of signatures are compared at the price of one product.
+as a determinant and a quadratic form (C. M. Bishop, Pattern Recognition and Machine Learning, eq.
+2.115; the Woodbury identity for S). Amplitudes are in units of their prior standard deviation. One
+product with S^-1 therefore serves the comparison of thousands of signatures.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ import scipy.linalg as linalg
 from halbach_fe.core.arrays import Floats
 
 ROWS_AT_ONCE = 8192
+"""Number of rows that products over all readings take at a time, to bound their memory."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Amplitudes of a set of effects, given the readings.
+    """The posterior of the amplitudes of a set of effects.
 
     Attributes
     ----------
     log_evidence : float
-        Over that of no effect at all.
+        Log evidence of the set over that of no effect.
     mean, covariance : ndarray, shape (k,) and (k, k)
-        Of the amplitudes, in units of their prior standard deviation.
+        Posterior mean and covariance of the amplitudes, in units of their prior standard deviation.
     """
 
     log_evidence: float
@@ -44,19 +45,22 @@ class Fit:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What readings say of signatures, the blocks integrated out.
+    """The sufficient statistics of readings for a set of signatures, the blocks integrated out.
 
     Attributes
     ----------
     information : ndarray, shape (k, k)
-        A, of amplitudes in units of their prior standard deviation.
+        The matrix A of the module's docstring.
     score : ndarray, shape (k,)
-        b.
+        The vector b of the module's docstring.
     chi2 : float
-        c; its expectation is the number of readings if nothing is missing.
+        The scalar c of the module's docstring. Its expectation is the number of readings if no
+        effect is missing.
     readings : int
+        Number of readings.
     prior : ndarray, shape (k,)
-        Precisions of the amplitudes before, in the same units: 1 unless widened.
+        Prior precisions of the amplitudes, in units of their usual prior standard deviation: 1
+        unless widened.
     """
 
     information: Floats
@@ -66,7 +70,7 @@ class Evidence:
     prior: Floats
 
     def fit(self, chosen: Sequence[int]) -> Fit:
-        """Fit a set of columns, their amplitudes having mean 0."""
+        """Return the posterior of the amplitudes of a set of columns, whose prior mean is 0."""
         index = np.asarray(chosen, int)
         if not len(index):
             return Fit(0.0, np.zeros(0), np.zeros((0, 0)))
@@ -78,7 +82,7 @@ class Evidence:
                    linalg.cho_solve(factor, np.eye(len(index))))
 
     def given(self, chosen: Sequence[int]) -> Evidence:
-        """The same of what remains when the amplitudes of a set of columns are integrated out."""
+        """Return the evidence with the amplitudes of a set of columns integrated out."""
         index = np.asarray(chosen, int)
         if not len(index):
             return self
@@ -91,25 +95,28 @@ class Evidence:
             self.chi2 - float(self.score[index] @ fit.mean), self.readings, self.prior)
 
     def only(self, chosen: Sequence[int]) -> Evidence:
-        """The same of some columns."""
+        """Return the evidence of a subset of the columns."""
         index = np.asarray(chosen, int)
         return replace(self, information=self.information[np.ix_(index, index)],
                        score=self.score[index], prior=self.prior[index])
 
     def shifted(self, column: int) -> Evidence:
-        """The same of readings less one signature, of amplitude 1."""
+        """Return the evidence of the readings less one signature at amplitude 1."""
         row = self.information[column]
         return replace(self, score=self.score - row,
                        chi2=self.chi2 - 2 * self.score[column] + row[column])
 
     def widened(self, chosen: Sequence[int], width: float) -> Evidence:
-        """The same with other prior standard deviations of a set of columns."""
+        """Return the evidence with another prior standard deviation for a set of columns.
+
+        ``width`` is in units of the usual prior standard deviation of these columns.
+        """
         prior = self.prior.copy()
         prior[np.asarray(chosen, int)] = width**-2
         return replace(self, prior=prior)
 
     def log_evidences(self, groups: Sequence[Sequence[int]]) -> Floats:
-        """Log evidence of every group of columns by itself, over that of no effect."""
+        """Return the log evidence of every group of columns by itself, over that of no effect."""
         found = np.empty(len(groups))
         sizes: dict[int, list[int]] = {}
         for number, group in enumerate(groups):
@@ -128,12 +135,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Marginal:
-    """Readings with the blocks integrated out: products with S^-1.
+    """The readings with the blocks integrated out, for products with S^-1.
 
     Attributes
     ----------
     whitened : ndarray, shape (n, m)
-        Sigma^-1/2 H L, L a root of C_0.
+        Sigma^-1/2 H L, with L a factor of C_0.
     factor : tuple
         Cholesky factor of 1 + whitened' whitened.
     """
@@ -143,14 +150,16 @@ class Marginal:
 
     @classmethod
     def of(cls, whitened: Floats) -> Marginal:
-        """From the whitened response to whitened parameters."""
+        """Build it from the whitened response (n, m) of the readings to whitened parameters."""
         product = np.eye(whitened.shape[1])
         for part in _rows(len(whitened)):
             product += whitened[part].T @ whitened[part]
         return cls(whitened, linalg.cho_factor(product, lower=True))
 
     def evidence(self, signatures: Floats, residual: Floats) -> Evidence:
-        """Compare whitened signatures (n, k), of amplitude 1, with a whitened residual (n,)."""
+        """Return the evidence of whitened signatures (n, k) at amplitude 1 for a whitened residual
+        (n,).
+        """
         columns = np.column_stack([signatures, residual])
         cross = np.zeros((self.whitened.shape[1], columns.shape[1]))
         own = np.zeros((columns.shape[1], columns.shape[1]))
@@ -163,10 +172,13 @@ class Marginal:
                         np.ones(len(total) - 1))
 
     def remove(self, columns: Floats) -> Floats:
-        """S^-1 times whitened columns (n, k), whitened once more: what the blocks cannot hide."""
+        """Return whitened S^-1 times whitened columns (n, k): the part that the blocks cannot
+        absorb.
+        """
         absorbed = linalg.cho_solve(self.factor, self.whitened.T @ columns)
         return np.asarray(columns - self.whitened @ absorbed)
 
 
 def _rows(count: int) -> list[slice]:
+    """Return slices of at most `ROWS_AT_ONCE` rows."""
     return [slice(first, first + ROWS_AT_ONCE) for first in range(0, count, ROWS_AT_ONCE)]

@@ -1,4 +1,4 @@
-"""Where readings disagree with what prior and noise foretell of them."""
+"""Leave-one-out residuals, and chi-squared of groups of readings given all other readings."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Marginal
 
 DISCOVERIES = 0.01
-"""False discovery rate among the groups of readings that are called in disagreement."""
+"""False discovery rate among the groups that are reported to disagree with the model."""
 
 
 @dataclass(frozen=True)
 class ResidualGroup:
-    """Readings that belong together, as those of a z window.
+    """The residual of a group of readings, such as those in a window of z.
 
     Attributes
     ----------
     kind, name : str
-        As ``z`` and ``-0.10 ... 0.00 m``.
+        Kind and name of the group, for example ``z`` and ``-0.10 ... 0.00 m``.
     readings : int
+        Number of readings.
     chi2_per_reading : float
-        Expected 1.
+        Chi-squared per reading; its expectation is 1.
     p : float
-        Chance of more, adjusted for the number of groups (Benjamini and Hochberg).
+        Probability of a larger chi-squared by chance, adjusted for the number of groups (Benjamini
+        and Hochberg).
     """
 
     kind: str
@@ -39,15 +41,15 @@ class ResidualGroup:
 
     @property
     def disagrees(self) -> bool:
-        """Whether chance is no explanation."""
+        """Whether the group disagrees with the model at the false discovery rate `DISCOVERIES`."""
         return self.p < DISCOVERIES
 
 
 def loo_residuals(marginal: Marginal, residual: Floats) -> Floats:
-    """Standardized residual (n,) of each reading from what all the others foretell of it.
+    """Return the standardized leave-one-out residual (n,) of each reading.
 
-    The leave-one-out identity ``(S^-1 r)_i / sqrt((S^-1)_ii)``, of whitened readings with the
-    blocks integrated out; normal if nothing is missing.
+    It is ``(S^-1 r)_i / sqrt((S^-1)_ii)`` of the whitened readings with the blocks integrated out,
+    and is standard normal if no effect is missing.
     """
     kept = linalg.solve_triangular(marginal.factor[0], marginal.whitened.T, lower=True)
     own = 1 - np.einsum("ij,ij->j", kept, kept)
@@ -57,14 +59,17 @@ def loo_residuals(marginal: Marginal, residual: Floats) -> Floats:
 def residual_groups(
     marginal: Marginal, residual: Floats, memberships: dict[str, list[str]]
 ) -> list[ResidualGroup]:
-    """Chi-squared of groups of readings under their joint predictive distribution.
+    """Return chi-squared of groups of readings under their predictive distribution.
+
+    The readings of a group are predicted jointly by all readings outside of the group.
 
     Parameters
     ----------
+    marginal : Marginal
     residual : ndarray, shape (n,)
-        Whitened.
+        Whitened residual of the readings.
     memberships : dict
-        By kind of group, the group of each reading.
+        For each kind of group, the name of the group to which each reading belongs.
     """
     found: list[tuple[str, str, int, float, float]] = []
     half = linalg.solve_triangular(marginal.factor[0], marginal.whitened.T, lower=True).T
@@ -73,8 +78,8 @@ def residual_groups(
         of = np.array(names)
         for name in dict.fromkeys(names):
             rows = np.flatnonzero(of == name)
-            # predictive residual of the group given the others: precision P = (S^-1) of its rows,
-            # chi2 = (S^-1 r)' P^-1 (S^-1 r); P = 1 - half half'
+            # the group given all others has precision P, the block 1 - half half' of S^-1, and
+            # chi2 = (S^-1 r)' P^-1 (S^-1 r)
             part = half[rows]
             inner = np.eye(part.shape[1]) - part.T @ part
             score = kept[rows]
@@ -82,5 +87,5 @@ def residual_groups(
             chi2 = float(score @ solved)
             found.append((kind, name, len(rows), chi2 / len(rows),
                           float(stats.chi2.sf(chi2, len(rows)))))
-    adjusted = false_discovery_control([one[-1] for one in found]) if found else []
-    return [ResidualGroup(*one[:4], float(p)) for one, p in zip(found, adjusted, strict=True)]
+    adjusted = false_discovery_control([group[-1] for group in found]) if found else []
+    return [ResidualGroup(*group[:4], float(p)) for group, p in zip(found, adjusted, strict=True)]

@@ -1,4 +1,4 @@
-"""How a map may be misread (units, axes, magnet, places), and the study that reads it right."""
+"""Conventions by which a map can be misread: units, axes, another magnet, and positions."""
 
 from __future__ import annotations
 
@@ -11,26 +11,39 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.measurement.instrument import along_axes
+from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 
-LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
-FLUX_DENSITIES = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
-RINGS = 4
-"""More or less than the study has, at most."""
+LENGTH_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
+"""Length units by their size in m."""
+FLUX_DENSITY_UNITS = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
+"""Flux density units by their size in T."""
+MAX_RING_DIFFERENCE = 4
+"""Largest difference between the numbers of rings of the true magnet and of the study's."""
 
 ALL_AXES: tuple[Axes, ...] = tuple(
     tuple(sign + name for sign, name in zip(signs, names, strict=True))  # type: ignore[misc]
     for names in permutations(COMPONENTS) for signs in product(("", "-"), repeat=3))
-SAME: Axes = ("x", "y", "z")
+"""All assignments of three columns to signed axes."""
+IDENTITY_AXES: Axes = ("x", "y", "z")
+"""Columns along x, y and z."""
 
 
 @dataclass(frozen=True)
 class ArrayVariant:
-    """Another magnet than the study's: the name of the error, in words, and the right study.
+    """A magnet that may have been measured in place of the study's.
 
-    ``turn_rad`` is by how much the magnetization of each block is turned, if that is all.
+    Attributes
+    ----------
+    name : str
+        Standard name of the error.
+    title : str
+        Description for a report.
+    change : callable
+        From the study to that of the true magnet.
+    turn_rad : float or None
+        Angle by which the magnetization of each block is turned, if this is the only difference.
     """
 
     name: str
@@ -41,27 +54,30 @@ class ArrayVariant:
 
 @dataclass(frozen=True)
 class MapConvention:
-    """How a map is to be read, and of what magnet: gross errors put right.
+    """The convention by which a map is to be read, and the magnet that it shows.
+
+    The defaults are those of the study. Each difference from them is a gross error.
 
     Attributes
     ----------
     length_unit, flux_density_unit : float
-        In m and T.
+        Units of the map in the study's units.
     positions, fields : tuple of str
         Axes of the columns, see `halbach_fe.study.measurement.Instrument`.
-    magnet : Magnet or None
+    magnet : ArrayVariant or None
+        The magnet that was measured in place of the study's.
     radius : float
-        Factor of the distances from the axis.
+        Factor of the points' distances from the axis.
     offset_m : float
-        Added to them.
+        Offset of the points' distances from the axis.
     shift_m : tuple of float
-        Of the points.
+        Displacement of all points.
     """
 
     length_unit: float = 1.0
     flux_density_unit: float = 1.0
-    positions: Axes = SAME
-    fields: Axes = SAME
+    positions: Axes = IDENTITY_AXES
+    fields: Axes = IDENTITY_AXES
     magnet: ArrayVariant | None = None
     radius: float = 1.0
     offset_m: float = 0.0
@@ -69,13 +85,13 @@ class MapConvention:
 
     @property
     def errors(self) -> tuple[tuple[str, str], ...]:
-        """Standard names of the errors, and what each is in words."""
+        """Standard name and description of each error."""
         found = []
         if self.length_unit != 1:
-            name = LENGTHS[self.length_unit]
+            name = LENGTH_UNITS[self.length_unit]
             found.append((name, f"coordinates in {name}"))
         if self.flux_density_unit != 1:
-            name = FLUX_DENSITIES[self.flux_density_unit]
+            name = FLUX_DENSITY_UNITS[self.flux_density_unit]
             found.append((name, f"flux densities in {name}"))
         found += axis_errors(self.positions, self.fields)
         if self.magnet:
@@ -85,8 +101,8 @@ class MapConvention:
         if self.offset_m:
             found.append(("wrong_radius", f"points {1e3 * self.offset_m:.1f} mm farther out"))
         if any(self.shift_m):
-            shift = ", ".join(f"{1e3 * one:.1f}" for one in self.shift_m)
-            found.append(("wrong_line", f"points that are off by ({shift}) mm"))
+            shift = ", ".join(f"{1e3 * component:.1f}" for component in self.shift_m)
+            found.append(("wrong_line", f"points displaced by ({shift}) mm"))
         return tuple(found)
 
     @property
@@ -96,16 +112,16 @@ class MapConvention:
 
     @property
     def text(self) -> str:
-        """The errors in words."""
+        """Description of all errors in one phrase."""
         return " and ".join(text for _, text in self.errors)
 
     def apply(self, study: Study) -> Study:
-        """The study that reads the map right.
+        """Return the study that reads the map by this convention.
 
         Raises
         ------
         ValidationError
-            If there is no such study.
+            If no valid study has this convention.
         """
         if self.magnet:
             study = Study.model_validate(self.magnet.change(study).model_dump())
@@ -113,8 +129,8 @@ class MapConvention:
         changes = {
             "length_unit_m": old.length_unit_m * self.length_unit,
             "flux_density_unit_T": old.flux_density_unit_T * self.flux_density_unit,
-            "position_axes": then(old.position_axes, self.positions),
-            "field_axes": then(old.field_axes, self.fields),
+            "position_axes": compose_axes(old.position_axes, self.positions),
+            "field_axes": compose_axes(old.field_axes, self.fields),
             "radius_scale": (1 + old.radius_scale) * self.radius - 1,
             "radius_offset_m": old.radius_offset_m * self.radius + self.offset_m,
             "translation_m": tuple(np.add(old.translation_m, self.shift_m).tolist())}
@@ -122,7 +138,7 @@ class MapConvention:
 
 
 def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
-    """Magnets that may be another than the study's by mistake."""
+    """Return magnets that may have been measured by mistake in place of the study's."""
     array = study.array
     pitch = 360.0 / array.blocks_per_ring
     found = []
@@ -131,19 +147,20 @@ def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
             angle = blocks * pitch
             found.append(ArrayVariant(
                 "rotated_by_one_block", f"the map turned by {_count(blocks, 'block')}",
-                partial(turned_magnetizations, angle_deg=-angle),
-                # in its places, an array that is turned differs in its magnetization only
+                partial(_rotated_magnet, angle_deg=-angle),
+                # a rotation by whole blocks changes the magnetizations, but not the positions
                 turn_rad=float(np.radians(array.multipole_order * angle))))
     turns = {round(pitch * k, 9) for k in range(1, array.blocks_per_ring)} | {
         45.0 * k for k in range(1, 8)}
-    for angle in sorted(turns, key=lambda one: (one % 90 != 0, one)):
+    for angle in sorted(turns, key=lambda turn: (turn % 90 != 0, turn)):
         found.append(ArrayVariant(
             "wrong_magnetization_direction", f"all magnetizations turned by {angle:g} deg",
             partial(_with_array, first_magnetization_angle_deg=_wrapped(
                 array.first_magnetization_angle_deg + angle)),
             turn_rad=float(np.radians(angle))))
     if study.dimension == 3:
-        for rings in range(max(1, array.rings - RINGS), array.rings + RINGS + 1):
+        fewest = max(1, array.rings - MAX_RING_DIFFERENCE)
+        for rings in range(fewest, array.rings + MAX_RING_DIFFERENCE + 1):
             if rings != array.rings:
                 found.append(ArrayVariant(
                     "wrong_ring_count", f"a magnet of {_count(rings, 'ring')}",
@@ -156,21 +173,22 @@ def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
     return tuple(found)
 
 
-def turned_magnetizations(study: Study, angle_deg: float) -> Study:
-    """The same magnet, turned about its axis with all that is around it."""
+def _rotated_magnet(study: Study, angle_deg: float) -> Study:
+    """Return the study with magnet and external sources rotated about the magnet's axis."""
     turn = rotation_matrix((0.0, 0.0, float(np.radians(angle_deg))))
 
     def around(vector: tuple[float, float, float]) -> tuple[float, ...]:
         return tuple((turn @ vector).tolist())
 
     array, external = study.array, study.external
-    exceptions = tuple(one.with_(
-        shift_m=around(one.shift_m),
-        magnetization_angle_deg=None if one.magnetization_angle_deg is None
-        else _wrapped(one.magnetization_angle_deg + angle_deg)) for one in array.exceptions)
+    exceptions = tuple(exception.with_(
+        shift_m=around(exception.shift_m),
+        magnetization_angle_deg=None if exception.magnetization_angle_deg is None
+        else _wrapped(exception.magnetization_angle_deg + angle_deg))
+        for exception in array.exceptions)
     dipoles = tuple(
-        one.with_(position_m=around(one.position_m), moment_A_m2=around(one.moment_A_m2))
-        for one in external.dipoles)
+        dipole.with_(position_m=around(dipole.position_m), moment_A_m2=around(dipole.moment_A_m2))
+        for dipole in external.dipoles)
     return _with_array(
         study, exceptions=exceptions,
         first_block_angle_deg=_wrapped(array.first_block_angle_deg + angle_deg),
@@ -179,24 +197,27 @@ def turned_magnetizations(study: Study, angle_deg: float) -> Study:
 
 
 def _with_array(study: Study, **keys: object) -> Study:
+    """Return the study with other keys of its array."""
     return study.with_(array=study.array.with_(**keys))
 
 
 def _wrapped(angle_deg: float) -> float:
+    """Return an angle in the range from 0 to 360 deg, without rounding errors."""
     return round(angle_deg % 360.0, 9)
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' if abs(number) != 1 else ''}"
+def _count(number: int, noun: str) -> str:
+    """Return a number with a noun, in the plural if needed."""
+    return f"{number} {noun}{'s' if abs(number) != 1 else ''}"
 
 
 def _matrix(axes: Axes) -> Floats:
-    """From columns (n, 3), by product from the right, to components."""
-    return along_axes(axes, np.eye(3))
+    """Return the matrix whose product with columns (n, 3), from the right, is along x, y, z."""
+    return to_magnet_axes(axes, np.eye(3))
 
 
-def then(first: Axes, second: Axes) -> Axes:
-    """Axes that put the columns right that were put along the first ones wrongly."""
+def compose_axes(first: Axes, second: Axes) -> Axes:
+    """Return the axes that correct columns which were already converted by other axes."""
     rows = _matrix(first) @ _matrix(second)
     x, y, z = (("-" if row.sum() < 0 else "") + COMPONENTS[int(np.argmax(np.abs(row)))]
                for row in rows)
@@ -204,27 +225,31 @@ def then(first: Axes, second: Axes) -> Axes:
 
 
 def axis_errors(positions: Axes, fields: Axes) -> tuple[tuple[str, str], ...]:
-    """Columns exchanged, then of the wrong sign: in coordinates, in B, or alike in both."""
+    """Return the errors of axes: exchanged columns, and columns of the wrong sign.
+
+    An exchange that coordinates and field have in common counts as one error, and so does a common
+    sign.
+    """
     found = []
     order, field_order = (tuple(axis[-1] for axis in axes) for axes in (positions, fields))
     both = order == field_order
-    for what, one in (("x, y, z and Bx, By, Bz", order),) if both else (
+    for columns, axes in (("x, y, z and Bx, By, Bz", order),) if both else (
             ("x, y, z", order), ("Bx, By, Bz", field_order)):
-        if one != SAME:
-            found.append(("swapped_axes", f"columns {what} that are along {', '.join(one)}"))
+        if axes != IDENTITY_AXES:
+            found.append(("swapped_axes", f"columns {columns} that are along {', '.join(axes)}"))
     for name in COMPONENTS:
         signs = f"-{name}" in positions, f"-{name}" in fields
         if any(signs):
-            what = {(True, False): name, (False, True): f"B{name}",
-                    (True, True): f"{name} and B{name}"}[signs]
+            columns = {(True, False): name, (False, True): f"B{name}",
+                       (True, True): f"{name} and B{name}"}[signs]
             reverse = name == "z" and signs[0]
             found.append(("reversed_z" if reverse else "sign_flipped_axis",
-                          f"{what} with the wrong sign"))
+                          f"{columns} with the wrong sign"))
     return tuple(found)
 
 
-def _by_errors() -> dict[Axes, dict[int, list[Axes]]]:
-    """For axes of the coordinates, those of B by the number of errors of both."""
+def _field_axes_by_error_count() -> dict[Axes, dict[int, list[Axes]]]:
+    """Return the axes of the field by axes of the coordinates and number of errors of both."""
     found: dict[Axes, dict[int, list[Axes]]] = {}
     for positions, fields in product(ALL_AXES, repeat=2):
         count = len(axis_errors(positions, fields))
@@ -232,16 +257,19 @@ def _by_errors() -> dict[Axes, dict[int, list[Axes]]]:
     return found
 
 
-AXES_BY_ERRORS = _by_errors()
+FIELD_AXES_BY_ERROR_COUNT = _field_axes_by_error_count()
+"""Axes of the field, by the axes of the coordinates and by the number of errors of both."""
 
-PLAUSIBLE = (
-    *LENGTHS.values(), *FLUX_DENSITIES.values(), "reversed_z", "sign_flipped_axis", "swapped_axes",
-    "rotated_by_one_block", "wrong_magnetization_direction", "wrong_ring_count",
+ERRORS_BY_PLAUSIBILITY = (
+    *LENGTH_UNITS.values(), *FLUX_DENSITY_UNITS.values(), "reversed_z", "sign_flipped_axis",
+    "swapped_axes", "rotated_by_one_block", "wrong_magnetization_direction", "wrong_ring_count",
     "wrong_multipole_order", "wrong_radius", "wrong_line")
-"""Of errors that a map does not tell apart, the first is put right."""
+"""Standard names of all gross errors. Of errors that a map does not distinguish, the first in this
+order is corrected."""
 
 
-def rank(reading: MapConvention) -> tuple[int, ...]:
-    """Order of readings that explain a map equally."""
-    turn = reading.magnet.turn_rad if reading.magnet and reading.magnet.turn_rad else 0.0
-    return (*(PLAUSIBLE.index(name) for name in reading.names), round(1e3 * abs(turn)))
+def rank(convention: MapConvention) -> tuple[int, ...]:
+    """Return a key that sorts equivalent conventions by their plausibility."""
+    turn = convention.magnet.turn_rad if convention.magnet and convention.magnet.turn_rad else 0.0
+    order = (ERRORS_BY_PLAUSIBILITY.index(name) for name in convention.names)
+    return (*order, round(1e3 * abs(turn)))

@@ -1,7 +1,9 @@
-"""What the signature of an effect is made of: fields of the nominal magnet at a map's points.
+"""Fields of the nominal magnet at a map's points, from which effects build their signatures.
 
-Blocks are taken in vacuum: permeability and iron change a signature by a few per cent, which
-matters little to a search, and nothing to the effect once it is in the model.
+Except for `NominalFields.finite_element_field` all fields are those of blocks in vacuum:
+permeability and iron change a signature by a few per cent. That matters little to the search for
+effects, and not at all to an effect that was found, because it is then applied to the study and
+solved in full.
 """
 
 from __future__ import annotations
@@ -24,88 +26,105 @@ from halbach_fe.study.model import Study
 
 @dataclass(frozen=True)
 class NominalFields:
-    """A study and the points of a map of it.
+    """The nominal magnet of a study, and its field at the points of a map.
+
+    Fields are computed when they are first asked for, and kept.
 
     Attributes
     ----------
     study : Study
     points : ndarray, shape (n, 3), in m
+        Positions of the probe along the magnet's axes.
     time : ndarray, shape (n,)
-        Of each reading, from 0 to 1.
+        When each point was read, from 0 at the first reading of the map to 1 at the last.
     solve : callable
-        Study to the field (n, 3) in T of its nominal magnet at the points, by finite elements.
-    known : ndarray, shape (blocks, D), in A/m, or None
-        Magnetizations as they were measured before the magnet was built; None: the nominal ones.
+        Function of a study that returns the field (n, 3) in T of its nominal magnet at the points,
+        by finite elements.
+    measured_magnetizations : ndarray, shape (blocks, D), in A/m, or None
+        Magnetizations that are expected from measurements of the single blocks, in D dimensions;
+        None to use the nominal ones.
     """
 
     study: Study
     points: Floats
     time: Floats
     solve: Callable[[Study], Floats]
-    known: Floats | None = field(default=None, kw_only=True)
+    measured_magnetizations: Floats | None = field(default=None, kw_only=True)
 
     @cached_property
     def magnet(self) -> Magnet:
-        """The study's magnet."""
+        """The magnet of the study."""
         return build_magnet(self.study)
 
     @property
     def blocks(self) -> tuple[MagnetBlock, ...]:
-        """The study's blocks."""
+        """The blocks of the study's magnet."""
         return self.magnet.blocks
 
     @cached_property
     def unit_fields(self) -> Floats:
-        """B (blocks, n, 3, 3) in T of each block for a remanence of 1 T along x, y, z."""
+        """B of each block for a remanence of 1 T along x, y and z.
+
+        Shape (blocks, n, 3, 3), in T; the last axis is the direction of the remanence.
+        """
         return np.array(list(unit_fields(self.blocks, self.points)))
 
     @cached_property
     def block_fields(self) -> Floats:
-        """B (blocks, n, 3) in T of each nominal block."""
+        """B of each nominal block, (blocks, n, 3) in T."""
         return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
                          for block, unit in zip(self.blocks, self.unit_fields, strict=True)])
 
     @cached_property
     def block_gradients(self) -> Floats:
-        """Derivatives (blocks, n, 3, 3) in T/m of component c of each block's B along j."""
+        """Gradient of B of each nominal block, (blocks, n, 3, 3) in T/m.
+
+        Element ``[b, i, c, j]`` is the derivative of component c along direction j.
+        """
         return np.array(list(block_gradients(self.blocks, self.points)))
 
     @cached_property
     def field(self) -> Floats:
-        """B (n, 3) in T of the nominal magnet and of what else the study has."""
+        """B of the nominal magnet and of the study's external sources, (n, 3) in T."""
         return np.asarray(self.block_fields.sum(axis=0) + external_field(self.magnet, self.points))
 
     @cached_property
     def gradient(self) -> Floats:
-        """Derivatives (n, 3, 3) in T/m of component c of the nominal magnet's B along j."""
+        """Gradient of B of the nominal magnet, (n, 3, 3) in T/m, without external sources.
+
+        Element ``[i, c, j]`` is the derivative of component c along direction j.
+        """
         return np.asarray(self.block_gradients.sum(axis=0))
 
     @cached_property
-    def solved(self) -> Floats:
-        """B (n, 3) in T of the nominal magnet by finite elements."""
+    def finite_element_field(self) -> Floats:
+        """B of the nominal magnet by finite elements, (n, 3) in T."""
         return self.solve(self.study)
 
-    def known_field(self, number: int) -> Floats:
-        """B (n, 3) in T of a block as it was measured; what is there or not as a whole must be
-        known better than a tolerance.
+    def measured_block_field(self, number: int) -> Floats:
+        """Return B (n, 3) in T of block ``number`` with its measured magnetization.
+
+        A missing or reversed block changes the field by as much as the block contributes. The
+        nominal magnetization would leave an error of the order of the block's tolerance in such a
+        signature, so the measured one is used where there is one.
         """
         return self.field_with(number, self.magnetizations[number])
 
     @cached_property
     def magnetizations(self) -> Floats:
-        """Of the blocks, as measured or else nominal, (blocks, D) in A/m."""
+        """Magnetizations of the blocks, measured or else nominal, (blocks, D) in A/m."""
         size = self.study.dimension
         return np.array([block.magnetization[:size] for block in self.blocks]
-                        ) if self.known is None else self.known
+                        ) if self.measured_magnetizations is None else self.measured_magnetizations
 
     def field_with(self, number: int, magnetization: Floats) -> Floats:
-        """B (n, 3) in T of a block with a magnetization (D,) in A/m."""
+        """Return B (n, 3) in T of block ``number`` with a magnetization (D,) in A/m."""
         block, size = self.blocks[number], len(magnetization)
         return np.asarray(self.unit_fields[number, :, :, :size] @ (
             MU_0 * block.recoil_tensor[:size, :size] @ magnetization))
 
     def block_fields_of(self, study: Study) -> Floats:
-        """B (blocks, n, 3) in T of each nominal block of another study."""
+        """Return B (blocks, n, 3) in T of each nominal block of another study."""
         blocks = build_magnet(study).blocks
         return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
@@ -113,23 +132,36 @@ class NominalFields:
 
     @cached_property
     def gradient_fields(self) -> Floats:
-        """Change of B (blocks, n, 3) in T per unit of the magnetization gradient of each block."""
+        """Change of B per unit of each block's magnetization gradient, (blocks, n, 3) in T."""
         array = self.study.array
         uneven = array.with_(
             exceptions=(*array.exceptions, BlockException(magnetization_gradient=1.0)))
         study = self.study.with_(array=uneven)
         return np.asarray(self.block_fields_of(study) - self.block_fields)
 
-    def moved(self, block: int, shift: Floats) -> Floats:
-        """Change of B (n, 3) in T/m when a block moves along ``shift`` (3,)."""
-        return np.asarray(-self.block_gradients[block] @ shift)
+    def block_translation_derivative(self, block: int, direction: Floats) -> Floats:
+        """Return the derivative of B (n, 3) in T/m when block number ``block`` moves.
 
-    def turned(self, block: int, axis: Floats, about: Floats) -> Floats:
-        """Change of B (n, 3) in T/rad when a block turns about an axis (3,) through a point."""
-        around = np.cross(axis, self.points - about)
+        ``direction`` (3,) need not be a unit vector: the derivative is per unit of the factor by
+        which it is multiplied.
+        """
+        return np.asarray(-self.block_gradients[block] @ direction)
+
+    def block_rotation_derivative(
+        self, block: int, axis: Floats, centre: Floats
+    ) -> Floats:
+        """Return the derivative of B (n, 3) in T/rad when block number ``block`` turns.
+
+        The rotation axis has the direction ``axis`` (3,), a unit vector, and passes through the
+        point ``centre`` (3,) in m. The magnetization turns with the block.
+        """
+        around = np.cross(axis, self.points - centre)
         return np.asarray(np.cross(axis, self.block_fields[block])
                           - np.einsum("ncj,nj->nc", self.block_gradients[block], around))
 
-    def displaced(self, displacement: Floats) -> Floats:
-        """Change of B (n, 3) in T when the points move by (n, 3) in m."""
+    def change_at_displaced_points(self, displacement: Floats) -> Floats:
+        """Return the change of B (n, 3) in T when the points move by ``displacement``.
+
+        To first order in ``displacement`` (n, 3) in m, in the field of the nominal magnet.
+        """
         return np.asarray(np.einsum("ncj,nj->nc", self.gradient, displacement))

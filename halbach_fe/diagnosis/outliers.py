@@ -1,10 +1,11 @@
-"""Single readings that are off by far more than their noise, while their neighbours are not.
+"""Find single readings that deviate by far more than their noise, while their neighbours do not.
 
-Each reading is compared with what all others foretell of it, blocks integrated out, and that
-difference with those of its neighbours: whatever a model lacks is smooth, and what is left of it
-varies little from one reading to the next, or is rough all around. A second-order polynomial
-through the neighbours, robust against other outliers, foretells the difference, and how far they
-are from it themselves is the local scale.
+Each reading has a leave-one-out residual: its difference from the prediction by all other readings,
+with the blocks integrated out. The residual is compared with those of the neighbouring readings. A
+discrepancy that an incomplete model causes is smooth, so that it varies little between neighbours,
+or is rough in a whole region. A second-order polynomial that is fitted robustly to the residuals of
+the neighbours predicts the residual, and the scatter of the neighbours about the polynomial is the
+local scale.
 """
 
 from __future__ import annotations
@@ -27,56 +28,62 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Component
 
 NEIGHBOURS = 24
-"""Of the same component; a polynomial of second order has ten coefficients."""
+"""Number of neighbours of the same component. A second-order polynomial has ten coefficients."""
 
-LOCAL = 9.0
-"""Times the local scale. That is a median of some 24 numbers: of noise whose level is not known,
-one reading in 10^5 is beyond."""
+LOCAL_SCALE_FACTOR = 9.0
+"""Smallest deviation of an outlier, in units of the local scale. The scale is the median of about
+24 numbers: of noise of unknown level, one reading in 10^5 deviates further."""
 
-ODDS = 1e-3
-"""Prior odds of any reading being off."""
+OUTLIER_PRIOR_ODDS = 1e-3
+"""Prior odds that a reading is an outlier."""
 
-RANGE = 0.1
-"""Of the largest reading: an outlier may be off by this much either way, all equally likely."""
+OUTLIER_RANGE = 0.1
+"""Largest error of an outlier relative to the map's largest reading. All errors up to it, of either
+sign, are equally likely."""
 
-FOUND = 5.0
-"""Log posterior odds from which a reading is one: beyond some six standard deviations."""
+OUTLIER_LOG_ODDS = 5.0
+"""Log posterior odds above which a reading is an outlier: deviations of about six standard
+deviations."""
 
-ROBUST = 6
-"""Fits of a polynomial: neighbours far from the last one weigh less, as several may be off."""
+ROBUST_FITS = 6
+"""Number of reweighted fits of a polynomial. Neighbours far from the previous fit have less weight,
+because several of them may be outliers."""
 
-CAUCHY = 2.385
-"""Times the scale, at which a neighbour weighs half (P. W. Holland and R. E. Welsch, Communications
-in Statistics A6 (1977) 813)."""
+CAUCHY_SCALE = 2.385
+"""Distance in units of the local scale at which a neighbour has half its weight (P. W. Holland and
+R. E. Welsch, Communications in Statistics A6 (1977) 813)."""
 
-CLOSE = 4
-"""Nearest neighbours that are no outliers too, but by chance."""
+CROWD_NEIGHBOURS = 4
+"""Number of nearest neighbours that are examined for further outliers, see `_crowded`."""
 
-CHANCE = 1e-4
+CROWD_PROBABILITY = 1e-4
+"""Probability of as many neighbouring outliers by chance, below which they are not outliers."""
 
-MAD = 1.4826
-"""Standard deviation over the median of the magnitude, of normal numbers."""
+MAD_TO_SD = 1.4826
+"""Ratio of the standard deviation to the median magnitude of normal numbers."""
 
-PASSES = 6
-"""Large outliers hide small ones, by what the blocks make of them."""
+MAX_PASSES = 6
+"""Largest number of passes. Several passes are needed because large outliers distort the prediction
+of other readings, and so hide small outliers."""
 
-MOST = 0.1
-"""Fraction of the readings that may be off: if it is more, they are no outliers."""
+MAX_OUTLIER_FRACTION = 0.1
+"""Largest fraction of the readings that may be outliers. If more are found, none is reported."""
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A reading that is off.
+    """A reading that is an outlier.
 
     Attributes
     ----------
     row : int
-        Of the map, from 1.
+        Row of the map, from 1.
     component : str
     at_m : tuple of float
-        Where the map says that it is.
+        Position of the reading according to the map.
     off_T, sd_T : float
-        Difference from what all readings that are not off foretell, and its standard deviation.
+        Difference from the prediction by all readings that are no outliers, and its standard
+        deviation.
     """
 
     row: int
@@ -87,8 +94,9 @@ class Outlier:
 
 
 def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
-    """Find readings of a map that are off; none among Fourier coefficients, each of which is made
-    of many.
+    """Find the outliers among the readings of a map.
+
+    There are none among Fourier coefficients, each of which is computed from many readings.
     """
     observation = update.observation
     if (np.diff(observation.analysis.indptr) != 1).any():
@@ -96,25 +104,25 @@ def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
     own = np.array(update.parts) != HELD_OUT_MAP
     root = update.response.matrix[own] @ update.prior.root
     residual = (update.readings - update.prediction_prior.mean)[own]
-    noise, training = update.errors.part(own), ~update.held_out[own]
-    labels = [label for label, mine in zip(observation.labels, own, strict=True) if mine]
-    off = find_outliers(root, residual, noise, training, labels, observation.positions[own],
-                        float(np.abs(update.readings[own]).max()))
-    if not off.any():
+    noise, training = update.errors.subset(own), ~update.held_out[own]
+    labels = [label for label, is_own in zip(observation.labels, own, strict=True) if is_own]
+    flagged = find_outliers(root, residual, noise, training, labels, observation.positions[own],
+                            float(np.abs(update.readings[own]).max()))
+    if not flagged.any():
         return ()
-    now = foretold(root, residual, noise, training & ~off)
+    predicted = leave_one_out(root, residual, noise, training & ~flagged)
     point, component = np.divmod(observation.analysis.indices[own], len(COMPONENTS))
     return tuple(
         Outlier(int(point[k]) + 1, COMPONENTS[component[k]],
-                tuple(observation.positions[own][k].tolist()), float(now.difference[k]),
-                float(now.sd[k])) for k in np.flatnonzero(off))
+                tuple(observation.positions[own][k].tolist()), float(predicted.difference[k]),
+                float(predicted.sd[k])) for k in np.flatnonzero(flagged))
 
 
 def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
-    """The study that leaves outliers out."""
+    """Return the study with outliers excluded."""
     rows: dict[int, list[Component]] = {}
-    for one in outliers:
-        rows.setdefault(one.row, []).append(one.component)
+    for outlier in outliers:
+        rows.setdefault(outlier.row, []).append(outlier.component)
     inference = study.inference.with_(excluded_readings=(
         *study.inference.excluded_readings,
         *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items())))
@@ -122,38 +130,45 @@ def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
 
 
 @dataclass(frozen=True)
-class Foretold:
-    """Readings as all others foretell them: differences (n,) and their standard deviations (n,)."""
+class LeaveOneOut:
+    """Differences of readings from their prediction by other readings.
+
+    Attributes
+    ----------
+    difference, sd : ndarray, shape (n,), in T
+        The differences and their standard deviations.
+    """
 
     difference: Floats
     sd: Floats
 
 
-def foretold(
+def leave_one_out(
     root: Floats, residual: Floats, noise: NoiseCovariance, used: NDArray[np.bool_]
-) -> Foretold:
-    """What used readings foretell of every reading, of a used one all others.
+) -> LeaveOneOut:
+    """Predict every reading from the used readings; a used reading from all other used ones.
 
-    With S the covariance of the used ones, blocks integrated out, the latter is
-    ``(S^-1 r)_i / (S^-1)_ii``, of variance ``1 / (S^-1)_ii``.
+    With S the covariance of the used readings, blocks integrated out, the difference of a used
+    reading from its prediction is ``(S^-1 r)_i / (S^-1)_ii``, with variance ``1 / (S^-1)_ii``.
 
     Parameters
     ----------
-    root : ndarray, shape (n, m)
-        H L: what the blocks may do to the readings, in T.
-    residual : ndarray, shape (n,)
-        Readings less what the model foretells, in T.
-    noise : Noise
+    root : ndarray, shape (n, m), in T
+        H L, the covariance factor of the readings that the blocks cause.
+    residual : ndarray, shape (n,), in T
+        Readings less the prior prediction of the model.
+    noise : NoiseCovariance
     used : ndarray of bool, shape (n,)
+        Readings from which the prediction is made.
     """
-    some = noise.part(used)
-    marginal = Marginal.of(some.whiten(root[used]))
-    whitened = some.whiten(residual[used])
-    whitening = some.whitening
+    noise_of_used = noise.subset(used)
+    marginal = Marginal.of(noise_of_used.whiten(root[used]))
+    whitened = noise_of_used.whiten(residual[used])
+    whitening = noise_of_used.whitening
     half = linalg.solve_triangular(marginal.factor[0], marginal.whitened.T, lower=True)
-    seen = whitening.T @ half.T
+    absorbed = whitening.T @ half.T
     precision = np.asarray(whitening.power(2).sum(axis=0)).ravel() - np.einsum(
-        "ij,ij->i", seen, seen)
+        "ij,ij->i", absorbed, absorbed)
     difference, sd = np.empty(len(residual)), np.empty(len(residual))
     difference[used] = whitening.T @ marginal.remove(whitened[:, None])[:, 0] / precision
     sd[used] = 1 / np.sqrt(precision)
@@ -161,66 +176,73 @@ def foretold(
     spread = linalg.solve_triangular(marginal.factor[0], root[~used].T, lower=True)
     difference[~used] = residual[~used] - root[~used] @ blocks
     sd[~used] = np.hypot(noise.sd[~used], np.linalg.norm(spread, axis=0))
-    return Foretold(difference, sd)
+    return LeaveOneOut(difference, sd)
 
 
 def find_outliers(
     root: Floats, residual: Floats, noise: NoiseCovariance, training: NDArray[np.bool_],
     labels: Sequence[str], positions: Floats, largest: float,
 ) -> NDArray[np.bool_]:
-    """Tell which readings are off.
+    """Tell which readings are outliers.
 
     Parameters
     ----------
     root, residual, noise
-        See `foretold`.
+        See `leave_one_out`.
     training : ndarray of bool, shape (n,)
-        Readings that foretell others.
+        Readings from which others are predicted.
     labels : sequence of str
-        Component of each.
+        Component of each reading.
     positions : ndarray, shape (n, 3), in m
     largest : float
-        Largest reading in T.
+        Magnitude of the largest reading in T.
     """
-    neighbourhoods = [_Neighbourhood.of(rows, positions[rows]) for label in dict.fromkeys(labels)
+    groups = [_Neighbourhood.of(rows, positions[rows]) for label in dict.fromkeys(labels)
                       if len(rows := np.flatnonzero(np.array(labels) == label)) > NEIGHBOURS / 2]
-    off = np.zeros(len(residual), bool)
-    for _ in range(PASSES):
-        now = foretold(root, residual, noise, training & ~off)
-        before = off
-        off = np.zeros(len(residual), bool)
-        for one in neighbourhoods:
-            off[one.rows] = one.odd_ones(now, before[one.rows], largest)
-        if (off == before).all() or off.mean() > MOST:
+    flagged = np.zeros(len(residual), bool)
+    for _ in range(MAX_PASSES):
+        predicted = leave_one_out(root, residual, noise, training & ~flagged)
+        before = flagged
+        flagged = np.zeros(len(residual), bool)
+        for group in groups:
+            flagged[group.rows] = group.outlying(predicted, before[group.rows], largest)
+        if (flagged == before).all() or flagged.mean() > MAX_OUTLIER_FRACTION:
             break
-    off &= ~_crowded(off, neighbourhoods)
-    return off if off.mean() <= MOST else np.zeros(len(residual), bool)
+    flagged &= ~_crowded(flagged, groups)
+    return flagged if flagged.mean() <= MAX_OUTLIER_FRACTION else np.zeros(len(residual), bool)
 
 
-def _crowded(off: NDArray[np.bool_], neighbourhoods: Sequence[_Neighbourhood]) -> NDArray[np.bool_]:
-    """Tell which readings are off together with their neighbours, more often than chance has it:
-    something is there.
+def _crowded(
+    flagged: NDArray[np.bool_], neighbourhoods: Sequence[_Neighbourhood]
+) -> NDArray[np.bool_]:
+    """Tell which flagged readings have more flagged neighbours than chance explains.
+
+    Such readings are no outliers: a local source, for example, affects neighbours alike.
     """
-    beside = np.zeros(len(off), int)
-    for one in neighbourhoods:
-        beside[one.rows] = off[one.rows[one.nearest[:, :CLOSE]]].sum(axis=1)
-    pairs = beside[off].sum()
-    expected = CLOSE * off.sum() * off.mean()
-    crowded = off & (beside > 0)
-    return crowded if stats.poisson.sf(pairs - 1, expected) < CHANCE else np.zeros_like(off)
+    flagged_neighbours = np.zeros(len(flagged), int)
+    for group in neighbourhoods:
+        nearest = group.rows[group.nearest[:, :CROWD_NEIGHBOURS]]
+        flagged_neighbours[group.rows] = flagged[nearest].sum(axis=1)
+    pairs = flagged_neighbours[flagged].sum()
+    expected = CROWD_NEIGHBOURS * flagged.sum() * flagged.mean()
+    crowded = flagged & (flagged_neighbours > 0)
+    probability = stats.poisson.sf(pairs - 1, expected)
+    return crowded if probability < CROWD_PROBABILITY else np.zeros_like(flagged)
 
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """Readings of one component, for each its neighbours, and polynomials at these.
+    """The readings of one component with their neighbours.
 
     Attributes
     ----------
     rows : ndarray, shape (k,)
+        Numbers of the readings.
     nearest : ndarray, shape (k, neighbours)
-        Numbers within the k.
+        Neighbours of each reading, as positions in ``rows``, the nearest first.
     terms : ndarray, shape (k, neighbours, 10)
-        Of polynomials in the distance from the reading, at which all but the first are 0.
+        Second-order monomials of the scaled distance from the reading to its neighbours. At the
+        reading itself all but the first are 0.
     """
 
     rows: Ints
@@ -229,11 +251,11 @@ class _Neighbourhood:
 
     @classmethod
     def of(cls, rows: Ints, positions: Floats) -> _Neighbourhood:
-        """From positions (k, 3) in m."""
+        """Build it from positions (k, 3) in m."""
         count = min(NEIGHBOURS, len(rows) - 1)
         _, nearest = KDTree(positions).query(positions, count + 1)
         own = nearest == np.arange(len(rows))[:, None]
-        own[~own.any(axis=1), -1] = True  # of points that are there more often than that
+        own[~own.any(axis=1), -1] = True  # a point with more than `count` coincident ones
         nearest = nearest[~own].reshape(len(rows), count)
         away = positions[nearest] - positions[:, None]
         away /= np.maximum(np.abs(away).max(axis=(1, 2)), 1e-12)[:, None, None]
@@ -241,45 +263,54 @@ class _Neighbourhood:
         return cls(rows, nearest, np.concatenate([
             np.ones((*nearest.shape, 1)), away, away[:, :, first] * away[:, :, second]], axis=2))
 
-    def odd_ones(
-        self, now: Foretold, off: NDArray[np.bool_], largest: float
+    def outlying(
+        self, predicted: LeaveOneOut, flagged: NDArray[np.bool_], largest: float
     ) -> NDArray[np.bool_]:
-        """Tell which readings (k,) are off: suspects, and of these the ones that are far even from
-        what all other readings foretell with equal weights.
+        """Tell which readings (k,) are outliers.
+
+        Suspects deviate from a robust fit to their neighbours. Outliers are those suspects that
+        deviate also from an ordinary fit to the neighbours that are no suspects.
         """
-        difference, sd = now.difference[self.rows], now.sd[self.rows]
+        difference, sd = predicted.difference[self.rows], predicted.sd[self.rows]
 
-        def odd(off: NDArray[np.bool_], fits: int) -> NDArray[np.bool_]:
-            deviation, own, local = self._deviations(difference, off, fits)
+        def is_outlying(flagged: NDArray[np.bool_], fits: int) -> NDArray[np.bool_]:
+            deviation, own, local = self._deviations(difference, flagged, fits)
             standard = deviation / (own * sd)
-            odds = (standard**2 / 2 - np.log(2 * RANGE * largest / (np.sqrt(2 * np.pi) * sd))
-                    + np.log(ODDS))
-            return (odds > FOUND) & (deviation > LOCAL * local)
+            volume = 2 * OUTLIER_RANGE * largest / (np.sqrt(2 * np.pi) * sd)
+            odds = standard**2 / 2 - np.log(volume) + np.log(OUTLIER_PRIOR_ODDS)
+            return (odds > OUTLIER_LOG_ODDS) & (deviation > LOCAL_SCALE_FACTOR * local)
 
-        suspects = off | odd(off, ROBUST)
+        suspects = flagged | is_outlying(flagged, ROBUST_FITS)
         while True:
-            left = suspects & odd(suspects, 1)
+            left = suspects & is_outlying(suspects, 1)
             if (left == suspects).all():
                 return left
             suspects = left
 
     def _deviations(
-        self, difference: Floats, off: NDArray[np.bool_], fits: int
+        self, difference: Floats, flagged: NDArray[np.bool_], fits: int
     ) -> tuple[Floats, Floats, Floats]:
-        """Deviation of readings (k,) from what the neighbours that are not off foretell, its
-        standard deviation if theirs is 1, and as these scatter.
+        """Return deviations of readings (k,) from the fit to their neighbours that are not flagged.
+
+        Returns
+        -------
+        deviation : ndarray, shape (k,)
+        own : ndarray, shape (k,)
+            Standard deviation of the deviation if that of every reading is 1.
+        local : ndarray, shape (k,)
+            Standard deviation of the deviation according to the scatter of the neighbours.
         """
-        good = ~off[self.nearest]
+        good = ~flagged[self.nearest]
         terms, values = self.terms * good[:, :, None], difference[self.nearest] * good
         root = good.astype(float)
         for _ in range(fits):
             inverse = np.linalg.pinv(terms * root[:, :, None], rcond=1e-6) * root[:, None]
             rest = values - np.einsum("kij,kjl,kl->ki", terms, inverse, values, optimize=True)
             typical = np.nanmedian(np.where(good, np.abs(rest), np.nan), axis=1)[:, None]
-            root = good / np.hypot(1, rest / np.maximum(CAUCHY * MAD * typical, 1e-300))
+            root = good / np.hypot(1, rest / np.maximum(CAUCHY_SCALE * MAD_TO_SD * typical, 1e-300))
         weights = inverse[:, 0]
         rank = np.einsum("kij,kji->k", terms, inverse)
         free = np.maximum(good.sum(axis=1) - rank, 1)
-        scale = MAD * typical[:, 0] * np.sqrt(good.sum(axis=1) / free)
+        scale = MAD_TO_SD * typical[:, 0] * np.sqrt(good.sum(axis=1) / free)
         own = np.sqrt(1 + np.sum(weights**2, axis=1))
         return (np.abs(difference - np.sum(weights * values, axis=1)), own, own * scale)

@@ -1,9 +1,10 @@
-"""Positions that shake: noise in proportion to the gradient, of unknown size.
+"""Estimate random errors of the probe's positions, which are noise in proportion to the gradient.
 
-It is no mean shift, so no signature shows it; the noise with it explains the readings better than
-that without, or worse. Whatever else may be missing is integrated out: the blocks, all effects of
-the catalogue, smooth fields and smooth errors of the sensors of any kind. Noise that is larger
-everywhere must be the worse explanation.
+Such errors shift no mean, so that no signature shows them. They are detected by comparing the
+evidence of the readings with and without this noise. Everything else that may be missing from the
+model is integrated out: the blocks, all effects of the catalogue, smooth fields, and smooth errors
+of the sensors. The noise must also explain the readings better than noise that is larger by one
+factor everywhere.
 """
 
 from __future__ import annotations
@@ -19,51 +20,55 @@ from scipy.optimize import minimize_scalar
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.model_selection import EFFECT_ODDS, FOUND
-from halbach_fe.diagnosis.smooth_discrepancy import DECAYS, harmonic_fields, sensor_errors
+from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
+from halbach_fe.diagnosis.smooth_discrepancy import DECAY_RATES, harmonic_fields, sensor_errors
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.measurement.reading_noise import displacement
+from halbach_fe.measurement.reading_noise import readings_per_displacement
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
 from halbach_fe.study.model import Study
 
-AMPLITUDES_M = np.geomspace(2e-5, 5e-4, 8)
-"""Standard deviations of a position that are tried, equally likely."""
+CANDIDATE_SDS_M = np.geomspace(2e-5, 5e-4, 8)
+"""Standard deviations of a position whose evidence is averaged, with equal prior probability."""
 
-LARGEST = 30.0
-"""Factor of the noise, where it is larger everywhere."""
+MAX_NOISE_FACTOR = 30.0
+"""Largest factor of the noise in the alternative of noise that is larger everywhere."""
 
-SMOOTH = 30.0
-"""Size of smooth terms, over the noise of a reading: they may explain anything smooth."""
+SMOOTH_SCALE = 30.0
+"""Prior standard deviation of the smooth terms in units of the noise of a reading. It is large, so
+that the smooth terms can explain any smooth discrepancy."""
 
-ROOM = 3.0
-"""What amplitudes of effects may be, over their usual size: they may explain what they can."""
+EFFECT_SCALE = 3.0
+"""Factor by which the prior standard deviations of effects are widened, so that effects can explain
+as much as they are able to."""
 
-MOST_READINGS = 3000
-"""That are compared; of more, some at random."""
+MAX_READINGS = 3000
+"""Largest number of readings that are compared. Of more readings, a random subset is taken."""
 
-NEGLIGIBLE = 1e-2
-"""Sum over all readings, in variances of the noise of one, that no explanation needs."""
+NEGLIGIBLE_VARIANCE = 1e-2
+"""Variance below which a principal component of the nuisance terms is dropped: its sum over all
+readings, in units of the noise variance of one reading."""
 
-SUSPICIOUS = 2.0
-"""Standard deviations of chi2 below which there is nothing to explain, and nothing is computed."""
+MIN_CHI2_EXCESS = 2.0
+"""Excess of chi-squared, in its standard deviations, below which no noise is missing and nothing is
+computed."""
 
-SAME = 0.1
-"""Ratio of amplitudes, less one, that counts as none."""
+CONVERGENCE_TOLERANCE = 0.1
+"""Largest relative change between rounds that counts as converged."""
 
 
 @dataclass(frozen=True)
 class PositionNoise:
-    """How well uncertain positions explain a residual.
+    """The evidence and the size of random errors of the positions.
 
     Attributes
     ----------
     log_bayes_factor : float
-        Averaged over the amplitude; over noise without, or larger everywhere by the best factor,
-        whichever is better.
+        Log Bayes factor, averaged over the candidate sizes, over the better of two alternatives: no
+        such errors, or noise that is larger everywhere by the best factor.
     sd_m : float
-        The likeliest standard deviation of a position, along each axis.
+        The likeliest standard deviation of a position along each axis.
     """
 
     log_bayes_factor: float
@@ -72,105 +77,114 @@ class PositionNoise:
 
 def estimate_position_noise(
     update: InferenceResult, marginal: Marginal, columns: Floats, residual: Floats,
-    present: PositionNoise | None,
+    current: PositionNoise | None,
 ) -> PositionNoise | None:
-    """Judge the training readings of a study that has some vibration already, or none.
+    """Estimate the position noise from the training readings; None if there is no evidence of it.
 
     Parameters
     ----------
+    update : InferenceResult
     marginal : Marginal
-        Of the blocks.
+        The training readings with the blocks integrated out.
     columns : ndarray, shape (n, k)
-        Signatures of effects, whitened, per standard deviation of their amplitudes.
+        Whitened signatures of effects, per standard deviation of their amplitudes.
     residual : ndarray, shape (n,)
-        Readings less what the model foretells, whitened.
+        Whitened training readings less their prior prediction.
+    current : PositionNoise or None
+        The position noise that the study of ``update`` already has.
     """
     count = len(residual)
-    if present is None and update.prior_conflict < 1 + SUSPICIOUS * np.sqrt(2 / count):
+    if current is None and update.prior_conflict < 1 + MIN_CHI2_EXCESS * np.sqrt(2 / count):
         return None
-    noise, observation = update.errors.part(~update.held_out), update.observation
+    noise, observation = update.errors.subset(~update.held_out), update.observation
     training = np.flatnonzero(~update.held_out)
     rows = np.arange(count)
-    if count > MOST_READINGS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_READINGS, replace=False))
-    moved = noise.whitening @ displacement(update.magnet, observation, np.ones(3))[training]
-    scale, smooth = SMOOTH * float(np.median(noise.sd)), []
+    if count > MAX_READINGS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_READINGS, replace=False))
+    per_metre = readings_per_displacement(update.magnet, observation, np.ones(3))
+    moved = noise.whitening @ per_metre[training]
+    scale, smooth = SMOOTH_SCALE * float(np.median(noise.sd)), []
     points = probe_points(update.study.instrument, observation.map_points)
     for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):
         readings = scale * observation.read(terms.fields)[:, training].T
-        smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAYS[0])))
-    anything = np.hstack([marginal.whitened, ROOM * columns, *smooth])
-    found = judge_vibration(anything[rows], residual[rows], sparse.csr_array(moved[rows]),
-                            present.sd_m if present else 0.0)
-    return found if found.log_bayes_factor + np.log(EFFECT_ODDS) > FOUND else None
+        smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAY_RATES[0])))
+    nuisance = np.hstack([marginal.whitened, EFFECT_SCALE * columns, *smooth])
+    found = compare_noise_models(nuisance[rows], residual[rows], sparse.csr_array(moved[rows]),
+                                 current.sd_m if current else 0.0)
+    log_odds = found.log_bayes_factor + np.log(EFFECT_PRIOR_ODDS)
+    return found if log_odds > DETECTION_LOG_ODDS else None
 
 
 def has_settled(old: PositionNoise | None, new: PositionNoise | None) -> bool:
-    """Tell whether nothing changed."""
+    """Tell whether the estimate has converged between two rounds."""
     if old is None or new is None:
         return old is new
-    return abs(new.sd_m / old.sd_m - 1) < SAME
+    return abs(new.sd_m / old.sd_m - 1) < CONVERGENCE_TOLERANCE
 
 
-def with_position_noise(study: Study, vibration: PositionNoise | None) -> Study:
-    """The study with more noise."""
-    if vibration is None:
+def with_position_noise(study: Study, position_noise: PositionNoise | None) -> Study:
+    """Return the study with position noise added to its noise."""
+    if position_noise is None:
         return study
-    settings = study.noise or NoiseSettings(position_sd_m=(vibration.sd_m,))
+    settings = study.noise or NoiseSettings(position_sd_m=(position_noise.sd_m,))
     old = settings.position_sd_m if study.noise else None
-    more = tuple(float(np.hypot(one, vibration.sd_m)) for one in old or (0.0,))
+    more = tuple(float(np.hypot(sd, position_noise.sd_m)) for sd in old or (0.0,))
     return study.with_(noise=settings.with_(position_sd_m=more))
 
 
-def judge_vibration(
-    root: Floats, residual: Floats, displacement: sparse.csr_array, present: float = 0.0,
+def compare_noise_models(
+    root: Floats, residual: Floats, per_displacement: sparse.csr_array, current_sd_m: float = 0.0,
 ) -> PositionNoise:
-    """Compare noise with and without vibration; everything is whitened.
+    """Compare the evidence of whitened readings with and without position noise.
 
     Parameters
     ----------
     root : ndarray, shape (n, m)
-        What the blocks, and anything else, may do to the readings.
+        Whitened covariance factor of blocks, effects and smooth terms.
     residual : ndarray, shape (n,)
-        Readings less what the model foretells.
-    displacement : sparse array, shape (n, k)
-        Change of the readings per m as each point moves along each axis.
-    present : float
-        Standard deviation in m of the vibration with which all was whitened.
+        Whitened readings less their prior prediction.
+    per_displacement : sparse array, shape (n, k)
+        Whitened change of the readings per m as each point moves along each axis.
+    current_sd_m : float
+        Standard deviation of the position noise that the whitening already includes.
     """
-    moved = sparse.csr_array(displacement @ displacement.T)
+    moved = sparse.csr_array(per_displacement @ per_displacement.T)
     root = _compressed(root)
 
     def log_evidence(sd: float, factor: float = 1.0) -> float:
         total = NoiseCovariance(sparse.csr_array(factor**2 * (
-            sparse.eye_array(len(residual)) + (sd**2 - present**2) * moved)))
+            sparse.eye_array(len(residual)) + (sd**2 - current_sd_m**2) * moved)))
         marginal = Marginal.of(total.whiten(root))
         white = total.whiten(residual)
         chi2 = float(white @ marginal.remove(white[:, None])[:, 0])
-        return -chi2 / 2 - total.log_size - float(np.log(np.diag(marginal.factor[0])).sum())
+        return (-chi2 / 2 - total.log_sqrt_determinant
+                - float(np.log(np.diag(marginal.factor[0])).sum()))
 
     def best(of: Callable[[float], float], low: float, high: float) -> float:
-        """Where a log evidence is largest, of positive numbers."""
-        found = minimize_scalar(lambda one: -of(float(np.exp(one))), method="bounded",
-                                bounds=(np.log(low), np.log(high)), options={"xatol": 1e-2})
-        return float(np.exp(found.x))
+        """Return the positive number at which a log evidence is largest."""
+        maximum = minimize_scalar(lambda logarithm: -of(float(np.exp(logarithm))),
+                                  method="bounded", bounds=(np.log(low), np.log(high)),
+                                  options={"xatol": 1e-2})
+        return float(np.exp(maximum.x))
 
-    found = np.array([log_evidence(sd) for sd in AMPLITUDES_M])
-    mean = float(special.logsumexp(found) - np.log(len(found)))
+    log_evidences = np.array([log_evidence(sd) for sd in CANDIDATE_SDS_M])
+    mean = float(special.logsumexp(log_evidences) - np.log(len(log_evidences)))
     factor = mean - log_evidence(0.0)
-    if factor > FOUND:
-        larger = best(partial(log_evidence, 0.0), 1.0, LARGEST)
+    if factor > DETECTION_LOG_ODDS:
+        larger = best(partial(log_evidence, 0.0), 1.0, MAX_NOISE_FACTOR)
         factor = min(factor, mean - log_evidence(0.0, larger))
-    if factor < FOUND:
+    if factor < DETECTION_LOG_ODDS:
         return PositionNoise(factor, 0.0)
-    top = int(np.argmax(found))
-    near = AMPLITUDES_M[[max(top - 1, 0), min(top + 1, len(found) - 1)]]
+    top = int(np.argmax(log_evidences))
+    near = CANDIDATE_SDS_M[[max(top - 1, 0), min(top + 1, len(log_evidences) - 1)]]
     return PositionNoise(factor, best(log_evidence, *near.tolist()))
 
 
 def _compressed(root: Floats) -> Floats:
-    """A root (n, k) of fewer columns, of the same covariance but for what is far below the noise:
-    many things do nearly the same to the readings.
+    """Return a covariance factor (n, k) with fewer columns.
+
+    Its covariance is the same except for components far below the noise. Many columns are nearly
+    linearly dependent.
     """
     values, vectors = np.linalg.eigh(root.T @ root)
-    return np.asarray(root @ vectors[:, values > NEGLIGIBLE])
+    return np.asarray(root @ vectors[:, values > NEGLIGIBLE_VARIANCE])

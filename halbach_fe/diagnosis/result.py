@@ -1,4 +1,4 @@
-"""What a diagnosis says: effects that are missing, and what no effect explains."""
+"""The results of a diagnosis: identified effects, and an unknown cause if one remains."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.gross_errors import GrossError
@@ -25,7 +26,14 @@ from halbach_fe.study.model import Study
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect at a place."""
+    """An effect at a place.
+
+    Attributes
+    ----------
+    effect : Effect
+    place : Place
+        Block, ring, seam or point at which the effect acts; empty for effects of the whole magnet.
+    """
 
     effect: Effect
     place: Place
@@ -33,122 +41,137 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class IdentifiedEffect:
-    """An effect that is missing from the study.
+    """An effect that the diagnosis found to be missing from the study.
 
     Attributes
     ----------
     hypothesis : Hypothesis
     values, sd : ndarray, shape (k,)
-        Its amplitudes, in the units of its parameters, and of its refinements once it is in the
-        model.
-    found : Found
-        Odds, and what could be meant instead.
+        Posterior mean and standard deviation of its amplitudes, in the units of its parameters.
+        Once the effect is in the model, the amplitudes of its refinements follow those of its
+        parameters.
+    selection : SelectedEffect
+        Log Bayes factor, posterior odds, and the alternatives that the readings cannot distinguish
+        from this effect.
     """
 
     hypothesis: Hypothesis
     values: Floats
     sd: Floats
-    found: SelectedEffect
+    selection: SelectedEffect
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What the amplitudes are."""
+        """The parameters (and refinements) to which the amplitudes belong."""
         effect = self.hypothesis.effect
         return (*effect.parameters, *effect.refinements)[:len(self.values)]
 
 
 @dataclass(frozen=True)
 class UnknownCause:
-    """Something that no effect of the catalogue explains.
+    """A discrepancy that no effect of the catalogue explains.
+
+    It is modelled as a smooth field or a smooth error of the sensors, see
+    `halbach_fe.diagnosis.smooth_discrepancy`.
 
     Attributes
     ----------
     kind : str
-        ``field``: it solves Maxwell's equations in the bore, so that a source is missing;
-        ``instrument``: it cannot; ``either``: the readings do not tell.
+        ``field``: the discrepancy solves Maxwell's equations in the bore, so that a source outside
+        the bore is missing; ``instrument``: it does not, so that the sensors are in error;
+        ``either``: the readings do not distinguish the two.
     log_bayes_factor : float
-        Over the named effects alone.
+        Log Bayes factor of the discrepancy over no effect at all if ``alone`` or ``ambiguous``, and
+        over the identified effects otherwise.
     alone : bool
-        Whether it is the better explanation by itself: no effect is named then.
-    as_well : bool
-        Whether it is about as good as several named effects together, in place of which it may be.
+        Whether the unknown cause by itself explains the readings better than all identified effects
+        together, or no effect was identified. The diagnosis then reports no effects.
+    ambiguous : bool
+        Whether the unknown cause by itself is about as probable as several identified effects
+        together, so that it may be the true explanation in their place. The effects are still
+        reported. In diagnosis.json this is the key ``as_well``.
     largest_T : float
-        Of it at any training reading.
+        Largest magnitude of the discrepancy at any point of the map.
     at_m : tuple of float
-        Where that is.
+        Position of that point.
     source_m : tuple of float or None
-        Where a point dipole would have to be that is the best source, if a field is missing.
+        Position of the point dipole that explains the readings best, if a field is the likelier
+        kind and point dipoles are in the catalogue.
     """
 
     kind: Literal["field", "instrument", "either"]
     log_bayes_factor: float
     alone: bool
-    as_well: bool
+    ambiguous: bool
     largest_T: float
     at_m: tuple[float, ...]
     source_m: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """What a study lacks.
+class Diagnosis(ShownInNotebook):
+    """The result of a diagnosis.
 
     Attributes
     ----------
-    read : Study
-        The study that reads the map right, without outliers; all else is compared with it.
-    before, after : Update
-        The inference with that study, and with the effects that were named.
-    named : tuple of Named
-    unknown : Unknown or None
-        What they leave unexplained, if anything.
+    corrected_study : Study
+        The study corrected for gross errors of the map, without its outliers. All else is compared
+        with this study.
+    before, after : InferenceResult
+        The inference with the corrected study, and with the identified effects added to it.
+    identified : tuple of IdentifiedEffect
+    unknown : UnknownCause or None
+        The discrepancy that the identified effects leave, if there is one.
     probabilities : dict
-        Of each effect, and of none, if at most one is missing.
+        Posterior probability of each effect by name, and of ``none``, on the assumption that at
+        most one effect is missing from the corrected study.
     evidence : Evidence
+        Evidence of all signatures for the corrected study.
     candidates : tuple of Candidate
-        From which all that is said of the study as it was follows.
-    groups_before, groups_after : list of Group
-        Where readings disagree.
-    left_out_before, left_out_after : ndarray, shape (n,)
-        Standardized residuals of the training readings.
+        The hypotheses to which the columns of ``evidence`` belong.
+    groups_before, groups_after : list of ResidualGroup
+        Chi-squared of groups of training readings.
+    loo_residuals_before, loo_residuals_after : ndarray, shape (n,)
+        Standardized leave-one-out residuals of the training readings.
     rounds : int
-    gross : tuple of Gross
-        How the map was misread.
+        Number of rounds of solving and searching.
+    gross_errors : tuple of GrossError
+        Errors of the map's units, axes or magnet.
     outliers : tuple of Outlier
-        Readings that are off singly.
-    vibration : Vibration or None
-        Of the probe, if the readings show it.
-    numerical : Numerical or None
-        The solver's own error, if it explains the misfit; then nothing else is looked for.
-    at_rest : bool
-        Whether the last round changed nothing.
+        Single readings that are excluded.
+    position_noise : PositionNoise or None
+        Random errors of the probe's positions, if the readings show them.
+    solver_error : SolverErrorExplanation or None
+        The solver's own error, if it explains the misfit. The search for effects is then skipped.
+    converged : bool
+        Whether the last round changed neither the effects nor their amplitudes.
     """
 
-    read: Study
+    corrected_study: Study
     before: InferenceResult
     after: InferenceResult
-    named: tuple[IdentifiedEffect, ...]
+    identified: tuple[IdentifiedEffect, ...]
     unknown: UnknownCause | None
     probabilities: dict[str, float]
     evidence: Evidence
     candidates: tuple[Candidate, ...]
     groups_before: list[ResidualGroup]
     groups_after: list[ResidualGroup]
-    left_out_before: Floats
-    left_out_after: Floats
+    loo_residuals_before: Floats
+    loo_residuals_after: Floats
     rounds: int
-    gross: tuple[GrossError, ...] = ()
+    gross_errors: tuple[GrossError, ...] = ()
     outliers: tuple[Outlier, ...] = ()
-    vibration: PositionNoise | None = None
-    numerical: SolverErrorExplanation | None = None
-    at_rest: bool = True
+    position_noise: PositionNoise | None = None
+    solver_error: SolverErrorExplanation | None = None
+    converged: bool = True
 
     @property
     def study(self) -> Study:
-        """The study with what was missing."""
+        """The study with everything that the diagnosis added."""
         return self.after.study
 
     @property
-    def anything(self) -> bool:
-        """Whether anything was named: an error, outliers, an effect, or vibration."""
-        return bool(self.gross or self.outliers or self.named or self.vibration)
+    def found_anything(self) -> bool:
+        """Whether the diagnosis found gross errors, outliers, effects or position noise."""
+        return bool(self.gross_errors or self.outliers or self.identified or self.position_noise)

@@ -1,4 +1,4 @@
-"""The comparison of all effects at one point of linearization."""
+"""Compare all effects of a catalogue at one point of linearization."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from halbach_fe.diagnosis.model_selection import (
     Candidate,
     SelectedEffect,
     select_effects,
-    tailored,
+    with_wide_priors,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
 from halbach_fe.diagnosis.smooth_discrepancy import (
+    fields_of_rms,
     harmonic_fields,
-    of_size,
 )
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
@@ -32,18 +32,34 @@ from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
 
 Say = Callable[[str], None]
+"""A callable that reports progress; its argument is a line of text."""
 NominalSolver = Callable[[Study, Floats], Floats]
+"""A callable from a study and points (n, 3) in m to the field (n, 3) in T of its nominal magnet."""
 Signatures = dict[tuple[str, Place], Floats]
-"""Whitened training readings (rows, k) per unit of each parameter, by effect and place."""
+"""Whitened signatures by effect name and place: training readings (rows, k) per unit of each of the
+effect's k parameters."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """All effects compared at one point of linearization.
+    """The comparison of all hypotheses at one point of linearization.
 
-    ``columns`` are the whitened signatures (rows, k), ``residual`` (rows,) what they explain;
-    ``training`` is the whitened residual of the training readings from the prior mean, with named
-    effects in the model.
+    Attributes
+    ----------
+    hypotheses : tuple of Hypothesis
+    candidates : tuple of Candidate
+        The same hypotheses, with the numbers of their columns.
+    evidence : Evidence
+        Evidence of all columns.
+    columns : ndarray, shape (rows, k)
+        Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes.
+    residual : ndarray, shape (rows,)
+        Whitened residual of the training readings from the prior mean of the study without the
+        identified effects; the columns are fitted to it.
+    marginal : Marginal
+        The readings with blocks and solver error integrated out.
+    training : ndarray, shape (rows,)
+        Whitened residual of the training readings with the identified effects in the model.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -55,32 +71,53 @@ class Search:
     training: Floats
 
 
-def apply_effects(study: Study, named: Sequence[IdentifiedEffect]) -> Study:
-    """The study with effects in full."""
-    for one in named:
-        study = one.hypothesis.effect.apply(study, one.hypothesis.place, one.values.tolist())
+def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
+    """Return the study with identified effects applied at their amplitudes."""
+    for effect in identified:
+        hypothesis = effect.hypothesis
+        study = hypothesis.effect.apply(study, hypothesis.place, effect.values.tolist())
     return study
 
 
 def score_hypotheses(
-    read: Study, start: Sequence[IdentifiedEffect], update: InferenceResult, known: Floats,
-    times: Floats,
-    solver: NominalSolver, effects: Sequence[Effect], named: Sequence[IdentifiedEffect],
-    signatures: Signatures,
+    corrected: Study, start: Sequence[IdentifiedEffect], update: InferenceResult,
+    prior_mean: Floats, times: Floats, solver: NominalSolver, effects: Sequence[Effect],
+    identified: Sequence[IdentifiedEffect], signatures: Signatures,
     progress: Progress = lambda done, total: None,
 ) -> Search:
-    """Compare all effects at the point where some are in the model already.
+    """Compare all effects at a point where some effects are in the model already.
 
-    The residual is that of the study ``read`` without them: what they do is added back, by their
-    signatures at this point. Other effects keep the ``signatures`` that they had first, with those
-    in the model with which the search ``start``s. ``known`` are the magnetizations (parameters,) in
-    A/m that the prior expects without any effects.
+    The residual is that of the corrected study without the identified effects: their contribution
+    is added back to the residual of the current model by their signatures at this point.
+
+    Parameters
+    ----------
+    corrected : Study
+        The study corrected for gross errors and outliers, without any effects.
+    start : sequence of IdentifiedEffect
+        Effects from which the search started. The signatures of all effects outside the model are
+        computed for the study with these.
+    update : InferenceResult
+        The inference with the identified effects in the model.
+    prior_mean : ndarray, shape (parameters,), in A/m
+        Prior mean of the magnetizations of the study without effects.
+    times : ndarray, shape (n,)
+        Time of each point of the map, from 0 at the first to 1 at the last.
+    solver : callable
+    effects : sequence of Effect
+    identified : sequence of IdentifiedEffect
+        The effects in the model of ``update``.
+    signatures : dict
+        Signatures of effects outside the model. Missing entries are computed and stored, so that
+        later rounds reuse them.
+    progress : callable, optional
+        Called with the numbers of finished and of all hypotheses.
     """
     rows = np.flatnonzero(~update.held_out)
-    noise = update.errors.part(rows)
+    noise = update.errors.subset(rows)
 
     def whitened(readings: Floats) -> Floats:
-        """All readings (..., readings) to training ones (rows, ...)."""
+        """Return the whitened training readings (rows, ...) of all readings (..., readings)."""
         return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
 
     response = noise.whiten(update.response.matrix[rows])
@@ -89,139 +126,175 @@ def score_hypotheses(
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
-    study = apply_effects(read, start)
+    study = apply_effects(corrected, start)
 
-    def scene_of(other: Study) -> NominalFields:
+    def nominal_fields_of(other: Study) -> NominalFields:
         points = probe_points(other.instrument, update.observation.map_points)
-        return NominalFields(other, points, times, lambda one: solver(one, points),
-                     known=known.reshape(-1, other.dimension))
+        return NominalFields(other, points, times, lambda changed: solver(changed, points),
+                             measured_magnetizations=prior_mean.reshape(-1, other.dimension))
 
-    scene, bare = scene_of(update.study), scene_of(study)
-    there = {(one.hypothesis.effect.name, one.hypothesis.place): one for one in named}
+    nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
+    in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
+                for effect in identified}
     kept = marginal.remove(response)
     information, score = response.T @ kept, kept.T @ training
-    worth_a_look = [Hypothesis(effect, place) for effect in effects if effect.places(study)
+    shortlisted = [Hypothesis(effect, place) for effect in effects if effect.places(study)
                     for place in dict.fromkeys((
                         *effect.shortlist(update.study, update.prior.mean, information, score),
-                        *(place for name, place in (*signatures, *there) if name == effect.name)))]
+                        *(place for name, place in (*signatures, *in_model)
+                          if name == effect.name)))]
     candidates: list[Candidate] = []
     columns: list[Floats] = []
     width = 0
-    for number, hypothesis in enumerate(worth_a_look):
-        progress(number, len(worth_a_look))
+    for number, hypothesis in enumerate(shortlisted):
+        progress(number, len(shortlisted))
         effect, place = hypothesis.effect, hypothesis.place
         key = effect.name, place
-        present = there.get(key)
+        present = in_model.get(key)
         if present is None:
-            seen = signatures.get(key)
-            if seen is None:
-                seen = signatures[key] = whitened(update.observation.read(
-                    effect.signature(bare, place)))
-        elif effect.discrete:
-            others = apply_effects(read, [one for one in named if one is not present])
+            signature = signatures.get(key)
+            if signature is None:
+                signature = signatures[key] = whitened(update.observation.read(
+                    effect.signature(nominal_start, place)))
+        elif effect.applied_in_full:
+            others = apply_effects(
+                corrected, [other for other in identified if other is not present])
             amounts = np.pad(present.values,
                              (0, len(amplitude_scale(effect)) - len(present.values)))
             amounts[0] = 1.0
-            seen = whitened(update.observation.read(_whole(
-                present.hypothesis, amounts, scene_of(others))))
-            residual = residual + seen @ amounts
+            signature = whitened(update.observation.read(_discrete_signature(
+                present.hypothesis, amounts, nominal_fields_of(others))))
+            residual = residual + signature @ amounts
         else:
-            seen = whitened(update.observation.read(effect.signature(scene, place)))
-            residual = residual + seen @ present.values
-        columns.append(seen * amplitude_scale(effect)[:seen.shape[1]])
+            signature = whitened(update.observation.read(effect.signature(nominal, place)))
+            residual = residual + signature @ present.values
+        columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
         candidates.append(Candidate(
-            effect.name, place.name, tuple(range(width, width + seen.shape[1])),
-            effect.certain or seen.shape[1] > len(effect.parameters), effect.only))
-        width += seen.shape[1]
+            effect.name, place.name, tuple(range(width, width + signature.shape[1])),
+            effect.is_binary or signature.shape[1] > len(effect.parameters), effect.unique))
+        width += signature.shape[1]
     stacked = np.hstack(columns)
-    return Search(tuple(worth_a_look), tuple(candidates), marginal.evidence(stacked, residual),
+    return Search(tuple(shortlisted), tuple(candidates), marginal.evidence(stacked, residual),
                   stacked, residual, marginal, training)
 
 
 def _solver_error(update: InferenceResult) -> Floats:
-    """Readings (k, n) of smooth fields as large as the solver's error, which no noise is; it is
-    part of what is integrated out with the blocks.
+    """Return readings (k, n) in T of smooth fields as large as the solver's error.
+
+    The solver's error is smooth, unlike noise. These fields are integrated out with the blocks, so
+    that no effect is identified for a misfit that the solver's error can explain.
     """
     size = float(np.sqrt(np.mean(update.response.error**2)))
     points = probe_points(update.study.instrument, update.observation.map_points)
-    fields = of_size(harmonic_fields(points), size) if size else np.zeros((1, *points.shape))
+    fields = fields_of_rms(harmonic_fields(points), size) if size else np.zeros((1, *points.shape))
     return update.observation.read(fields)
 
 
-def _whole(hypothesis: Hypothesis, amounts: Floats, scene: NominalFields) -> Floats:
-    """Signatures (k, n, 3) of an effect that is there as a whole, in a scene without it: what it
-    does at these amounts, less what its refinements do of that, and these.
+def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, nominal: NominalFields) -> Floats:
+    """Return the signatures (k, n, 3) in T of an effect that is applied in full.
+
+    Such an effect is not linear in its first amplitude, which is 1 if it is present. The first
+    signature is the finite difference between the fields with and without the effect at the given
+    amounts, less the contribution of its refinements to this difference. The linear signatures of
+    the refinements follow it. Effects without refinements have their ordinary signature.
+
+    Parameters
+    ----------
+    hypothesis : Hypothesis
+    amounts : ndarray, shape (k,)
+        Amplitudes of the parameters and refinements.
+    nominal : NominalFields
+        Fields of the study without the effect.
     """
     effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
     if not effect.refinements:
-        return effect.signature(scene, place)
-    refined = effect.refine(scene, place, values)
-    there = scene.solve(effect.apply(scene.study, place, values)) - scene.solved
-    return np.concatenate([(there - np.tensordot(amounts[1:], refined, 1))[None], refined])
+        return effect.signature(nominal, place)
+    refined = effect.refine(nominal, place, values)
+    changed = nominal.solve(effect.apply(nominal.study, place, values))
+    change = changed - nominal.finite_element_field
+    return np.concatenate([(change - np.tensordot(amounts[1:], refined, 1))[None], refined])
 
 
 def memoized_solver(session: Session) -> NominalSolver:
-    """Solve for the fields (n, 3) in T of nominal magnets at points (n, 3) in m, each once."""
-    known: dict[tuple[str, bytes], Floats] = {}
+    """Return a finite-element solver of nominal magnets that solves each magnet once.
+
+    The returned callable takes a study and points (n, 3) in m and returns the field (n, 3) in T.
+    """
+    solved: dict[tuple[str, bytes], Floats] = {}
 
     def solve(study: Study, points: Floats) -> Floats:
         key = study.model_dump_json(include=FIELD_KEYS), points.tobytes()
-        if key not in known:
-            known[key] = solve_nominal(build_magnet(study), points, session)
-        return known[key]
+        if key not in solved:
+            solved[key] = solve_nominal(build_magnet(study), points, session)
+        return solved[key]
     return solve
 
 
-def identify_effects(read: Study, search: Search, points: Floats) -> tuple[IdentifiedEffect, ...]:
-    """What is missing, of what can be: no gap is negative, and the points (n, 3) in m of the map
-    are in air.
+def identify_effects(
+    corrected: Study, search: Search, points: Floats
+) -> tuple[IdentifiedEffect, ...]:
+    """Select the missing effects and fit their amplitudes, without impossible ones.
+
+    An effect is impossible if an amplitude is below its parameter's minimum (a negative gap, for
+    example), if no valid study has it, or if it puts points of the map inside material. Such a
+    candidate is excluded and the selection repeated.
+
+    Parameters
+    ----------
+    corrected : Study
+        The study corrected for gross errors and outliers.
+    search : Search
+    points : ndarray, shape (n, 3), in m
+        Points of the map.
     """
-    barred: set[int] = set()
+    excluded: set[int] = set()
     while True:
         found = _amplitudes(
-            search, select_effects(search.evidence, search.candidates, barred=barred))
-        bad = next((number for number in range(len(found))
-                    if not _possible(read, found[:number + 1], points)), None)
-        if bad is None:
+            search, select_effects(search.evidence, search.candidates, excluded=excluded))
+        impossible = next((number for number in range(len(found))
+                    if not _possible(corrected, found[:number + 1], points)), None)
+        if impossible is None:
             return found
-        barred.add(search.candidates.index(found[bad].found.candidate))
+        excluded.add(search.candidates.index(found[impossible].selection.candidate))
 
 
-def _possible(study: Study, named: Sequence[IdentifiedEffect], points: Floats) -> bool:
-    """Tell whether a study can have effects of their amplitudes."""
-    if any(value < parameter.least for one in named
-           for value, parameter in zip(one.values, one.parameters, strict=True)):
+def _possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
+    """Tell whether a valid study can have effects of these amplitudes, with the map's points in
+    air.
+    """
+    if any(value < parameter.minimum for effect in identified
+           for value, parameter in zip(effect.values, effect.parameters, strict=True)):
         return False
     try:
-        changed = Study.model_validate(apply_effects(study, named).model_dump())
+        changed = Study.model_validate(apply_effects(study, identified).model_dump())
         inside = build_magnet(changed).contains(probe_points(changed.instrument, points))
     except (ValidationError, HalbachError):
         return False
     return not inside.any()
 
 
-def _amplitudes(search: Search, found: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
-    """Amplitudes of found effects, all together."""
+def _amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
+    """Fit the amplitudes of all selected effects jointly."""
     evidence = search.evidence
-    for one in found:
-        if one.candidate.certain:
-            evidence = evidence.shifted(one.candidate.columns[0])
-    fit = tailored(evidence, [one.candidate for one in found]).fit(
-        [column for one in found for column in one.candidate.free])
+    for selection in selected:
+        if selection.candidate.is_binary:
+            evidence = evidence.shifted(selection.candidate.columns[0])
+    fit = with_wide_priors(evidence, [selection.candidate for selection in selected]).fit(
+        [column for selection in selected for column in selection.candidate.free])
     deviation = np.sqrt(np.diag(fit.covariance))
-    named, first = [], 0
-    for one in found:
-        hypothesis = search.hypotheses[search.candidates.index(one.candidate)]
-        free, fixed = len(one.candidate.free), int(one.candidate.certain)
+    identified, first = [], 0
+    for selection in selected:
+        hypothesis = search.hypotheses[search.candidates.index(selection.candidate)]
+        free, fixed = len(selection.candidate.free), int(selection.candidate.is_binary)
         scale = amplitude_scale(hypothesis.effect)[fixed:fixed + free]
         part = slice(first, first + free)
-        named.append(IdentifiedEffect(
+        identified.append(IdentifiedEffect(
             hypothesis, np.concatenate([np.ones(fixed), scale * fit.mean[part]]),
-            np.concatenate([np.zeros(fixed), scale * deviation[part]]), one))
+            np.concatenate([np.zeros(fixed), scale * deviation[part]]), selection))
         first += free
-    return tuple(named)
+    return tuple(identified)
 
 
 def amplitude_scale(effect: Effect) -> Floats:
-    """Prior standard deviations of all amplitudes, refinements too."""
+    """Return the prior standard deviations of an effect's parameters and refinements."""
     return np.array([parameter.sd for parameter in (*effect.parameters, *effect.refinements)])

@@ -1,14 +1,15 @@
-"""What no effect explains: smooth fields of any kind, and smooth errors of a sensor of any kind.
+"""Smooth fields of any kind and smooth errors of a sensor, for causes outside the catalogue.
 
 A field whose sources are outside the bore is ``-grad phi`` with ``phi`` harmonic: modified Bessel
 functions times ``cos n phi``, ``cos k z`` and their sines, and polynomials that do not depend on z
-(J. D. Jackson, Classical Electrodynamics, 3rd ed., section 3.7). Errors of a sensor need not be
-one: each component is a Fourier series in z and angle by itself. Both have many terms with
-amplitudes of one unknown scale, smaller for finer ones, and the evidence is averaged over the
-scale; so a named effect with one amplitude, where it explains as much, is the better explanation.
+(J. D. Jackson, Classical Electrodynamics, 3rd ed., section 3.7). Errors of a sensor do not have to
+be a field: each component is an independent Fourier series in z and in the azimuth. Both have many
+terms, whose amplitudes have one unknown scale and decrease with order. The evidence is averaged
+over the scale. An effect with one amplitude is therefore the better explanation if it explains the
+readings equally well.
 
-The solver's own error is such a field as well, smooth and of a size that is known: no effect may be
-named for what it can explain.
+The solver's own error is also such a field, smooth and of known size. No effect may be identified
+for a misfit that it can explain.
 """
 
 from __future__ import annotations
@@ -21,25 +22,26 @@ from scipy import special
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Evidence
 
-SCALES = np.geomspace(0.1, 300, 15)
-"""Of the amplitudes, over the noise of a reading."""
+AMPLITUDE_SCALES = np.geomspace(0.1, 300, 15)
+"""Candidate scales of the amplitudes, in units of the noise of a reading."""
 
-DECAYS = ((0.25, 0.125), (1.0, 0.4), (2.0, 1.0))
-"""Of the logarithm of amplitudes, per order in angle and per half wave in z."""
+DECAY_RATES = ((0.25, 0.125), (1.0, 0.4), (2.0, 1.0))
+"""Candidate decay rates of the logarithm of the amplitudes: per azimuthal order, and per half wave
+in z."""
 
 
 @dataclass(frozen=True)
 class SmoothDiscrepancy:
-    """How well one kind of smooth field explains a residual.
+    """The evidence of one kind of smooth discrepancy.
 
     Attributes
     ----------
     log_bayes_factor : float
-        Over nothing, averaged over the scale.
+        Log Bayes factor over no discrepancy, averaged over scale and decay.
     scale : float
-        The likeliest, over the noise of a reading.
+        The likeliest scale, in units of the noise of a reading.
     mean : ndarray, shape (k,)
-        Its amplitudes, of the columns as they were given.
+        Posterior mean of the amplitudes of the columns, at the likeliest scale and decay.
     """
 
     log_bayes_factor: float
@@ -49,37 +51,59 @@ class SmoothDiscrepancy:
 
 @dataclass(frozen=True)
 class SmoothTerms:
-    """Fields (k, n, 3) of rms 1 over a map, and the order and half waves (k, 2) of each."""
+    """The terms of a smooth discrepancy.
+
+    Attributes
+    ----------
+    fields : ndarray, shape (k, n, 3)
+        Normalized fields at the points of a map.
+    fineness : ndarray, shape (k, 2)
+        Azimuthal order and number of half waves in z of each term.
+    """
 
     fields: Floats
     fineness: Floats
 
 
 def judge_smooth_terms(evidence: Evidence, fineness: Floats) -> SmoothDiscrepancy:
-    """Evidence of all columns together, their amplitudes having one unknown scale and decay."""
+    """Return the evidence of all columns together, averaged over scale and decay of the amplitudes.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    fineness : ndarray, shape (k, 2)
+        Of the columns, see `SmoothTerms`.
+    """
     found, means = [], []
-    for decay in DECAYS:
+    for decay in DECAY_RATES:
         weights = np.exp(-fineness @ decay)
         values, vectors = np.linalg.eigh(weights[:, None] * evidence.information * weights)
         values, score = np.maximum(values, 0.0), vectors.T @ (weights * evidence.score)
-        for scale in SCALES:
+        for scale in AMPLITUDE_SCALES:
             shrunk = scale**2 * score / (1 + scale**2 * values)
             found.append((score @ shrunk - np.log1p(scale**2 * values).sum()) / 2)
             means.append(weights * (vectors @ shrunk))
     best = int(np.argmax(found))
     return SmoothDiscrepancy(float(special.logsumexp(found) - np.log(len(found))),
-                       float(SCALES[best % len(SCALES)]), means[best])
+                             float(AMPLITUDE_SCALES[best % len(AMPLITUDE_SCALES)]), means[best])
 
 
 def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothTerms:
-    """Fields without sources at points (n, 3) in m.
+    """Return fields without sources at the points, each with an rms magnitude of 1.
 
-    ``orders`` is the largest n, ``waves`` the number of half waves over the length of the map.
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    orders : int
+        Largest azimuthal order.
+    waves : int
+        Largest number of half waves over the length of the map.
     """
     radius = np.hypot(points[:, 0], points[:, 1])
     angle = np.arctan2(points[:, 1], points[:, 0])
     z = points[:, 2] - points[:, 2].mean()
-    length = max(np.ptp(z), 1e-9) * 1.2  # beyond the map, lest it be periodic there
+    # longer than the map, on which the terms must not be periodic
+    length = max(np.ptp(z), 1e-9) * 1.2
     scale = max(radius.max(), 1e-9)
     along, across = np.eye(3)[2], np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     around = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
@@ -114,17 +138,28 @@ def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothT
     return SmoothTerms(np.array(found), np.array(fineness, float))
 
 
-def of_size(terms: SmoothTerms, size: float) -> Floats:
-    """Fields (k, n, 3) whose amplitudes of standard deviation 1, finer ones smaller, make an rms of
-    ``size`` in each component.
+def fields_of_rms(terms: SmoothTerms, size: float) -> Floats:
+    """Return fields (k, n, 3) whose sum has an rms of ``size`` in each component.
+
+    The amplitudes of the sum are independent with a standard deviation of 1. Finer terms are
+    smaller by the first of `DECAY_RATES`.
     """
-    weights = np.exp(-terms.fineness @ DECAYS[0])
+    weights = np.exp(-terms.fineness @ DECAY_RATES[0])
     weights *= np.sqrt(3) * size / np.linalg.norm(weights)
     return weights[:, None, None] * terms.fields
 
 
 def sensor_errors(points: Floats, orders: int = 3, waves: int = 8) -> SmoothTerms:
-    """Errors of each component by itself at points (n, 3) in m."""
+    """Return smooth errors at the points, of one component each with an rms of sqrt(3).
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    orders : int
+        Largest azimuthal order.
+    waves : int
+        Largest number of half waves over the length of the map.
+    """
     angle = np.arctan2(points[:, 1], points[:, 0])
     z = points[:, 2] - points[:, 2].mean()
     length = max(np.ptp(z), 1e-9)

@@ -1,4 +1,4 @@
-"""Whether the solver's own error explains a misfit: numerical causes come before physical ones."""
+"""Test whether the solver's own error explains a misfit, before a physical cause is searched."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from halbach_fe.inference.result import InferenceResult
 
 @dataclass(frozen=True)
 class SolverErrorExplanation:
-    """A misfit that is as large as the solver's error: of its mesh and open boundary.
+    """A misfit that is no larger than the solver's error from its mesh and open boundary.
 
     Attributes
     ----------
     chi2_noise, chi2_errors : float
-        Per training reading, the blocks integrated out: by the noise alone, and by noise and the
-        solver's error.
+        Chi-squared per training reading with the blocks integrated out: for the noise alone, and
+        for noise and solver error together.
     largest_error_T : float
-        Of any reading.
+        Largest solver error of any reading.
     largest_over_noise : float
-        The same over the noise of that reading.
+        Largest ratio of a reading's solver error to its noise.
     """
 
     chi2_noise: float
@@ -32,14 +32,16 @@ class SolverErrorExplanation:
 
 
 def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation | None:
-    """Tell whether readings disagree with the model by their noise, but not by the solver's error
-    as well.
+    """Return an explanation if the solver's error removes the misfit, else None.
+
+    The readings must disagree with the model by their noise alone, and agree by noise and solver
+    error together.
     """
     error = update.response.error
     if not error.any() or update.prior_conflict > update.conflict_limit:
         return None
     training = ~update.held_out
-    noise = update.noise.part(training)
+    noise = update.noise.subset(training)
     matrix = update.response.matrix[training]
     marginal = Marginal.of(noise.whiten(matrix @ update.prior.root))
     residual = noise.whiten(
@@ -48,4 +50,4 @@ def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation |
     if chi2 <= update.conflict_limit:
         return None
     return SolverErrorExplanation(chi2, update.prior_conflict, float(error.max()),
-                     float(np.max(error / update.noise.sd)))
+                                  float(np.max(error / update.noise.sd)))

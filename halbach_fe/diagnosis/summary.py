@@ -1,4 +1,6 @@
-"""What a diagnosis leaves behind: words, numbers for machines, and the study's file, mended."""
+"""Summarize a diagnosis: phrases for reports, diagnosis.json, and the study's file with the
+changes.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.model_selection import Candidate
-from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect, UnknownCause
 from halbach_fe.inference.result import (
     ALL_READINGS,
     COVERAGE_Z,
@@ -30,33 +32,39 @@ from halbach_fe.study.edit import edited_text
 from halbach_fe.study.model import Study
 
 STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
+"""Names of the files that a diagnosis writes."""
 
-HUMAN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "1/T": ("%/T", 100.0),
-         "1/T^2": ("%/T²", 100.0), "A m2": ("A m²", 1.0), "K": ("K", 1.0)}
-"""Units for people, and how many of them."""
+DISPLAY_UNITS = {
+    "m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "1/T": ("%/T", 100.0),
+    "1/T^2": ("%/T²", 100.0), "A m2": ("A m²", 1.0), "K": ("K", 1.0)}
+"""Units that reports show for the units of parameters, and the factor to convert to them."""
 
-NOTHING = "–"
-MOST_ROWS = 10
-"""Of outliers, that are told; all are in the summary."""
+EMPTY_CELL = "–"
+"""Text of a table's cell without an entry."""
+MAX_LISTED_ROWS = 10
+"""Largest number of outliers that a report lists. The summary has all of them."""
 
-FRACTIONS = {"gain", "loss", "gradient", "scale"}
-"""Parameters without a unit that are told in percent."""
+PERCENT_PARAMETERS = {"gain", "loss", "gradient", "scale"}
+"""Dimensionless parameters that reports show in percent."""
 
 
 @dataclass(frozen=True)
-class Score:
-    """How a model meets the readings of a region; of training readings by those left out.
+class RegionFit:
+    """How well a model agrees with the readings of a region.
 
     Attributes
     ----------
     region, part : str
     readings : int
+        Number of readings.
     chi2_per_reading : float
-        By the full covariance of prediction and noise; of training readings by that of the prior.
+        Chi-squared per reading by the full covariance of prediction and noise. The prediction is
+        the prior one for training readings, and the posterior one for held-out readings.
     median_relative_error : float or None
-        Of the posterior; None if all readings are 0.
+        Median relative error of the posterior prediction; None if all readings are 0.
     coverage95 : float
-        Fraction within the 95 % band, of training readings each foretold by all others.
+        Fraction of the readings within the 95 % band of their prediction. Training readings are
+        compared with their leave-one-out prediction.
     """
 
     region: str
@@ -67,18 +75,21 @@ class Score:
     coverage95: float
 
 
-def region_scores(update: InferenceResult, left_out: Floats) -> list[Score]:
-    """Of all readings of each part, and of those that the update has not seen by region."""
+def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[RegionFit]:
+    """Return the fit of all readings of each part, and of held-out readings by region.
+
+    ``loo_residuals`` (n,) are the standardized leave-one-out residuals of the training readings.
+    """
     parts, regions = np.array(update.parts), np.array(update.regions)
     training = parts == TRAINING
-    found = [Score(ALL_READINGS, TRAINING, int(training.sum()), update.prior_conflict,
-                   _median(update, training), float(np.mean(np.abs(left_out) <= COVERAGE_Z)))]
+    found = [RegionFit(ALL_READINGS, TRAINING, int(training.sum()), update.prior_conflict,
+                   _median(update, training), float(np.mean(np.abs(loo_residuals) <= COVERAGE_Z)))]
     names = list(dict.fromkeys(update.regions))
     for part in (HELD_OUT, HELD_OUT_MAP):
         for region in [ALL_READINGS, *(names if len(names) > 1 else [])]:
             chosen = (parts == part) & ((regions == region) | (region == ALL_READINGS))
             if chosen.any():
-                found.append(Score(
+                found.append(RegionFit(
                     region, part, int(chosen.sum()),
                     float(np.mean(update.whitened(update.prediction_posterior, chosen) ** 2)),
                     _median(update, chosen), float(np.mean(np.abs(update.standardized(
@@ -88,6 +99,7 @@ def region_scores(update: InferenceResult, left_out: Floats) -> list[Score]:
 
 def _median(update: InferenceResult,
             chosen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> float | None:
+    """Return the median relative error of the posterior prediction; None if all readings are 0."""
     errors = update.relative_error(update.prediction_posterior)[chosen]
     return None if np.isnan(errors).all() else float(np.nanmedian(errors))
 
@@ -101,73 +113,77 @@ def write_summary(
 
 
 def write_study(text: str, study: Study, diagnosis: Diagnosis, folder: Path) -> None:
-    """Write study.diagnosed.toml, from the text of the study's file.
+    """Write study.diagnosed.toml, edited from the text of the study's file.
 
     Raises
     ------
     StudyError
-        If the amplitudes are none that a study may have.
+        If no valid study has the fitted amplitudes.
     """
     write_text(folder / STUDY_FILE, edited_text(text, _steps(study, diagnosis)))
 
 
 def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
-    """Studies on the way from a file's to the diagnosed one, and what each step is for."""
-    yield study, "so that this file needs no other"
-    for error in diagnosis.gross:
+    """Yield the studies from that of the file to the diagnosed one, each with a comment."""
+    yield study, "copied from another file, so that this one is complete"
+    for error in diagnosis.gross_errors:
         study = error.apply(study)
-        yield study, f"gross error: {error.reading.text}"
-    study = diagnosis.read
+        yield study, f"gross error: {error.convention.text}"
+    study = diagnosis.corrected_study
     yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
-    for one in diagnosis.named:
-        hypothesis = one.hypothesis
-        study = hypothesis.effect.apply(study, hypothesis.place, one.values.tolist())
-        yield study, note(one)
-    shaken = diagnosis.vibration
-    yield diagnosis.study, "" if shaken is None else (
-        f"vibration: {1e3 * shaken.sd_m:.2g} mm, log Bayes factor {shaken.log_bayes_factor:.1f}")
+    for effect in diagnosis.identified:
+        hypothesis = effect.hypothesis
+        study = hypothesis.effect.apply(study, hypothesis.place, effect.values.tolist())
+        yield study, note(effect)
+    position_noise = diagnosis.position_noise
+    yield diagnosis.study, "" if position_noise is None else (
+        f"vibration: {1e3 * position_noise.sd_m:.2g} mm, log Bayes factor "
+        f"{position_noise.log_bayes_factor:.1f}")
 
 
-def note(named: IdentifiedEffect) -> str:
-    """A line about an effect, in the units of the study."""
-    told = ", ".join(f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
-                     for parameter, value, sd in _uncertain(named))
-    candidate = named.found.candidate
-    factor = f"log Bayes factor {named.found.log_bayes_factor:.1f}"
-    return f"{candidate.name}: {told or 'there'}, {factor}"
+def note(identified: IdentifiedEffect) -> str:
+    """Return a line that describes an effect, in the units of the study."""
+    fitted = ", ".join(
+        f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
+        for parameter, value, sd in _uncertain(identified))
+    candidate = identified.selection.candidate
+    factor = f"log Bayes factor {identified.selection.log_bayes_factor:.1f}"
+    return f"{candidate.name}: {fitted or 'present'}, {factor}"
 
 
-def amounts(named: IdentifiedEffect) -> list[str]:
-    """Amplitudes with their standard deviations, in units for people."""
-    found, told = [], _uncertain(named)
-    for parameter, value, sd in told:
+def amounts(identified: IdentifiedEffect) -> list[str]:
+    """Return the amplitudes of an effect with their standard deviations, in display units."""
+    found, fitted = [], _uncertain(identified)
+    for parameter, value, sd in fitted:
         unit, factor = human_unit(parameter)
-        alone = len(told) == 1 and parameter.name in named.hypothesis.effect.title
+        alone = len(fitted) == 1 and parameter.name in identified.hypothesis.effect.title
         name = "" if alone else f"{parameter.name} "
         text = _rounded(factor * value, factor * sd).replace("-", "−")
         found.append(f"{name}{text}{_spaced(unit)}")
-    return found or ["there"]
+    return found or ["present"]
 
 
-def _uncertain(named: IdentifiedEffect) -> list[tuple[Parameter, float, float]]:
-    """Amplitudes that are no yes or no."""
+def _uncertain(identified: IdentifiedEffect) -> list[tuple[Parameter, float, float]]:
+    """Return the parameters, values and standard deviations of amplitudes that were fitted."""
     return [(parameter, value, sd) for parameter, value, sd in zip(
-        named.parameters, named.values.tolist(), named.sd.tolist(), strict=True) if sd > 0]
+        identified.parameters, identified.values.tolist(), identified.sd.tolist(), strict=True)
+        if sd > 0]
 
 
 def human_unit(parameter: Parameter) -> tuple[str, float]:
-    """A unit for people, and how many of it are one of the parameter's."""
+    """Return the display unit of a parameter, and the factor to convert a value to it."""
     if parameter.unit == "1":
-        return ("%", 100.0) if parameter.name in FRACTIONS else ("", 1.0)
-    return HUMAN.get(parameter.unit, (parameter.unit, 1.0))
+        return ("%", 100.0) if parameter.name in PERCENT_PARAMETERS else ("", 1.0)
+    return DISPLAY_UNITS.get(parameter.unit, (parameter.unit, 1.0))
 
 
 def _spaced(unit: str) -> str:
+    """Return a unit after a space; nothing for a dimensionless one."""
     return f" {unit}" if unit and unit != "1" else ""
 
 
 def _rounded(value: float, sd: float) -> str:
-    """Value and standard deviation, two digits of the latter."""
+    """Format a value and its standard deviation, with two digits of the latter."""
     if not sd > 0:
         return f"{value:.6g}"
     exponent = int(np.floor(np.log10(sd)))
@@ -180,17 +196,27 @@ def _rounded(value: float, sd: float) -> str:
 
 
 def place_in_words(place: Place) -> str:
-    """A place in words."""
-    parts = [f"{what} {number}" for what, number in (("ring", place.ring), ("slot", place.slot))
+    """Describe a place in words."""
+    parts = [f"{noun} {number}" for noun, number in (("ring", place.ring), ("slot", place.slot))
              if number]
     return ", ".join(parts) or place.name
 
 
 @dataclass(frozen=True)
-class Other:
-    """Something that was found and is no effect of the catalogue, as text.
+class OtherFinding:
+    """Text on a finding of the diagnosis that is not an effect of the catalogue.
 
-    ``instead`` are standard names of what it could be as well.
+    Attributes
+    ----------
+    name, title, kind : str
+    amount : str
+        Size of the finding.
+    sentence : str
+        The finding in a sentence.
+    place, factor : str
+        Place and log Bayes factor, if there are any.
+    instead : str
+        Standard names of findings that the map does not distinguish from this one.
     """
 
     name: str
@@ -198,118 +224,134 @@ class Other:
     kind: str
     amount: str
     sentence: str
-    place: str = NOTHING
-    factor: str = NOTHING
-    instead: str = NOTHING
+    place: str = EMPTY_CELL
+    factor: str = EMPTY_CELL
+    instead: str = EMPTY_CELL
 
 
-def others(diagnosis: Diagnosis) -> list[Other]:
-    """Gross errors, outliers, the solver's error and vibration."""
+def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
+    """Return gross errors, outliers, the solver's error and position noise as text."""
     found = []
-    for one in diagnosis.gross:
-        instead = [" and ".join(other.names) for other in one.alternatives]
-        found.append(Other(
-            " and ".join(one.names), one.reading.text, "gross error",
-            f"misfit {100 * one.misfit_before:.3g} % → {100 * one.misfit_after:.2g} %",
-            f"Gross error: {one.reading.text}.",
-            instead=", ".join(dict.fromkeys(instead)) or NOTHING))
+    for error in diagnosis.gross_errors:
+        instead = [" and ".join(other.names) for other in error.alternatives]
+        found.append(OtherFinding(
+            " and ".join(error.names), error.convention.text, "gross error",
+            f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
+            f"Gross error: {error.convention.text}.",
+            instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
     if diagnosis.outliers:
-        rows = sorted({one.row for one in diagnosis.outliers})
+        rows = sorted({outlier.row for outlier in diagnosis.outliers})
         text = f"row{'s' if len(rows) > 1 else ''} " + ", ".join(
-            map(str, rows[:MOST_ROWS])) + ", ..." * (len(rows) > MOST_ROWS)
+            map(str, rows[:MAX_LISTED_ROWS])) + ", ..." * (len(rows) > MAX_LISTED_ROWS)
         count = len(diagnosis.outliers)
-        found.append(Other(
-            "outliers", "readings that are off singly", "readings",
+        found.append(OtherFinding(
+            "outliers", "single readings that are outliers", "readings",
             f"{count} of {count + len(diagnosis.before.parts)}",
-            f"{count} {'readings are' if count > 1 else 'reading is'} off singly and left out "
-            f"({text} of the map).", place=text))
-    if diagnosis.numerical:
-        cause = diagnosis.numerical
-        found.append(Other(
+            f"{count} {'readings are outliers' if count > 1 else 'reading is an outlier'} and "
+            f"excluded ({text} of the map).", place=text))
+    if diagnosis.solver_error:
+        cause = diagnosis.solver_error
+        found.append(OtherFinding(
             "solver_error", "error of mesh and open boundary", "numerical",
             f"up to {1e3 * cause.largest_error_T:.2g} mT, {cause.largest_over_noise:.2g} times the "
             "noise",
             "The solver's own error explains the misfit: chi² per reading is "
-            f"{cause.chi2_noise:.3g} by the noise alone and {cause.chi2_errors:.3g} with that "
-            "error. Make `mesh` finer or `open_boundary` farther before anything is concluded."))
-    if diagnosis.vibration:
-        size = f"{1e3 * diagnosis.vibration.sd_m:.2g} mm"
-        found.append(Other(
-            "vibration", "positions that shake", "noise", f"{size} along each axis",
-            f"The positions shake by {size}.",
-            factor=f"{diagnosis.vibration.log_bayes_factor:.1f}"))
+            f"{cause.chi2_noise:.3g} for the noise alone and {cause.chi2_errors:.3g} with that "
+            "error. Refine `mesh` or move `open_boundary` outwards, and diagnose the map again."))
+    if diagnosis.position_noise:
+        size = f"{1e3 * diagnosis.position_noise.sd_m:.2g} mm"
+        found.append(OtherFinding(
+            "vibration", "random errors of the probe's positions", "noise",
+            f"{size} along each axis",
+            f"The probe's positions have random errors of {size} along each axis.",
+            factor=f"{diagnosis.position_noise.log_bayes_factor:.1f}"))
     return found
 
 
-def rivals(named: IdentifiedEffect) -> list[tuple[Candidate, float]]:
-    """Other effects that would do as well, each at its best place, with log Bayes factors."""
+def rivals(identified: IdentifiedEffect) -> list[tuple[Candidate, float]]:
+    """Return the other effects that the readings cannot distinguish, each at its best place.
+
+    The second item of each pair is the log Bayes factor.
+    """
     best: dict[str, tuple[Candidate, float]] = {}
-    for candidate, factor in named.found.alternatives:
-        if candidate.effect != named.found.candidate.effect:
+    for candidate, factor in identified.selection.alternatives:
+        if candidate.effect != identified.selection.candidate.effect:
             best.setdefault(candidate.effect, (candidate, factor))
     return list(best.values())
 
 
-def diagnosis_summary(diagnosis: Diagnosis, separations: Sequence[Separation] = ()) -> dict[str,
-                                                                                            object]:
-    """What a script wants to know of a diagnosis; the README says what everything is."""
+def diagnosis_summary(
+    diagnosis: Diagnosis, separations: Sequence[Separation] = ()
+) -> dict[str, object]:
+    """Return the content of diagnosis.json, whose keys the README describes."""
     conflicting = diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
     return {
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
-        "rounds": diagnosis.rounds, "at_rest": diagnosis.at_rest,
-        "verdict": "numerical" if diagnosis.numerical else
-        "unknown" if diagnosis.unknown and not diagnosis.anything else
-        "unexplained" if not diagnosis.named and not diagnosis.unknown and conflicting else
-        "named" if diagnosis.anything else "nothing",
-        "gross": [_gross(one) for one in diagnosis.gross],
-        "outliers": [asdict(one) for one in diagnosis.outliers],
-        "effects": [_entry(one) for one in diagnosis.named],
-        "numerical": asdict(diagnosis.numerical) if diagnosis.numerical else None,
-        "vibration": asdict(diagnosis.vibration) if diagnosis.vibration else None,
-        "unknown": asdict(diagnosis.unknown) if diagnosis.unknown else None,
-        "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])),
+        "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
+        "verdict": "numerical" if diagnosis.solver_error else
+        "unknown" if diagnosis.unknown and not diagnosis.found_anything else
+        "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
+        "named" if diagnosis.found_anything else "nothing",
+        "gross": [_gross(error) for error in diagnosis.gross_errors],
+        "outliers": [asdict(outlier) for outlier in diagnosis.outliers],
+        "effects": [_entry(effect) for effect in diagnosis.identified],
+        "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
+        "vibration": asdict(diagnosis.position_noise) if diagnosis.position_noise else None,
+        "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
+        "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),
                    "after": _groups(diagnosis.groups_after)},
-        "scores": {"before": [asdict(one) for one in region_scores(
-                       diagnosis.before, diagnosis.left_out_before)],
-                   "after": [asdict(one) for one in region_scores(
-                       diagnosis.after, diagnosis.left_out_after)]},
-        "next": [{"effect": _name(one.named), "rival": _name(one.rival), "gains": one.gains,
-                  "recommended": one.recommended and one.recommended.name}
-                 for one in separations],
+        "scores": {"before": [asdict(fit) for fit in region_scores(
+                       diagnosis.before, diagnosis.loo_residuals_before)],
+                   "after": [asdict(fit) for fit in region_scores(
+                       diagnosis.after, diagnosis.loo_residuals_after)]},
+        "next": [{"effect": _name(pair.identified), "rival": _name(pair.rival),
+                  "gains": pair.gains,
+                  "recommended": pair.recommended and pair.recommended.name}
+                 for pair in separations],
     }
 
 
 def _gross(found: GrossError) -> dict[str, object]:
-    def told(reading: MapConvention) -> dict[str, object]:
-        return {"errors": list(reading.names), "text": reading.text}
+    """Return the JSON entry of a gross error."""
+    def entry(convention: MapConvention) -> dict[str, object]:
+        return {"errors": list(convention.names), "text": convention.text}
 
-    return {**told(found.reading), "misfit_before": found.misfit_before,
+    return {**entry(found.convention), "misfit_before": found.misfit_before,
             "misfit_after": found.misfit_after,
-            "alternatives": [told(one) for one in found.alternatives]}
+            "alternatives": [entry(convention) for convention in found.alternatives]}
 
 
-def _entry(named: IdentifiedEffect) -> dict[str, object]:
-    effect, found = named.hypothesis.effect, named.found
+def _unknown_entry(unknown: UnknownCause) -> dict[str, object]:
+    """Return the JSON entry of an unknown cause; its key ``as_well`` is the field ``ambiguous``."""
+    return {"as_well" if name == "ambiguous" else name: value
+            for name, value in asdict(unknown).items()}
+
+
+def _entry(identified: IdentifiedEffect) -> dict[str, object]:
+    """Return the JSON entry of an identified effect."""
+    effect, selection = identified.hypothesis.effect, identified.selection
     return {
         "effect": effect.name, "title": effect.title, "kind": effect.kind,
-        "place": named.hypothesis.place.name,
+        "place": identified.hypothesis.place.name,
         "parameters": [
             {"name": parameter.name, "unit": parameter.unit, "value": value, "sd": sd}
-            for parameter, value, sd in zip(named.parameters, named.values.tolist(),
-                                            named.sd.tolist(), strict=True)],
-        "log_bayes_factor": found.log_bayes_factor, "log_odds": found.log_odds,
+            for parameter, value, sd in zip(identified.parameters, identified.values.tolist(),
+                                            identified.sd.tolist(), strict=True)],
+        "log_bayes_factor": selection.log_bayes_factor, "log_odds": selection.log_odds,
         "alternatives": [
             {"effect": candidate.effect, "place": candidate.place, "log_bayes_factor": factor}
-            for candidate, factor in found.alternatives],
+            for candidate, factor in selection.alternatives],
     }
 
 
 def _groups(found: Sequence[ResidualGroup]) -> list[dict[str, object]]:
-    return [asdict(one) for one in found]
+    """Return the JSON entries of groups of readings."""
+    return [asdict(group) for group in found]
 
 
 def _name(hypothesis: Hypothesis) -> str:
+    """Return effect and place of a hypothesis."""
     return f"{hypothesis.effect.name} {hypothesis.place.name}".strip()

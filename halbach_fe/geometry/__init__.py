@@ -1,1 +1,1 @@
-"""The magnet that a study describes, as shapes in space."""
+"""The geometry of the magnet that a study describes: blocks, outlines, symmetry, domain."""

@@ -1,4 +1,4 @@
-"""The layout of an array: where each block stands, how it is shaped and magnetized."""
+"""The layout of an array: position, shape and nominal magnetization of every block."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from halbach_fe.study.model import Study
 def blocks_of_array(study: Study) -> tuple[MagnetBlock, ...]:
     """Build all blocks of a study, ring by ring (lowest z first), slot by slot.
 
-    In a 2D study the one ring stretches from z = -inf to +inf.
+    The single ring of a 2D study extends from z = -inf to +inf.
 
     Raises
     ------
@@ -37,14 +37,17 @@ def blocks_of_array(study: Study) -> tuple[MagnetBlock, ...]:
 def _block(
     array: Array, ring: int, slot: int, outline: Outline, limits: tuple[float, float]
 ) -> MagnetBlock:
-    """One block, as its array or the exceptions to it have it."""
-    ours = exceptions_of(array, ring, slot)
+    """Return one block, with the array's values and those of its exceptions.
+
+    ``outline`` and ``limits`` (of z, in m) are its nominal place.
+    """
+    exceptions = exceptions_of(array, ring, slot)
     angle, remanence = magnetization_angle_deg(array, slot), array.remanence_T
     permeability = array.recoil_permeability
     across = array.recoil_permeability_across or permeability
     meant: tuple[int, int] | None = None
     gradient = corner_loss = 0.0
-    for exception in ours:
+    for exception in exceptions:
         if exception.mounted_from is not None:
             meant = exception.mounted_from
             angle = (magnetization_angle_deg(array, meant[1]) + position_angle_deg(array, slot)
@@ -68,60 +71,60 @@ def _block(
         corner_loss=corner_loss, mounted_from=meant)
     if remanence is None:
         block = replace(block, remanence=_remanence_of_moment(array, block))
-    factor = magnetization_factor(ours)
+    factor = magnetization_factor(exceptions)
     if factor != 1.0:
         block = replace(block, remanence=block.remanence * factor)
-    return _posed(block, array, ours)
+    return _displaced(block, array, exceptions)
 
 
-def _posed(
+def _displaced(
     block: MagnetBlock, array: Array, exceptions: Sequence[BlockException]
 ) -> MagnetBlock:
-    """The block where its exceptions put it; its easy axis turns with it."""
+    """Return the block displaced and rotated by its exceptions; its easy axis rotates with it."""
     axes = rotation_matrix((0.0, 0.0, np.radians(position_angle_deg(array, block.slot))))
-    shift, turn = np.zeros(3), np.zeros(3)
-    for one in exceptions:
-        twist = np.array([0.0, 0.0, np.radians(one.twist_deg)])
-        shift += axes @ one.displacement_m + one.shift_m
-        shift += rotation_matrix(vector(twist)) @ block.middle - block.middle
-        turn += axes @ np.radians(one.rotation_deg) + twist
-    if not (shift.any() or turn.any()):
+    displacement, rotation = np.zeros(3), np.zeros(3)
+    for exception in exceptions:
+        twist = np.array([0.0, 0.0, np.radians(exception.twist_deg)])
+        displacement += axes @ exception.displacement_m + exception.shift_m
+        displacement += rotation_matrix(vector(twist)) @ block.middle - block.middle
+        rotation += axes @ np.radians(exception.rotation_deg) + twist
+    if not (displacement.any() or rotation.any()):
         return block
-    return replace(block, shift=vector(shift), turn=vector(turn),
-                   easy_axis=vector(rotation_matrix(vector(turn)) @ block.easy_axis))
+    return replace(block, displacement_m=vector(displacement), rotation_rad=vector(rotation),
+                   easy_axis=vector(rotation_matrix(vector(rotation)) @ block.easy_axis))
 
 
 def exceptions_of(array: Array, ring: int, slot: int) -> list[BlockException]:
-    """The exceptions that hold for a block, in the order of the study."""
-    return [one for one in array.exceptions
-            if one.ring in (None, ring) and one.slot in (None, slot)]
+    """Return the exceptions that hold for a block, in the order of the study."""
+    return [exception for exception in array.exceptions
+            if exception.ring in (None, ring) and exception.slot in (None, slot)]
 
 
 def magnetization_factor(exceptions: Sequence[BlockException]) -> float:
-    """Product of the magnetization factors of a block's exceptions."""
-    return float(np.prod([one.magnetization_factor for one in exceptions]))
+    """Return the product of the magnetization factors of a block's exceptions."""
+    return float(np.prod([exception.magnetization_factor for exception in exceptions]))
 
 
 def position_angle_deg(array: Array, slot: int) -> float:
-    """Angle of the middle of block ``slot`` (from 1) about the z axis."""
+    """Return the angle about the z axis of the middle of slot ``slot`` (from 1)."""
     return array.first_block_angle_deg + (slot - 1) * 360.0 / array.blocks_per_ring
 
 
 def magnetization_angle_deg(array: Array, slot: int) -> float:
-    """Nominal direction of magnetization of block ``slot`` (from 1)."""
+    """Return the angle of the nominal magnetization of slot ``slot`` (from 1) to the x axis."""
     turn = (1 + array.multipole_order) * (slot - 1) * 360.0 / array.blocks_per_ring
     return array.first_magnetization_angle_deg + turn
 
 
 def facing_angle_deg(array: Array, slot: int) -> float:
-    """Angle about z that the faces of block ``slot`` (from 1) follow."""
+    """Return the angle to the x axis of the thickness of the block in slot ``slot`` (from 1)."""
     if array.block.shape == "cuboid" and array.block.orientation == "magnetization":
         return magnetization_angle_deg(array, slot)
     return position_angle_deg(array, slot)
 
 
 def ring_limits(study: Study) -> list[tuple[float, float]]:
-    """z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
+    """Return the z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
     array = study.array
     if study.dimension == 2:
         return [(-np.inf, np.inf)]
@@ -133,25 +136,37 @@ def ring_limits(study: Study) -> list[tuple[float, float]]:
 
 
 def _remanence_of_moment(array: Array, block: MagnetBlock) -> float:
-    """A moment m means B_r = mu_0 m / V, m being the remanent moment.
+    """Return the remanence B_r = mu_0 m / V in T of a block with the remanent moment m.
 
-    (The moment that a Helmholtz coil shows of a lone block is smaller by the self-demagnetization
-    1 + N (mu_r - 1), at most some 2 %; a nominal value does not know it.)
+    A Helmholtz coil measures a smaller moment of a single block: self-demagnetization divides it by
+    1 + N (mu_r - 1), with the demagnetizing factor N, at most some 2 %. The nominal moment of a
+    study is not corrected for that.
+
+    Raises
+    ------
+    StudyError
+        If the remanence is larger than that of any magnet material.
     """
     assert array.block_moment_A_m2 is not None  # the study model guarantees both
     assert array.ring_length_m is not None
     remanence = MU_0 * array.block_moment_A_m2 / (block.area * array.ring_length_m)
     if remanence > 2.0:
         raise StudyError(
-            f"Input `array.block_moment_A_m2` of study must be a moment of a remanence up to "
-            f"2 T; instead received {array.block_moment_A_m2:g}, which is {remanence:.3g} T in "
-            f"this block. Check moment, radii and ring length."
+            f"Input `array.block_moment_A_m2` of study must be the moment of a block with a "
+            f"remanence of up to 2 T; instead received {array.block_moment_A_m2:g}, which makes "
+            f"{remanence:.3g} T in this block's volume. Check moment, radii and ring length."
         )
     return remanence
 
 
 def outline_of_slot(array: Array, slot: int) -> Outline:
-    """Outline of block ``slot``, counter-clockwise."""
+    """Return the outline of the block in slot ``slot``, counter-clockwise, in m.
+
+    Raises
+    ------
+    StudyError
+        If the gap between blocks leaves them no width.
+    """
     middle = np.radians(position_angle_deg(array, slot))
     half_pitch = np.pi / array.blocks_per_ring
     inner, outer, block = array.inner_radius_m, array.outer_radius_m, array.block
@@ -168,7 +183,7 @@ def outline_of_slot(array: Array, slot: int) -> Outline:
         local = np.array([(r * np.cos(a), r * np.sin(a)) for r, a in corners])
         return closed_outline(local, arcs=(1, 3))
     if block.shape == "trapezoid":
-        # The side faces are parallel to the sector's limits, half a gap inside them.
+        # The side faces are parallel to the limits of the sector, at half a gap from them.
         inset = block.side_gap_m / 2 / np.cos(half_pitch)
         widths = [r * np.tan(half_pitch) - inset for r in (inner, outer)]
         if widths[0] <= 0:

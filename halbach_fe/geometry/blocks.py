@@ -1,8 +1,8 @@
-"""The blocks of an array: where they stand, their shape, their nominal magnetization.
+"""The blocks of an array: their place, shape and nominal magnetization.
 
-Every block is a prism along z: an outline in the (x, y) plane, of straight edges and arcs about
-the z axis, between two z. The mesh, the exact field and the checks of a user's points all start
-from the blocks listed here.
+Every block is a prism along z between two values of z. Its outline in the (x, y) plane consists of
+straight edges and of arcs about the z axis. The mesh, the exact field and the checks of a user's
+points are all derived from these blocks.
 """
 
 from __future__ import annotations
@@ -19,17 +19,36 @@ from halbach_fe.geometry.outline import Outline, outline_contains, outline_part
 from halbach_fe.study.materials import MU_0
 
 CORNER = 1 / 6
-"""Share of a block's width and thickness that is a corner."""
+"""Extent of a corner (see ``inner_corner_loss``) as a fraction of a block's width and thickness."""
 
 
 @dataclass(frozen=True)
 class MagnetBlock:
-    """One block; ``ring`` and ``slot`` count from 1. Lengths in m, remanence in T.
+    """One block of the array.
 
-    The recoil permeability is relative, along the easy axis and across it. Outline and z limits are
-    the block's place; it stands off it by ``shift`` in m, turned by the rotation vector ``turn`` in
-    rad about its middle. ``factor``, ``gradient`` and ``corner_loss`` are of its magnetization, see
-    `halbach_fe.study.magnet.BlockException`.
+    Attributes
+    ----------
+    ring, slot : int
+        Counted from 1.
+    outline : Outline
+        Outline of its nominal place in the (x, y) plane, in m.
+    z_min, z_max : float, in m
+        Limits of its nominal place; infinite in 2D.
+    easy_axis : tuple of 3 floats
+        Unit vector, rotated with the block.
+    remanence : float, in T
+        Negative for a block that is mounted upside down.
+    recoil_permeability, recoil_permeability_across : float
+        Relative, along the easy axis and perpendicular to it.
+    displacement_m : tuple of 3 floats
+        Displacement from the nominal place along x, y and z.
+    rotation_rad : tuple of 3 floats
+        Rotation vector, about the block's middle.
+    gradient, corner_loss : float
+        Non-uniformity of the magnetization, see ``magnetization_gradient`` and
+        ``inner_corner_loss`` of `halbach_fe.study.magnet.BlockException`.
+    mounted_from : tuple of 2 ints, optional
+        Ring and slot that the block was made for, if that is another place.
     """
 
     ring: int
@@ -41,37 +60,46 @@ class MagnetBlock:
     remanence: float
     recoil_permeability: float
     recoil_permeability_across: float
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    displacement_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gradient: float = 0.0
     corner_loss: float = 0.0
     mounted_from: tuple[int, int] | None = None
 
     @property
     def in_place(self) -> bool:
-        """Whether it stands where it should."""
-        return not (any(self.shift) or any(self.turn))
+        """Whether the block is neither displaced nor rotated."""
+        return not (any(self.displacement_m) or any(self.rotation_rad))
 
     @property
     def middle(self) -> Floats:
-        """Mean of its corners, (3,) in m; z is 0 if it is infinitely long."""
+        """Mean of the corners of the nominal place, (3,) in m; z is 0 for an infinite block."""
         x, y = np.mean([edge.start for edge in self.outline], axis=0)
         z = 0.0 if np.isinf(self.z_max) else (self.z_min + self.z_max) / 2
         return np.array([x, y, z])
 
     def to_place(self, points: Floats) -> Floats:
-        """Where points (n, 3) in m lie as seen from the block if it stood in its place."""
-        return np.asarray((points - self.middle - self.shift) @ rotation_matrix(self.turn)
-                          + self.middle)
+        """Return points (n, 3) in m moved by the motion that takes the block to its nominal place.
+
+        The moved points lie, relative to the nominal place, as the given points lie relative to the
+        displaced block.
+        """
+        back = (points - self.middle - self.displacement_m) @ rotation_matrix(self.rotation_rad)
+        return np.asarray(back + self.middle)
 
     def from_place(self, points: Floats) -> Floats:
-        """Where points (n, 3) in m lie that `to_place` would put at the given ones."""
-        return np.asarray((points - self.middle) @ rotation_matrix(self.turn).T + self.middle
-                          + self.shift)
+        """Return points (n, 3) in m moved with the block from its nominal place: the inverse of
+        `to_place`.
+        """
+        turned = (points - self.middle) @ rotation_matrix(self.rotation_rad).T
+        return np.asarray(turned + self.middle + self.displacement_m)
 
     @cached_property
     def parts(self) -> tuple[tuple[float, MagnetBlock], ...]:
-        """The block, or pieces of it, and how much of its magnetization each has."""
+        """Uniformly magnetized parts, which may overlap, whose superposition is the block.
+
+        Every part has a weight: its magnetization is the weight times the block's.
+        """
         if not (self.gradient or self.corner_loss):
             return ((1.0, self),)
         whole = replace(self, gradient=0.0, corner_loss=0.0)
@@ -95,20 +123,22 @@ class MagnetBlock:
 
     @property
     def recoil_tensor(self) -> Floats:
-        """Relative recoil permeability as a tensor, (3, 3)."""
+        """Relative recoil permeability as a tensor, (3, 3), along x, y and z."""
         axis = np.array(self.easy_axis)
         along, across = self.recoil_permeability, self.recoil_permeability_across
         return across * np.eye(3) + (along - across) * np.outer(axis, axis)
 
     @property
     def name(self) -> str:
-        """Label used in regions, parameters and reports."""
+        """Label of the block in regions, parameters and reports: ``r01s05`` is ring 1, slot 5."""
         return f"r{self.ring:02d}s{self.slot:02d}"
 
     @cached_property
     def area(self) -> float:
-        """Cross-section in m^2, by Green's theorem (exact: the integrand is a polynomial, or a
-        constant on arcs).
+        """Area of the cross-section in m^2.
+
+        It is the boundary integral of Green's theorem. The quadrature is exact: the integrand is a
+        polynomial on straight edges and constant on arcs.
         """
         t, weight = np.polynomial.legendre.leggauss(3)
         total = 0.0
@@ -124,7 +154,7 @@ class MagnetBlock:
 
     @property
     def magnetization(self) -> Floats:
-        """Nominal M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
+        """Nominal magnetization M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
         return np.array(self.easy_axis) * self.remanence / (MU_0 * self.recoil_permeability)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
@@ -137,11 +167,11 @@ class MagnetBlock:
 
 
 def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
-    """Matrix (3, 3) of a rotation vector in rad."""
+    """Return the matrix (3, 3) of a rotation vector in rad."""
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def vector(values: Floats) -> tuple[float, float, float]:
-    """Three numbers (3,) as a tuple of plain floats."""
+    """Return an array (3,) as a tuple of Python floats."""
     x, y, z = values.tolist()
     return x, y, z

@@ -1,6 +1,6 @@
-"""The magnet that a study describes: its blocks in their places, its iron, and how far it reaches.
+"""The magnet that a study describes: its blocks, its iron ring, and its outer dimensions.
 
-It is built once, by `build_magnet`, and handed to everything that computes a field.
+`build_magnet` builds it once; all functions that compute a field take it as an argument.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.study.magnet import Array, External, IronRing
@@ -22,12 +23,12 @@ from halbach_fe.study.model import Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
 SHAPE_KEYS = ("dimension", "array")
-"""Keys of a study that its blocks depend on."""
+"""Keys of a study that the blocks depend on."""
 
 
 @dataclass(frozen=True)
-class Magnet:
-    """A magnet as it stands in space, with the study that describes it.
+class Magnet(ShownInNotebook):
+    """The blocks of a magnet, together with the study that describes them.
 
     Attributes
     ----------
@@ -68,44 +69,44 @@ class Magnet:
 
     @property
     def iron_ring(self) -> IronRing | None:
-        """The iron tube around the blocks, if there is one."""
+        """The iron tube around the blocks, or None."""
         return self.study.iron_ring
 
     @property
     def external(self) -> External:
-        """Sources of field outside the magnet."""
+        """Sources of magnetic field outside the magnet."""
         return self.study.external
 
     @cached_property
     def curve(self) -> Curve | None:
-        """Magnetization curve of the iron, if it has one."""
+        """Magnetization curve of the iron ring, or None if there is none."""
         return curve_of(self.study)
 
     @property
     def is_nonlinear(self) -> bool:
-        """Whether the field is no linear function of the magnetizations."""
+        """Whether the field is a non-linear function of the magnetizations (iron with a curve)."""
         return is_nonlinear(self.study)
 
     @cached_property
     def is_vacuum(self) -> bool:
-        """Whether no material reacts to the field, so that the closed form is all there is."""
+        """Whether all permeabilities are 1, so that the closed-form field needs no correction."""
         return self.iron_ring is None and all(
             block.isotropic and block.recoil_permeability == 1.0 for block in self.blocks)
 
     @cached_property
     def nominal_magnetization(self) -> Floats:
-        """Nominal M of all blocks, (parameters,) in A/m; the cross-section has no M_z."""
+        """Nominal M of all blocks, (parameters,) in A/m; two components per block in 2D."""
         return np.concatenate([block.magnetization[:self.dimension] for block in self.blocks])
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the magnetization parameters: ``r01s05.Mx`` is M_x of ring 1, slot 5."""
+        """Names of the magnetization parameters; ``r01s05.Mx`` is M_x of ring 1, slot 5."""
         components = COMPONENTS[:self.dimension]
         return tuple(f"{block.name}.M{c}" for block in self.blocks for c in components)
 
     @cached_property
     def ring_limits(self) -> tuple[tuple[float, float], ...]:
-        """z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
+        """Limits of z in m of every ring; the array is centred at z = 0, infinite in 2D."""
         return tuple(ring_limits(self.study))
 
     @property
@@ -115,13 +116,13 @@ class Magnet:
 
     @cached_property
     def array_outer_radius(self) -> float:
-        """Radius in m of the smallest cylinder around all blocks in their places."""
+        """Radius in m of the smallest cylinder about the z axis around all nominal blocks."""
         slots = self.array.blocks_per_ring
         return max(edge.radius for block in self.blocks[:slots] for edge in block.outline)
 
     @property
     def iron_half_length(self) -> float:
-        """Half the length of the iron ring in m: its own, or the array's; infinite in 2D."""
+        """Half the length of the iron ring in m (default: that of the array); infinite in 2D."""
         iron = self.iron_ring
         if self.dimension == 3 and iron is not None and iron.length_m:
             return iron.length_m / 2
@@ -129,7 +130,7 @@ class Magnet:
 
     @cached_property
     def radius(self) -> float:
-        """Radius in m of everything that is not air.
+        """Outer radius in m of the magnet, including the iron ring.
 
         Raises
         ------
@@ -148,7 +149,7 @@ class Magnet:
 
     @property
     def half_length(self) -> float:
-        """Half the length in m of everything that is not air."""
+        """Half the length of the magnet in m, including the iron ring."""
         return max(self.array_half_length, self.iron_half_length)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
@@ -164,11 +165,11 @@ class Magnet:
         return inside
 
     def with_(self, **changes: Any) -> Magnet:
-        """The magnet of the same study with other keys, see `Study.with_`."""
+        """Return the magnet of the same study with other values of some keys, see `Study.with_`."""
         return self.with_study(self.study.with_(**changes))
 
     def with_study(self, study: Study) -> Magnet:
-        """The magnet of another study; blocks are built again only if they differ."""
+        """Return the magnet of another study; blocks are built again only if they may differ."""
         same = all(getattr(study, key) == getattr(self.study, key) for key in SHAPE_KEYS)
         return Magnet(study, self.blocks) if same else build_magnet(study)
 
@@ -180,5 +181,11 @@ def build_magnet(study: Study) -> Magnet:
     ------
     StudyError
         If neighbouring blocks overlap.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.build_magnet(hf.read_study("dipole.toml")).blocks[0].name
+    'r01s01'
     """
     return Magnet(study, blocks_of_array(study))

@@ -1,4 +1,4 @@
-"""Outlines of blocks in the (x, y) plane: straight edges, and arcs about the z axis."""
+"""Outlines of blocks in the (x, y) plane, made of straight edges and arcs about the z axis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from halbach_fe.core.errors import StudyError
 
 @dataclass(frozen=True)
 class Edge:
-    """A directed edge of an outline, straight or (``arc``) along a circle about the z axis."""
+    """A directed edge of an outline: straight, or (``arc``) an arc about the z axis.
+
+    ``start`` and ``end`` are in m.
+    """
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -22,7 +25,7 @@ class Edge:
 
     @property
     def angles(self) -> tuple[float, float]:
-        """Start angle and signed sweep in rad of an arc; the sweep is the shorter way round."""
+        """Start angle and signed sweep of an arc in rad; the sweep is between -pi and pi."""
         first = np.arctan2(self.start[1], self.start[0])
         last = np.arctan2(self.end[1], self.end[0])
         sweep = (last - first + np.pi) % (2 * np.pi) - np.pi
@@ -30,7 +33,7 @@ class Edge:
 
     @property
     def radius(self) -> float:
-        """Distance of the start from the z axis in m."""
+        """Distance in m of the edge's start from the z axis; the radius of an arc."""
         return float(np.hypot(*self.start))
 
     @property
@@ -41,9 +44,18 @@ class Edge:
         return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
 
     def at(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return points (n, 2) in m and outward normals times speed (n, 2) in m, t in [0, 1].
+        """Return points on the edge and its scaled normals at parameters t in [0, 1].
 
-        Outlines run counter-clockwise, so outward is to the right of the edge.
+        Parameters
+        ----------
+        t : ndarray, shape (n,)
+
+        Returns
+        -------
+        points : ndarray, shape (n, 2), in m
+        normals : ndarray, shape (n, 2), in m
+            Outward normals whose length is the derivative of the arc length by t. Outlines run
+            counter-clockwise, so that outward is to the right of the edge.
         """
         t = np.asarray(t, float)[:, None]
         if self.arc:
@@ -59,20 +71,21 @@ Outline = tuple[Edge, ...]
 
 
 def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
-    """Tell which points (n, 2) lie inside an outline, by their angle of view of each edge.
+    """Tell which points (n, 2) in m lie inside an outline.
 
-    Outlines are polygons, of which some edges bulge as arcs about the origin: the polygon's
-    winding number is corrected by the circular segments between chord and arc.
+    The even-odd rule (crossings of a ray along +x) decides for the polygon of the corners. Points
+    in a circular segment, between the chord and the arc of an edge, are on the other side of the
+    outline than of the polygon.
     """
     inside = np.zeros(len(points), bool)
     x, y = points.T
-    for edge in outline:  # even-odd rule along +x
+    for edge in outline:
         (x0, y0), (x1, y1) = edge.start, edge.end
         crosses = (y0 > y) != (y1 > y)
         if y1 != y0:
             inside ^= crosses & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
     for edge in outline:
-        if edge.arc:  # a point between chord and arc is on the other side than the chord says
+        if edge.arc:
             (x0, y0), (x1, y1) = edge.start, edge.end
             side = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
             beyond = side < 0 if edge.angles[1] > 0 else side > 0
@@ -81,16 +94,26 @@ def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
 
 
 def plane_rotation(angle: float) -> Floats:
-    """Rotation by ``angle`` rad in the plane, (2, 2)."""
+    """Return the matrix (2, 2) of a rotation by ``angle`` rad in the plane."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
-    """Points (n, m, 2) in m at fractions (n,) of an outline's thickness, from the inner side, and
-    (m,) of its width.
+    """Return points inside an outline, on a grid of fractions of its thickness and width.
 
-    The second and fourth edge, from inner to outer corners and back in all shapes, are joined by
-    straight lines.
+    The points lie on straight lines between the inner face (edge 3 of every shape) and the outer
+    face (edge 1).
+
+    Parameters
+    ----------
+    depth : ndarray, shape (n,)
+        Fractions of the thickness, from the inner face.
+    width : ndarray, shape (m,)
+        Fractions of the width.
+
+    Returns
+    -------
+    ndarray, shape (n, m, 2), in m
     """
     far, near = outline[1].at(width)[0], outline[3].at(1 - width)[0]
     share = depth[:, None, None]
@@ -99,50 +122,55 @@ def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
 
 def outline_part(outline: Outline, inner: float, outer: float, start: float,
                  stop: float) -> Outline:
-    """The part of an outline between two fractions of its thickness, from the inner side, and of
-    its width.
+    """Return the part of an outline between two fractions of its thickness and of its width.
+
+    ``inner`` and ``outer`` are fractions of the thickness, counted from the inner face; ``start``
+    and ``stop`` are fractions of the width.
     """
-    (one, two), (four, three) = places_in(
+    (first, second), (fourth, third) = places_in(
         outline, np.array([inner, outer]), np.array([start, stop])).swapaxes(0, 1)
-    return closed_outline(np.array([one, two, three, four]), tuple(
+    return closed_outline(np.array([first, second, third, fourth]), tuple(
         number for number in (1, 3) if outline[number].arc))
 
 
 def closed_outline(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
-    """The outline through corners (n, 2) in m, in their order; the edges numbered in ``arcs``, from
-    0, are arcs about the z axis, the others are straight.
+    """Return the outline through corners (n, 2) in m, in their order.
+
+    ``arcs`` are the numbers (from 0) of the edges that are arcs about the z axis.
     """
     points = [(float(x), float(y)) for x, y in corners]
     return tuple(Edge(points[i], points[(i + 1) % len(points)], arc=i in arcs)
                  for i in range(len(points)))
 
 
-@lru_cache(maxsize=32)  # a diagnosis asks for the same blocks hundreds of times
+@lru_cache(maxsize=32)  # a diagnosis builds the same blocks hundreds of times
 def check_overlaps(outlines: tuple[Outline, ...]) -> None:
-    """Refuse outlines that overlap: one holds a point of another, or their edges cross.
+    """Raise StudyError if outlines overlap: if a point of one is inside another, or edges cross.
 
-    Shared faces are allowed; outlines are drawn in by 1e-6 so that rounding decides nothing.
+    Shared faces are allowed: the outlines are shrunk by 1e-6 so that rounding does not matter.
     """
     t = np.linspace(0.0, 1.0, 9)
-    drawn_in, centres, reaches, widths = [], [], [], []
+    shrunk, centres, reaches, widths = [], [], [], []
     for outline in outlines:
         boundary = np.vstack([edge.at(t)[0][:-1] for edge in outline])
         centre = np.mean([edge.start for edge in outline], axis=0)
-        drawn_in.append(centre + (1 - 1e-6) * (boundary - centre))
+        shrunk.append(centre + (1 - 1e-6) * (boundary - centre))
         centres.append(centre)
         reaches.append(1.1 * np.hypot(*(boundary - centre).T).max())  # arcs bulge between samples
         widths.append([np.abs(_angles(polygon, centre)).max()
-                       for polygon in (drawn_in[-1], boundary)])
+                       for polygon in (shrunk[-1], boundary)])
     places, sizes = np.array(centres), np.array(reaches)
-    inside, whole = np.where(np.array(widths) < np.pi / 2, widths, np.pi).T  # or the axis is in it
-    for i, polygon in enumerate(drawn_in):
+    # an outline that contains the axis subtends all angles
+    inside, whole = np.where(np.array(widths) < np.pi / 2, widths, np.pi).T
+    for i, polygon in enumerate(shrunk):
         samples = np.vstack([polygon, polygon.mean(axis=0)])
-        # those in other sectors about the axis are apart: with shared faces, by what is drawn in
+        # only outlines with overlapping ranges of angle about the axis, and near enough, are
+        # compared; those that share a face are told apart by the shrinking
         near = (np.hypot(*(places - places[i]).T) <= sizes + sizes[i]) & (
             np.abs(_angles(places, places[i])) <= inside[i] + whole)
         for j in np.flatnonzero(near).tolist():
             if i != j and (outline_contains(outlines[j], samples).any()
-                           or _cross(polygon, drawn_in[j])):
+                           or _cross(polygon, shrunk[j])):
                 raise StudyError(
                     f"Input `array.block` of study must leave neighbours apart; instead blocks "
                     f"{i + 1} and {j + 1} of a ring overlap. Reduce the block's width, or place "
@@ -151,23 +179,26 @@ def check_overlaps(outlines: tuple[Outline, ...]) -> None:
 
 
 def _angles(points: Floats, from_: Floats) -> Floats:
-    """Angles (n,) about the axis in rad of points (n, 2), from that of another one (2,)."""
+    """Return the angles (n,) in rad about the axis of points (n, 2), from that of a point (2,)."""
     turned = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(from_[1], from_[0])
     return np.asarray((turned + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _cross(one: Floats, two: Floats) -> bool:
-    """Tell whether any side of one closed polygon crosses any of another."""
-    a, b = one[:, None], np.roll(one, -1, axis=0)[:, None]
-    c, d = two[None], np.roll(two, -1, axis=0)[None]
+def _cross(first: Floats, second: Floats) -> bool:
+    """Tell whether any side of a closed polygon (n, 2) crosses any side of another (m, 2)."""
+    a, b = first[:, None], np.roll(first, -1, axis=0)[:, None]
+    c, d = second[None], np.roll(second, -1, axis=0)[None]
 
     def side(p: Floats, q: Floats, x: Floats) -> Floats:
         return ((q[..., 0] - p[..., 0]) * (x[..., 1] - p[..., 1])
                 - (q[..., 1] - p[..., 1]) * (x[..., 0] - p[..., 0]))
 
     def apart(x: Floats, y: Floats) -> NDArray[np.bool_]:
-        """Clearly on two sides: sides of aligned blocks are collinear but for rounding."""
+        """Tell whether x and y have opposite signs beyond rounding.
+
+        Sides of aligned blocks are collinear up to rounding, and do not cross.
+        """
         return (np.minimum(x, y) < -tiny) & (np.maximum(x, y) > tiny)
 
-    tiny = 1e-9 * float(np.ptp(one)) ** 2
+    tiny = 1e-9 * float(np.ptp(first)) ** 2
     return bool((apart(side(a, b, c), side(a, b, d)) & apart(side(c, d, a), side(c, d, b))).any())

@@ -1,6 +1,6 @@
-"""The region file: which physical tag of the mesh is which part of the magnet.
+"""The region file, which relates the physical tags of a mesh to the parts of the magnet.
 
-Geometry writes it beside the mesh; the solve reads it and refuses a mesh that does not match.
+It is written beside the mesh; the solver reads it and refuses a mesh that does not match.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ FIRST_BLOCK_TAG = 1001
 
 Tag = Annotated[int, Field(ge=1, lt=2**31)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,100}$")]
-"""It goes into GetDP's files."""
+"""A name that is safe to write into GetDP's input files."""
 
 
 class BlockRegion(BaseModel):
-    """The physical tag of one block."""
+    """The physical tag of a block, or of a whole ring of blocks (slot 0) in a half-plane mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name
@@ -47,25 +47,25 @@ class Regions(BaseModel):
 
     @property
     def volume_tags(self) -> tuple[int, ...]:
-        """Tags of every region that is solved in (surfaces in 2D)."""
+        """Tags of all regions with elements of the mesh's dimension (surfaces in 2D)."""
         iron = () if self.iron is None else (self.iron,)
         return (self.air, *iron, *(block.tag for block in self.blocks))
 
     @property
     def names(self) -> dict[int, str]:
-        """Tag to name."""
+        """Names of the regions by tag, for messages."""
         names = {self.air: "air", self.outer_boundary: "outer boundary"}
         if self.iron is not None:
             names[self.iron] = "iron ring"
         return names | {block.tag: f"block {block.name}" for block in self.blocks}
 
     def write(self, path: Path) -> None:
-        """Write as JSON."""
+        """Write the region file as JSON."""
         path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> Regions:
-        """Read what `write` wrote; raise MeshError for anything else."""
+        """Read a file that `write` wrote; raise MeshError if that fails."""
         try:
             return cls.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:

@@ -1,8 +1,9 @@
-"""Blocks that are others turned or mirrored, so that one solve or integral serves them all.
+"""Symmetry of the array: blocks that are rotated or reflected copies of a source block.
 
-Magnetization and B are axial vectors: under a rotation R the field of a turned block is
-``F'(x) = R F(R^-1 x) R^T`` (F maps its magnetization to B), and under the reflection S in a plane
-``F'(x) = S F(S x) S``, the sign of an axial vector cancelling.
+The field of a source block, solved or integrated once, serves all its copies. F(x) is the matrix
+that maps the magnetization of a block to B at x. Magnetization and B are axial vectors. The field
+matrix of a block rotated by R is therefore ``F'(x) = R F(R^-1 x) R^T``, and of a block reflected
+by S in a plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels.
 """
 
 from __future__ import annotations
@@ -17,14 +18,25 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 
-_ROUNDING = 1e-12  # m; coordinates nearer than this are one point
-_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+_ROUNDING = 1e-12
+"""Grid in m that coordinates are rounded to before points are compared."""
+
+_HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd numbers with well-mixed bits, which combine three rounded coordinates to a hash."""
 
 
 @dataclass(frozen=True)
 class SymmetryImage:
-    """How a block comes from its source: turned about z by ``turn`` rad, after being mirrored in
-    the plane z = 0 if ``mirrored``.
+    """The reflection and rotation that map a source block to one of its copies.
+
+    Attributes
+    ----------
+    source : int
+        Number of the source block.
+    turn : float, in rad
+        Rotation about z, after the reflection.
+    mirrored : bool
+        Whether the source is reflected in the plane z = 0.
     """
 
     source: int
@@ -32,14 +44,17 @@ class SymmetryImage:
     mirrored: bool = False
 
     def to_source(self, points: Floats) -> Floats:
-        """Where points (n, 3) lie as seen from the source."""
+        """Return points (n, 3) moved by the inverse map, from the copy to the source."""
         found = points @ rotation_about_z(self.turn)
         return found * [1, 1, -1] if self.mirrored else found
 
     def from_source(self, field: Floats) -> Floats:
-        """Turn the source's field (..., 3, k), per unit along its k axes, to the block's place.
+        """Return the field of the copy from the field of the source at the `to_source` points.
 
-        With k = 2 the axes are those of the cross-section.
+        Parameters
+        ----------
+        field : ndarray, shape (..., 3, k)
+            B per unit of magnetization along the first k axes (x, y in a cross-section).
         """
         size = field.shape[-1]
         turn = rotation_about_z(self.turn)
@@ -50,19 +65,19 @@ class SymmetryImage:
 
 
 def rotation_about_z(angle: float) -> Floats:
-    """Rotation about z by ``angle`` rad, (3, 3)."""
+    """Return the matrix (3, 3) of a rotation about z by ``angle`` rad."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
 
 
 def unique_points(points: Floats) -> tuple[Floats, Ints]:
-    """Points (u, 3) without repetition, and which of them each of the points (n, 3) is."""
+    """Return the distinct points (u, 3), and the index (n,) among them of each point (n, 3)."""
     grid = np.round(points / _ROUNDING).astype(np.int64)
-    with np.errstate(over="ignore"):  # a hash: one number sorts faster than three
-        key = (grid.astype(np.uint64) * _MIX).sum(axis=1)
+    with np.errstate(over="ignore"):  # sorting one hash is faster than sorting three coordinates
+        key = (grid.astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     found = points[first]
-    if np.abs(found[inverse] - points).max(initial=0) > 2 * _ROUNDING:  # a collision
+    if np.abs(found[inverse] - points).max(initial=0) > 2 * _ROUNDING:  # two points share a hash
         found, inverse = np.unique(grid, axis=0, return_inverse=True)
         return found * _ROUNDING, inverse.reshape(-1)
     return found, inverse.reshape(-1)
@@ -70,83 +85,99 @@ def unique_points(points: Floats) -> tuple[Floats, Ints]:
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Every block of a study as one of a few sources, placed.
+    """The blocks of a study as images of a few source blocks.
 
     Attributes
     ----------
-    placements : tuple of Placement
-        By block.
+    images : tuple of SymmetryImage
+        One image per block, in the order of the blocks.
     """
 
-    placements: tuple[SymmetryImage, ...]
+    images: tuple[SymmetryImage, ...]
 
     @cached_property
     def sources(self) -> tuple[int, ...]:
-        """Blocks that have to be solved for, in ascending order."""
-        return tuple(sorted({placement.source for placement in self.placements}))
+        """Numbers of the source blocks, whose fields have to be computed, in ascending order."""
+        return tuple(sorted({image.source for image in self.images}))
 
-    def spread(self, points: Floats) -> tuple[Floats, list[Ints]]:
-        """All points as all sources see them, without repetition; and for every placement which
-        of them its points are.
+    def source_points(self, points: Floats) -> tuple[Floats, list[Ints]]:
+        """Return the points at which the fields of the source blocks are needed.
+
+        The fields of all blocks at ``points`` follow from them, see `SymmetryImage.from_source`.
+
+        Returns
+        -------
+        union : ndarray, shape (u, 3), in m
+            The distinct points over all images.
+        index : list of ndarray of int, shape (n,)
+            For each block, which of them are the `SymmetryImage.to_source` of ``points``.
         """
-        distinct = list(dict.fromkeys((p.turn, p.mirrored) for p in self.placements))
-        seen = [SymmetryImage(0, *way).to_source(points) for way in distinct]
+        distinct = list(dict.fromkeys((image.turn, image.mirrored) for image in self.images))
+        seen = [SymmetryImage(0, *motion).to_source(points) for motion in distinct]
         union, inverse = unique_points(np.vstack(seen))
         index = dict(zip(distinct, inverse.reshape(len(distinct), len(points)), strict=True))
-        return union, [index[p.turn, p.mirrored] for p in self.placements]
+        return union, [index[image.turn, image.mirrored] for image in self.images]
 
 
 def no_symmetry(magnet: Magnet) -> Symmetry:
-    """Every block is its own source."""
+    """Return the trivial symmetry, in which every block is its own source."""
     return Symmetry(tuple(SymmetryImage(number) for number in range(len(magnet.blocks))))
 
 
 def symmetry_of(magnet: Magnet) -> Symmetry:
-    """Find the rotations by blocks, and the mirror in z = 0, that leave materials as they are.
+    """Return the symmetry under rotations about z by whole blocks and reflection in z = 0.
 
-    The iron ring and the boundary are symmetric always.
+    The shapes and permeabilities of the blocks decide; their magnetizations may differ, because
+    fields are computed per unit of magnetization. The iron ring and the outer boundary always have
+    this symmetry.
     """
     blocks = magnet.blocks
     slots, rings = magnet.array.blocks_per_ring, magnet.array.rings
     tensors = np.array([b.recoil_tensor for b in blocks]).reshape(rings, slots, 3, 3)
     outlines = [block.outline for block in blocks[:slots]]
     pitch = 2 * np.pi / slots
-    period = next(k for k in range(1, slots + 1) if slots % k == 0 and _turns(
+    period = next(k for k in range(1, slots + 1) if slots % k == 0 and _is_periodic(
         outlines, tensors, k, pitch))
     mirror = magnet.dimension == 3 and _equal(tensors, tensors[::-1])
-    placements = []
+    images = []
     for number in range(len(blocks)):
         ring, slot = divmod(number, slots)
         mirrored = mirror and 2 * ring >= rings
         source = (rings - 1 - ring if mirrored else ring) * slots + slot % period
-        placements.append(SymmetryImage(source, (slot - slot % period) * pitch, mirrored))
-    return Symmetry(tuple(placements))
+        images.append(SymmetryImage(source, (slot - slot % period) * pitch, mirrored))
+    return Symmetry(tuple(images))
 
 
-def _turns(outlines: list[Outline], tensors: Floats, step: int, pitch: float) -> bool:
-    """Tell whether a turn by ``step`` blocks leaves shapes and permeabilities as they are."""
+def _is_periodic(outlines: list[Outline], tensors: Floats, step: int, pitch: float) -> bool:
+    """Tell whether a rotation by ``step`` slots maps all shapes and permeabilities onto themselves.
+
+    ``pitch`` is the angle in rad between neighbouring slots.
+    """
     space = rotation_about_z(step * pitch)
     if not _equal(np.roll(space @ tensors @ space.T, step, axis=1), tensors):
         return False
     turn = space[:2, :2]
-    return all(_same_shape(_corners(one) @ turn.T, _corners(other))
-               for one, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
+    return all(_same_shape(_corners(outline) @ turn.T, _corners(other))
+               for outline, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A block's own coordinates: x through its middle, from the z axis, at half its height.
+    """A block's own coordinate system.
+
+    Its origin is on the z axis at the block's middle height, and its x axis goes through the
+    block's middle.
 
     Attributes
     ----------
-    angle : float
-        Of the block's middle about the z axis, in rad.
-    centre : float
-        Its z in m; 0 if it is infinitely long.
+    angle : float, in rad
+        Angle of the block's middle about the z axis.
+    centre : float, in m
+        Middle height of the block, along z; 0 if it is infinitely long.
     shape : tuple
-        Equal for congruent blocks.
+        A key that is equal for congruent blocks.
     even : bool
-        Whether the outline is its own mirror image in y.
+        Whether the outline is symmetric under y -> -y in this frame.
     """
 
     angle: float
@@ -155,8 +186,11 @@ class Frame:
     even: bool
 
     def local(self, points: Floats) -> tuple[Floats, Floats]:
-        """Points (n, 3) in the frame, folded to y, z >= 0 as far as the block is symmetric; and
-        the signs (n, 3) that unfold the field.
+        """Return points in the frame, reflected into the part where the field is computed.
+
+        Points (n, 3) with z < 0 are reflected to z > 0, and those with y < 0 to y > 0 if the
+        outline is symmetric. The second result are the signs (n, 3) of these reflections, which
+        `unfold` needs.
         """
         found = (points - [0, 0, self.centre]) @ rotation_about_z(self.angle)
         signs = np.ones_like(found)
@@ -165,13 +199,16 @@ class Frame:
         return found * signs, signs
 
     def unfold(self, field: Floats, signs: Floats) -> Floats:
-        """A field (n, 3, 3) in the frame's quadrant, at the block's place."""
+        """Return field matrices (n, 3, 3) at the points that `local` was given.
+
+        ``field`` (n, 3, 3) are the field matrices at the points that `local` returned.
+        """
         turn = rotation_about_z(self.angle)
         return np.asarray(turn @ (field * signs[:, :, None] * signs[:, None, :]) @ turn.T)
 
 
 def frame_of(block: MagnetBlock) -> Frame:
-    """The frame of a block."""
+    """Return the frame of a block."""
     corners = _corners(block.outline)
     middle = corners.mean(axis=0)
     angle = float(np.arctan2(middle[1], middle[0]))
@@ -185,16 +222,16 @@ def frame_of(block: MagnetBlock) -> Frame:
                  _same_shape(local * [1, -1], local))
 
 
-def _equal(one: Floats, other: Floats) -> bool:
-    """Tell whether permeabilities are the same but for rounding of their turns."""
-    return bool(np.abs(one - other).max() < 1e-12)
+def _equal(tensors: Floats, others: Floats) -> bool:
+    """Tell whether permeability tensors agree up to the rounding of their rotations."""
+    return bool(np.abs(tensors - others).max() < 1e-12)
 
 
 def _corners(outline: Outline) -> Floats:
     return np.array([edge.start for edge in outline])
 
 
-def _same_shape(one: Floats, other: Floats) -> bool:
-    """Tell whether two sets of corners (n, 2) are the same, in any order."""
-    distance = np.linalg.norm(one[:, None] - other[None], axis=2)
+def _same_shape(corners: Floats, others: Floats) -> bool:
+    """Tell whether two sets of corners (n, 2) in m are the same in any order."""
+    distance = np.linalg.norm(corners[:, None] - others[None], axis=2)
     return bool((distance.min(axis=0) < 1e-9).all() and (distance.min(axis=1) < 1e-9).all())

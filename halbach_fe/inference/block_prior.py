@@ -29,7 +29,7 @@ from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.solver.vacuum_field import demagnetizing_tensors
-from halbach_fe.stats.gaussian import Gaussian, mounted
+from halbach_fe.stats.gaussian import Gaussian, remounted_root
 from halbach_fe.stats.small_samples import (
     anderson_darling,
     holm,
@@ -125,7 +125,7 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
     nominal = np.concatenate([block.magnetization[:size] for block in magnet.blocks])
     return replace(meant, nominal=nominal, gaussian=Gaussian(
-        (turns @ mean).ravel(), mounted(meant.gaussian.root, turns, sources)))
+        (turns @ mean).ravel(), remounted_root(meant.gaussian.root, turns, sources)))
 
 
 def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:

@@ -23,14 +23,14 @@ from halbach_fe.inference.result import (
 )
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import as_read, without_remainder
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes, remove_nonlinear_part
 from halbach_fe.measurement.observation import (
     Observation,
-    excluded,
-    held_out,
+    concatenate,
+    excluded_components,
+    held_out_readings,
     observe,
-    predicted_as,
-    together,
+    study_for_validation_map,
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.response.matrix import Response, response_matrix
@@ -50,7 +50,8 @@ LEFT_OUT = 0.02
 
 def infer(
     magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
-    prior: Gaussian | None = None, linearized_only: bool = False, unseen: xr.Dataset | None = None,
+    prior: Gaussian | None = None, linearized_only: bool = False,
+    validation_map: xr.Dataset | None = None,
 ) -> InferenceResult:
     """Update the block magnetizations of a study with a measured map.
 
@@ -74,10 +75,19 @@ def infer(
     ------
     MeasurementError
         If a map or the blocks do not fit the study.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> result = hf.infer(magnet, hf.read_map("map.csv"), hf.Session.open("results"))
+    >>> block = result.magnetizations.sel(parameter="r01s05.Mx")
+    >>> bool(block["posterior_sd"] < block["prior_sd"])
+    True
     """
     study = magnet.study
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
-    observation, noise, readings, parts = _read_maps(magnet, data, unseen)
+    observation, noise, readings, parts = _read_maps(magnet, data, validation_map)
     keep = np.array(parts) != TRAINING
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
@@ -87,19 +97,20 @@ def infer(
     try:
         model = response_matrix(magnet, observation, session)
     except PointsOutsideError as error:
-        raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
+        raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
     before = prior or (of_blocks.gaussian if of_blocks else nominal_prior(
         model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd))
-    errors = noise.plus(model.error)
+    errors = noise.with_independent_errors(model.error)
     learnt = linear_gaussian.update(
-        model.matrix, (readings - model.offset)[~keep], errors.part(~keep), before,
+        model.matrix, (readings - model.offset)[~keep], errors.subset(~keep), before,
         np.flatnonzero(~keep))
     after = learnt.distribution
-    if learnt.left_out > LEFT_OUT:
+    if learnt.discarded_information > LEFT_OUT:
         warnings.warn(
             f"Of so many parameters and readings of study {study.name} some combinations were left "
-            f"out, which together may change a variance by {learnt.left_out:.1g} of itself.",
+            f"out, which together may change a variance by {learnt.discarded_information:.1g} of "
+            "itself.",
             HalbachWarning, stacklevel=2)
     if magnet.is_nonlinear and not linearized_only:
         _check_linearization(magnet, observation, session, model, after.mean, errors.sd)
@@ -107,16 +118,16 @@ def infer(
         magnet=magnet, observation=observation, readings=readings, noise=noise, parts=parts,
         regions=regions, response=model, prior=before, posterior=after,
         prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
-        prior_conflict=learnt.conflict, parameters_learnt=learnt.learnt,
+        prior_conflict=learnt.prior_conflict, parameters_learnt=learnt.parameters_learnt,
         log_evidence=learnt.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None,
-        left_out=learnt.left_out)
+        left_out=learnt.discarded_information)
 
 
 def observation_of(
     magnet: Magnet, data: xr.Dataset, blocks: BlockTable | None = None,
-    unseen: xr.Dataset | None = None,
+    validation_map: xr.Dataset | None = None,
 ) -> Observation:
     """What `infer` would update with and predict, its inputs checked as there.
 
@@ -127,26 +138,22 @@ def observation_of(
     noise = magnet.study.noise
     if noise is not None:
         magnet = magnet.with_(noise=noise.with_(position_sd_m=None) if noise.regions else None)
-    return _read_maps(magnet, data, unseen)[0]
+    return _read_maps(magnet, data, validation_map)[0]
 
 
 def _read_maps(
-    magnet: Magnet, data: xr.Dataset, unseen: xr.Dataset | None
+    magnet: Magnet, data: xr.Dataset, validation_map: xr.Dataset | None
 ) -> tuple[Observation, NoiseCovariance, Floats, tuple[str, ...]]:
     """A map, and one that is only predicted: with noise, readings in T, and the part of each."""
     observation, noise, readings = _read_map(magnet, data,
-                                             excluded(magnet.study, data.sizes["point"]))
-    keep = held_out(magnet.study, observation)
+                                             excluded_components(magnet.study, data.sizes["point"]))
+    keep = held_out_readings(magnet.study, observation)
     parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
-    if unseen is not None:
-        try:
-            other, its_noise, its_readings = _read_map(
-                magnet.with_study(predicted_as(magnet.study, unseen)), unseen,
-                np.zeros((unseen.sizes["point"], 3), bool))
-        except MeasurementError as error:
-            raise MeasurementError(
-                str(error).replace(" of map must", " of held-out map must")) from None
-        observation, noise = together(observation, other), noise.beside(its_noise)
+    if validation_map is not None:
+        other, its_noise, its_readings = _read_map(
+            magnet.with_study(study_for_validation_map(magnet.study, validation_map)),
+            validation_map, np.zeros((validation_map.sizes["point"], 3), bool), "held-out map")
+        observation, noise = concatenate(observation, other), noise.stacked_with(its_noise)
         readings = np.concatenate([readings, its_readings])
         parts += (HELD_OUT_MAP,) * len(other)
     heights = observation.points[:, 2]
@@ -159,26 +166,26 @@ def _read_maps(
 
 
 def _read_map(
-    magnet: Magnet, data: xr.Dataset, left_out: NDArray[np.bool_]
+    magnet: Magnet, data: xr.Dataset, left_out: NDArray[np.bool_], where: str = "map"
 ) -> tuple[Observation, NoiseCovariance, Floats]:
     """A map as the study observes it but for components (n, 3) that are left out, with its noise
     and its readings in T.
     """
-    data = as_read(magnet.study.instrument, data)
+    data = in_si_and_magnet_axes(magnet.study.instrument, data)
     observation = observe(
-        magnet.study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out)
+        magnet.study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out, where)
     inside = magnet.contains(observation.points)
     if inside.any():
         first = int(np.argmax(inside))
         x, y, z = observation.points[first]
         sensors = len(inside) // data.sizes["point"]
         raise MeasurementError(must_be(
-            f"reading {first // sensors + 1}", "map", "at a point in air",
+            f"reading {first // sensors + 1}", where, "at a point in air",
             f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
             f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
             "Check the study's radii and the map's axes and units."))
     return (observation, reading_noise(magnet, observation, data),
-            observation.read(np.nan_to_num(without_remainder(magnet.study.instrument, data))))
+            observation.read(np.nan_to_num(remove_nonlinear_part(magnet.study.instrument, data))))
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:

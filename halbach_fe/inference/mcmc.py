@@ -127,8 +127,9 @@ def sample_posterior(
     model = nonlinear_model(update.magnet, update.observation, session,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
-    errors = update.noise.plus(model.error).part(train)
-    tolerance = max(SMALLEST_TOLERANCE_T, LIKELIHOOD_ERROR * errors.finest / len(errors))
+    errors = update.noise.with_independent_errors(model.error).subset(train)
+    tolerance = max(SMALLEST_TOLERANCE_T,
+                    LIKELIHOOD_ERROR * errors.uniform_error_scale / len(errors))
     target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors,
                        update.prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
@@ -137,7 +138,7 @@ def sample_posterior(
         Proposal(prior_reference(update.prior), PRIOR_STEP)]
     say(f"mode found; {chains} chains of {draws} draws")
     path = session.folder / "chains.nc"
-    runs = [_Run(generator, reference.place(
+    runs = [_Run(generator, reference.to_z(
         OVERDISPERSED * generator.standard_normal(len(reference.centre))))
         for generator in generators]
     key = _key(update, model, chains, seed)

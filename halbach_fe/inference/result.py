@@ -12,16 +12,18 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import (
     Observation,
 )
 from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import parts_of, whitened
+from halbach_fe.stats.linear_gaussian import row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 
@@ -32,6 +34,13 @@ TRAINING, HELD_OUT, HELD_OUT_MAP = "training", "held out", "held-out map"
 
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
+
+
+PREDICTION_COLUMNS = (
+    "label", "x_m", "y_m", "z_m", "region", "held_out", "part", "measured_T", "sigma_T",
+    "solver_error_T", "prior_mean_T", "prior_sd_T", "posterior_mean_T", "posterior_sd_T",
+    "standardized_residual_prior", "standardized_residual")
+"""Columns of prediction.csv, one row per reading."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,7 @@ class RegionScore:
 
 
 @dataclass(frozen=True)
-class InferenceResult:
+class InferenceResult(ShownInNotebook):
     """A study, a map, and what the one says about the other.
 
     ``parts`` and ``regions`` are those of each reading: training, held out, or of a map that is
@@ -109,6 +118,33 @@ class InferenceResult:
         """The study that was updated."""
         return self.magnet.study
 
+    @property
+    def magnetizations(self) -> xr.Dataset:
+        """Block magnetizations in A/m by parameter: nominal, and mean and standard deviation of
+        prior and posterior.
+        """
+        values = {
+            "nominal": self.response.nominal, "prior_mean": self.prior.mean,
+            "prior_sd": self.prior.sd, "posterior_mean": self.posterior.mean,
+            "posterior_sd": self.posterior.sd}
+        return xr.Dataset({name: ("parameter", value, {"units": "A/m"})
+                           for name, value in values.items()},
+                          coords={"parameter": list(self.response.parameters)})
+
+    @property
+    def predictions(self) -> xr.Dataset:
+        """All readings with their noise, and what prior and posterior predict of them: the columns
+        of prediction.csv, by reading.
+        """
+        prior, posterior = self.prediction_prior, self.prediction_posterior
+        columns = dict(zip(PREDICTION_COLUMNS, (
+            np.array(self.observation.labels), *self.observation.positions.T,
+            np.array(self.regions), self.held_out.astype(int), np.array(self.parts),
+            self.readings, self.noise.sd, self.response.error, prior.mean, prior.sd,
+            posterior.mean, posterior.sd, self.standardized(prior), self.standardized(posterior)),
+            strict=True))
+        return xr.Dataset({name: ("reading", value) for name, value in columns.items()})
+
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:
         """Which readings (readings,) the update has not seen."""
@@ -117,7 +153,7 @@ class InferenceResult:
     @cached_property
     def errors(self) -> NoiseCovariance:
         """What readings may differ by from the model: their noise and the solver's error."""
-        return self.noise.plus(self.response.error)
+        return self.noise.with_independent_errors(self.response.error)
 
     @property
     def sigma(self) -> Floats:
@@ -164,7 +200,7 @@ class InferenceResult:
             residual, noise, root = self._unseen(prediction, self.held_out)
             sd = np.concatenate([
                 np.linalg.norm(root(np.arange(part.start, part.stop)), axis=1)
-                for part in parts_of(len(residual), prediction.columns)])
+                for part in row_slices(len(residual), prediction.columns)])
             result[self.held_out] = residual / np.hypot(noise.sd, sd)
         return result
 
@@ -183,7 +219,7 @@ class InferenceResult:
         foretells is taken off. Only then are noise and prediction independent.
         """
         seen = np.flatnonzero(~self.held_out & ~chosen)
-        told, noise = self.errors.given(chosen, seen)
+        told, noise = self.errors.conditional(chosen, seen)
         residual, index = self.readings - prediction.mean, np.flatnonzero(chosen)
 
         def root(rows: Ints) -> Floats:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -18,10 +16,11 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.core.tables import csv_text
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.result import InferenceResult
+from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, Root, beside, entries
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 
 WRITTEN_COVARIANCE = 2000
 """Parameters, at most, whose covariance is written too: 32 MB."""
@@ -29,38 +28,18 @@ WRITTEN_COVARIANCE = 2000
 
 def write_inference(update: InferenceResult, folder: Path) -> None:
     """Write posterior.h5, prediction.csv and summary.json."""
-    parameters = list(update.response.parameters)
-    labels = {"reading": list(update.observation.labels)}
-    magnetization = xr.Dataset(
-        {name: ("parameter", values, {"units": "A/m"})
-         for name, values in (
-             ("nominal", update.response.nominal),
-             ("prior_mean", update.prior.mean), ("prior_sd", update.prior.sd),
-             ("posterior_mean", update.posterior.mean), ("posterior_sd", update.posterior.sd))},
-        coords={"parameter": parameters}, attrs={"study": update.study.model_dump_json()})
+    magnetization = update.magnetizations
+    magnetization.attrs["study"] = update.study.model_dump_json()
     known = {"prior": update.prior, "posterior": update.posterior}
     for name, one in known.items():
         magnetization.update(_stored_root(name, one, update.prior))
-        if len(parameters) <= WRITTEN_COVARIANCE:
+        if len(update.response.parameters) <= WRITTEN_COVARIANCE:
             magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
                                                    {"units": "A2/m2"})
     write_hdf5(magnetization, folder / "posterior.h5")
-    x, y, z = update.observation.positions.T
-    columns = {
-        "label": np.array(labels["reading"]), "x_m": x, "y_m": y, "z_m": z,
-        "region": np.array(update.regions), "held_out": update.held_out.astype(int),
-        "part": np.array(update.parts), "measured_T": update.readings, "sigma_T": update.noise.sd,
-        "solver_error_T": update.response.error,
-        "prior_mean_T": update.prediction_prior.mean, "prior_sd_T": update.prediction_prior.sd,
-        "posterior_mean_T": update.prediction_posterior.mean,
-        "posterior_sd_T": update.prediction_posterior.sd,
-        "standardized_residual_prior": update.standardized(update.prediction_prior),
-        "standardized_residual": update.standardized(update.prediction_posterior)}
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-    write_text(folder / "prediction.csv", table.getvalue())
+    readings = update.predictions
+    write_text(folder / "prediction.csv", csv_text(
+        {str(name): readings[name].values for name in PREDICTION_COLUMNS}))
     text = json.dumps(inference_summary(update), indent=1, allow_nan=False)
     write_text(folder / "summary.json", text + "\n")
 
@@ -94,12 +73,13 @@ def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
 
 def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
     """Variables of the root of a distribution's covariance: its rows as a sparse matrix, or what
-    the readings left of the prior's, see `Root`.
+    the readings left of the prior's, see `CovarianceFactor`.
     """
-    if isinstance(one.root, Root) and one is not prior and one.root.outer is entries(prior.root):
+    if (isinstance(one.root, CovarianceFactor) and one is not prior
+            and one.root.outer is root_matrix(prior.root)):
         return {f"{name}_directions": (("coordinate", "direction"), one.root.directions),
-                f"{name}_left": ("direction", one.root.left)}
-    rows = sparse.csr_array(entries(one.root))
+                f"{name}_left": ("direction", one.root.remaining)}
+    rows = sparse.csr_array(root_matrix(one.root))
     return {f"{name}_root": (f"{name}_entry", rows.data, {"units": "A/m"}),
             f"{name}_root_column": (f"{name}_entry", rows.indices),
             f"{name}_root_row_start": (f"{name}_row", rows.indptr, {"columns": rows.shape[1]})}
@@ -107,11 +87,11 @@ def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
 
 def _read_root(
     data: xr.Dataset, name: str, prior: Gaussian | None, size: int
-) -> Floats | Root:
+) -> Floats | CovarianceFactor:
     """The root with ``size`` rows; KeyError, ValueError or TypeError if what is stored is none."""
     if f"{name}_left" in data and prior is not None:
         left = data[f"{name}_left"]
-        return Root(entries(prior.root), untrusted.finite_array(
+        return CovarianceFactor(root_matrix(prior.root), untrusted.finite_array(
             data[f"{name}_directions"], (prior.root.shape[1], len(left))),
             untrusted.finite_array(left, left.shape))
     start, values = data[f"{name}_root_row_start"], data[f"{name}_root"]
@@ -120,7 +100,7 @@ def _read_root(
          _whole(start)),
         shape=(size, int(start.attrs["columns"])))
     rows.check_format()  # scipy would follow indices anywhere
-    return beside(rows)
+    return stacked_root(rows)
 
 
 def _whole(data: xr.DataArray) -> Ints:

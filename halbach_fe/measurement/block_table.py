@@ -1,9 +1,10 @@
 """Moments of single blocks, measured before the magnet was assembled, and their CSV file.
 
-A row is one block on its own in a Helmholtz coil. Its moment is given in the block's own axes as
-mounted: x radially outward through the block's middle, z along the magnet's axis, y azimuthally
-(z cross x). Where ring and slot are known, they count from 1 as everywhere; where they are not,
-``type`` says which blocks of the magnet it is a sample of.
+Each row is a single block that was measured in a Helmholtz coil. Its moment is given in the axes of
+the block at its place in the magnet: x points radially outward through the middle of the block, z
+along the magnet's axis, and y azimuthally (z cross x). Ring and slot are counted from 1. If the
+place of a block is not known, ``type`` names the type of blocks of the magnet of which it is a
+sample.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ COLUMNS = (*REQUIRED_COLUMNS[:2], "ring", "slot", *REQUIRED_COLUMNS[2:], "volume
            "temperature_C")
 
 MAX_PLACE = 100_000
-"""Ring or slot."""
+"""Largest number of a ring or slot."""
 MAX_MOMENT = 1e12
-"""In A m^2; a larger one is no number of a magnet, and its square none of this machine."""
+"""Largest moment in A m^2. Larger values are unphysical, and their squares may overflow."""
 
 
 @dataclass(frozen=True)
@@ -37,19 +38,21 @@ class BlockTable:
     Attributes
     ----------
     serial, type : tuple of str
+        Serial number, unique in the table, and type of each block.
     ring, slot : ndarray of int, shape (n,)
-        From 1; both 0 where the block's place in the magnet is not known.
+        Place in the magnet, counted from 1; both 0 if the place is not known.
     moment : ndarray, shape (n, 3), in A m^2
-        In the block's own axes as mounted.
+        Magnetic moment, in the axes of the block at its place in the magnet.
     sigma : ndarray, shape (n,), in A m^2
-        Standard deviation of each component, independent from block to block.
+        Standard deviation of each component of the moment, independent from block to block.
     volume : ndarray, shape (n,), in m^3
+        NaN if the volume is not known.
     temperature : ndarray, shape (n,), in degrees Celsius
-        NaN where they are not known.
+        Temperature at the measurement, NaN if it is not known.
     attributes : mapping
-        Provenance, free text by key.
+        Provenance, as free text by key.
     source : str
-        What error messages call the table.
+        Name of the table in error messages.
     """
 
     serial: tuple[str, ...]
@@ -68,7 +71,7 @@ class BlockTable:
 
     @property
     def places(self) -> list[tuple[int, int]]:
-        """Ring and slot of every block, (0, 0) where they are not known."""
+        """Ring and slot of every block, (0, 0) if its place is not known."""
         return list(zip(self.ring.tolist(), self.slot.tolist(), strict=True))
 
     def __post_init__(self) -> None:
@@ -78,13 +81,20 @@ class BlockTable:
 def read_blocks(path: str | Path) -> BlockTable:
     """Read and validate a table of measured blocks.
 
-    The header names the columns of `COLUMNS` in any order; ring, slot, volume and temperature may
-    be missing or have empty cells. ``# key: value`` lines are attributes.
+    The header names the columns of `COLUMNS` in any order. The columns ring, slot, volume_m3 and
+    temperature_C may be missing or have empty cells. Lines ``# key: value`` are attributes.
 
     Raises
     ------
     MeasurementError
-        With one sentence that names the file, the line and what to do.
+        If the table is invalid. The message names the file and the line, and says how to correct
+        it.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> len(hf.read_blocks("blocks.csv"))
+    16
     """
     path = Path(path)
     where = f"block table {path}"
@@ -103,7 +113,7 @@ def read_blocks(path: str | Path) -> BlockTable:
 
     def texts(name: str) -> tuple[str, ...]:
         for number, row in lines:
-            if not row[name] or row[name].startswith("#"):  # which begins a comment
+            if not row[name] or row[name].startswith("#"):  # `write_blocks` would make it a comment
                 raise MeasurementError(must_be(f"{name} in line {number}", where,
                                                "given, and not begin with #",
                                                f"'{row[name]}'" if row[name] else "an empty cell"))
@@ -117,7 +127,15 @@ def read_blocks(path: str | Path) -> BlockTable:
 
 
 def write_blocks(table: BlockTable, path: Path) -> None:
-    """Write a table as `read_blocks` reads it, whole or not at all; raise OutputError."""
+    """Write a table that `read_blocks` can read.
+
+    The file is written atomically: it is either complete, or not there.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     columns = {
         "serial": table.serial, "type": table.type, "ring": [n or "" for n in table.ring.tolist()],
         "slot": [n or "" for n in table.slot.tolist()],
@@ -130,7 +148,7 @@ def write_blocks(table: BlockTable, path: Path) -> None:
 def _whole(
     values: Floats, name: str, lines: Sequence[tuple[int, Mapping[str, str]]], where: str
 ) -> Ints:
-    """Counts from 1; 0 for an empty cell."""
+    """Return ring or slot numbers as integers from 1, or 0 for an empty cell; check their range."""
     for value, (number, row) in zip(values, lines, strict=True):
         if row.get(name) and not (1 <= value <= MAX_PLACE and value == int(value)):
             raise MeasurementError(must_be(f"{name} in line {number}", where,
@@ -139,7 +157,7 @@ def _whole(
 
 
 def _check(table: BlockTable) -> None:
-    """Refuse what cannot be measured blocks."""
+    """Raise MeasurementError for the first invalid entry of a table."""
     if not len(table):
         raise MeasurementError(must_be("content", table.source, "at least one block", "none"))
 
@@ -160,14 +178,14 @@ def _check(table: BlockTable) -> None:
         if table.sigma[number] >= size[number]:
             refuse(number, "sigma_A_m2", f"below the moment of {size[number]:g} A m^2",
                    f"{table.sigma[number]:g}", "Are both in A m^2?")
-        if table.volume[number] <= 0:  # NaN: not known
+        if table.volume[number] <= 0:  # False for NaN, an unknown volume
             refuse(number, "volume_m3", "positive", f"{table.volume[number]:g}",
-                   "Leave it empty where it is not known.")
+                   "Leave it empty if it is not known.")
         if np.isinf(table.volume[number]) or np.isinf(table.temperature[number]):
             refuse(number, "volume and temperature", "finite numbers", "an infinite one")
         if (table.ring[number] > 0) != (table.slot[number] > 0):
             refuse(number, "place", "ring and slot together", "one of them alone",
-                   "Leave both empty where the place is not known.")
+                   "Leave both empty if the place is not known.")
     serials: set[str] = set()
     blocks: dict[tuple[int, int], str] = {}
     for number, (serial, place) in enumerate(zip(table.serial, table.places, strict=True)):

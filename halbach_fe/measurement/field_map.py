@@ -1,14 +1,14 @@
-"""Field maps: B at labelled points, measured or computed, and their files.
+"""Field maps: measured or computed B at labelled points, and the files that hold them.
 
 A map is an `xarray.Dataset` with
 
 * ``B_T`` (point, component): flux density in T, NaN where a component was not measured;
 * coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m and ``component`` = x, y, z;
 * optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
-* attributes: provenance, free text by key.
+* attributes: provenance, as free text by key.
 
-HDF5 and CSV hold all of it and read back equal. VTU, for ParaView, has no place for scans and
-attributes; the rest reads back equal too.
+HDF5 and CSV files hold all of these and read back equal. VTU files, for ParaView, hold all but
+scans and attributes.
 """
 
 from __future__ import annotations
@@ -40,14 +40,15 @@ FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
 SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
 OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
 MAX_FIELD_T = 10.0
-"""No permanent magnet comes near; a larger number is one in mT or G."""
+"""Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
+probably in mT or G."""
 
 
 def field_map(
     points: Floats, flux_density: Floats, sigma: Floats | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
-    """Make a map from points (n, 3) in m and B (n, 3) in T, and sigma (n, 3) in T if known."""
+    """Return a map of points (n, 3) in m with B (n, 3) in T and optionally sigma (n, 3) in T."""
     data = xr.Dataset(
         {"B_T": (("point", "component"), np.array(flux_density, float))},
         coords={"component": list(COMPONENTS)} | {
@@ -61,17 +62,19 @@ def field_map(
 
 
 def points_of(data: xr.Dataset) -> Floats:
-    """Positions (n, 3) of a map in m."""
+    """Return the positions (n, 3) in m of a map."""
     return np.column_stack([data[name].values for name in POSITION_COLUMNS])
 
 
 def write_map(data: xr.Dataset, path: Path) -> None:
-    """Write a map; the suffix decides: .h5, .csv or .vtu. The file appears whole or not at all.
+    """Write a map in the format of the suffix: .h5, .csv or .vtu.
+
+    The file is written atomically: it is either complete, or not there.
 
     Raises
     ------
     OutputError
-        Unknown suffix, or a file that cannot be written.
+        If the suffix is unknown, or the file cannot be written.
     """
     writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
         ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
@@ -85,14 +88,21 @@ def write_map(data: xr.Dataset, path: Path) -> None:
 def read_map(path: str | Path) -> xr.Dataset:
     """Read and validate a map from CSV, HDF5 (.h5, .hdf5, .nc) or VTU.
 
-    CSV: ``# key: value`` comments are attributes; the header names the columns x_m, y_m, z_m and
-    some of Bx_T, By_T, Bz_T in any order, optionally sigma_T or sigma_Bx_T ..., time_s, scan. An
-    empty field is a component that was not measured.
+    In CSV, comments ``# key: value`` are attributes. The header names, in any order, the columns
+    x_m, y_m, z_m, at least one of Bx_T, By_T, Bz_T, and optionally sigma_T (or sigma_Bx_T ...),
+    time_s and scan. An empty field is a component that was not measured.
 
     Raises
     ------
     MeasurementError
-        With one sentence that names the file, the line and what to do.
+        If the file cannot be read as a map. The message names the file and the line, and says how
+        to correct it.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.read_map("map.csv")["B_T"].dims
+    ('point', 'component')
     """
     path = Path(path)
     raw = file_bytes(path, f"map {path}")
@@ -216,7 +226,7 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
 
 
 def check_readings(data: xr.Dataset, path: Path) -> None:
-    """Refuse what cannot be a reading: raise MeasurementError with the first in the map."""
+    """Check points and values of a map; raise MeasurementError for the first invalid reading."""
     where = f"map {path}"
     if not data.sizes["point"]:
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
@@ -240,7 +250,11 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
 
 
 def check_magnitudes(data: xr.Dataset) -> None:
-    """Refuse a map in other units than m and T; those of its file are the study's to tell."""
+    """Raise MeasurementError if a map's values are too large to be in m and T.
+
+    The study, not the map, states the units of the file; see `in_si_and_magnet_axes` in
+    `halbach_fe.measurement.instrument`.
+    """
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     farthest = float(np.abs(points_of(data)).max())
     if farthest > 10 * MAX_LENGTH_M:
@@ -257,7 +271,7 @@ def check_magnitudes(data: xr.Dataset) -> None:
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
-    """The same point twice is an error, unless the file says when or in which scan."""
+    """Raise MeasurementError if a point occurs twice at the same time and in the same scan."""
     keys = [points]
     if "time_s" in data:
         keys.append(data["time_s"].values[:, None])
@@ -269,4 +283,4 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
         x, y, z = points[row]
         raise MeasurementError(must_be(
             f"reading {row + 1}", where, "at a point of its own", f"({x:g}, {y:g}, {z:g}) m again",
-            "Remove it, or tell repeated readings apart by time_s or scan."))
+            "Remove it, or distinguish repeated readings by time_s or scan."))

@@ -1,9 +1,13 @@
-"""What a mapper does to the field between magnet and map.
+"""The model of a field mapper: how B at the sensors becomes the values of a map.
 
-`halbach_fe.study.measurement.Instrument` says what each number means. Units and axes are put right
-as the map is read. What is linear in B (where the sensors were, how they were turned, their gains
-and crosstalk) belongs to the model of a reading; the rest (offset, drift, non-linearity) is taken
-out of the map.
+The numbers of the model are explained in `halbach_fe.study.measurement.Instrument`. They are
+applied in three ways:
+
+* Units and axes of the map are converted when it is read (`in_si_and_magnet_axes`).
+* Effects that are linear in B (positions, orientation, gains and crosstalk of the sensors) are part
+  of the model of a reading (`sensor_model`).
+* All other effects (offset, drift and nonlinearity) are subtracted from the map
+  (`remove_nonlinear_part`).
 """
 
 from __future__ import annotations
@@ -23,49 +27,61 @@ from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
 
 ROUNDS = 50
+"""Largest number of fixed-point iterations that invert the law of the sensors."""
+
 CONVERGED_T = 1e-12
+"""Largest residual in T at which the iteration stops."""
 
 
 @dataclass(frozen=True)
-class Probe:
-    """Where a mapper's sensors were, and what they saw of B there.
+class SensorModel:
+    """Positions of a mapper's sensors and their linear response to B, for a map of n points.
 
     Attributes
     ----------
     points : ndarray, shape (n, 3) or (3 n, 3), in m
-        Of the probe at each point of the map; with sensors apart, of each sensor, point by point.
+        Position of the probe at each point of the map. If its three sensors are apart, the position
+        of each sensor, point by point.
     operator : sparse array, shape (3 n, 3 len(points))
-        From B there, flattened point by point, to the linear part of the readings (Bx, By, Bz of
-        each point of the map).
+        Maps B at ``points``, flattened point by point, to the linear part of the map's values (Bx,
+        By, Bz of each point).
     """
 
     points: Floats
     operator: sparse.csr_array
 
 
-def as_read(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
-    """A map in m and T along the magnet's axes, as the study says that it is to be read.
+def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
+    """Convert a map to m, T and the magnet's axes, by the units and axes that the study states.
 
     Raises
     ------
     MeasurementError
-        If its numbers are still those of another unit.
+        If positions or flux densities are so large that they must be in another unit.
     """
-    points = along_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
+    points = to_magnet_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
     unit = instrument.flux_density_unit_T
-    field = along_axes(instrument.field_axes, data["B_T"].values) * unit
+    field = to_magnet_axes(instrument.field_axes, data["B_T"].values) * unit
     read = data.assign_coords({name: data[name].copy(data=points[:, axis])
                                for axis, name in enumerate(POSITION_COLUMNS)})
     read = read.assign(B_T=data["B_T"].copy(data=field))
     if "sigma_T" in data:
-        sigma = np.abs(along_axes(instrument.field_axes, data["sigma_T"].values)) * unit
+        sigma = np.abs(to_magnet_axes(instrument.field_axes, data["sigma_T"].values)) * unit
         read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
     check_magnitudes(read)
     return read
 
 
-def along_axes(axes: Axes, columns: Floats) -> Floats:
-    """Vectors (n, 3) along the magnet's axes, of which ``axes`` are those of the columns (n, 3)."""
+def to_magnet_axes(axes: Axes, columns: Floats) -> Floats:
+    """Convert vectors (n, 3) to the magnet's axes.
+
+    Parameters
+    ----------
+    axes : Axes
+        For each column of the vectors, the axis of the magnet along which it points, such as
+        ``("x", "-z", "y")``.
+    columns : ndarray, shape (n, 3)
+    """
     found = np.empty(columns.shape)
     for column, axis in enumerate(axes):
         sign = -1.0 if axis.startswith("-") else 1.0
@@ -73,28 +89,32 @@ def along_axes(axes: Axes, columns: Floats) -> Floats:
     return found
 
 
-def probe(instrument: Instrument, points: Floats) -> Probe:
-    """The probe on a map's points (n, 3) in m."""
+def sensor_model(instrument: Instrument, points: Floats) -> SensorModel:
+    """Return the sensors' positions and linear response for a map's points (n, 3) in m."""
     count = len(points)
-    positions = probe_positions(instrument, points)
+    positions = sensor_positions(instrument, points)
     rows = sensor_matrix(instrument)
     if not np.ptp(positions, axis=1).any():
-        return Probe(positions[:, 0], sparse.csr_array(sparse.kron(sparse.eye_array(count), rows)))
-    apart = np.zeros((3, 9))  # each sensor reads at its own point
+        return SensorModel(positions[:, 0],
+                           sparse.csr_array(sparse.kron(sparse.eye_array(count), rows)))
+    apart = np.zeros((3, 9))  # each sensor responds to B at its own position
     for axis in range(3):
         apart[axis, 3 * axis:3 * axis + 3] = rows[axis]
-    return Probe(positions.reshape(-1, 3),
-                 sparse.csr_array(sparse.kron(sparse.eye_array(count), apart)))
+    return SensorModel(positions.reshape(-1, 3),
+                       sparse.csr_array(sparse.kron(sparse.eye_array(count), apart)))
 
 
-def probe_positions(instrument: Instrument, points: Floats) -> Floats:
-    """Where each sensor was, (n, 3, 3) in m: by point of the map, sensor, coordinate."""
+def sensor_positions(instrument: Instrument, points: Floats) -> Floats:
+    """Return the positions (n, 3, 3) in m of each sensor at the points (n, 3) in m of a map.
+
+    The axes of the result are point of the map, sensor, and coordinate.
+    """
     stretched = points * [1 + instrument.radius_scale, 1 + instrument.radius_scale,
                           1 + instrument.z_scale]
     if instrument.radius_offset_m:
-        stretched += instrument.radius_offset_m * outward(points)
+        stretched += instrument.radius_offset_m * radial_direction(points)
     if any(instrument.eccentricity_m):
-        stretched += np.tensordot(instrument.eccentricity_m, run_out(points), 1)
+        stretched += np.tensordot(instrument.eccentricity_m, eccentricity_shift(points), 1)
     z = points[:, 2]
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
@@ -104,35 +124,47 @@ def probe_positions(instrument: Instrument, points: Floats) -> Floats:
 
 
 def probe_points(instrument: Instrument, points: Floats) -> Floats:
-    """Where the middle of the sensors was, (n, 3) in m, at points (n, 3) of a map."""
-    return np.asarray(probe_positions(instrument, points).mean(axis=1))
+    """Return the mean position (n, 3) in m of the sensors at each of a map's points (n, 3) in m."""
+    return np.asarray(sensor_positions(instrument, points).mean(axis=1))
 
 
-def outward(points: Floats) -> Floats:
-    """Unit vectors (n, 3) away from the axis at points (n, 3); along x on it."""
+def radial_direction(points: Floats) -> Floats:
+    """Return the unit vectors (n, 3) radially outward at points (n, 3); on the axis, along x."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(points))])
 
 
-def run_out(points: Floats) -> Floats:
-    """Displacements (2, n, 3) of points (n, 3) on circles per unit of eccentricity along x and y:
-    farther out by the cosine or sine of the angle, which is right; none on the axis.
+def eccentricity_shift(points: Floats) -> Floats:
+    """Return the displacements (2, n, 3) of points on circles per unit of eccentricity in x and y.
+
+    The probe moves on an eccentric circle: its distance from the axis changes by the eccentricity
+    times the cosine (x) or sine (y) of its angle. Of the points (n, 3), those on the axis are not
+    displaced.
     """
-    away = outward(points) * (np.hypot(points[:, 0], points[:, 1]) > 0)[:, None]
+    away = radial_direction(points) * (np.hypot(points[:, 0], points[:, 1]) > 0)[:, None]
     return np.stack([away[:, [0]] * away, away[:, [1]] * away])
 
 
 def sensor_matrix(instrument: Instrument) -> Floats:
-    """From B in the magnet's axes to the linear part of what the three sensors show, (3, 3)."""
+    """Return the matrix (3, 3) from B in the magnet's axes to the sensors' linear response."""
     matrix = np.diag(1 + np.array(instrument.gain))
     for name, value in instrument.crosstalk.items():
         matrix[COMPONENTS.index(name[0]), COMPONENTS.index(name[1])] = value
     return matrix @ rotation_matrix(instrument.rotation_rad).T
 
 
-def remainder(instrument: Instrument, fields: Floats, time: Floats) -> Floats:
-    """What sensors show beyond the linear part, (n, 3) in T, of B (n, 3) in T in their own axes;
-    time (n,) runs from 0 to 1 over the map.
+def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floats:
+    """Return the part (n, 3) in T of the sensors' values that is not linear in B.
+
+    It is the sum of planar Hall effect, quadratic and cubic terms, offset and drift.
+
+    Parameters
+    ----------
+    instrument : Instrument
+    fields : ndarray, shape (n, 3), in T
+        B in the sensors' own axes.
+    time : ndarray, shape (n,)
+        Time of each reading, from 0 at the beginning to 1 at the end of the map; see `map_time`.
     """
     others = np.stack([fields[:, 1] * fields[:, 2], fields[:, 0] * fields[:, 2],
                        fields[:, 0] * fields[:, 1]], axis=1)
@@ -143,19 +175,27 @@ def remainder(instrument: Instrument, fields: Floats, time: Floats) -> Floats:
 
 
 def map_time(data: xr.Dataset) -> Floats:
-    """When each reading of a map was taken, (n,), from 0 to 1."""
+    """Return the time (n,) of each point of a map, scaled to run from 0 to 1.
+
+    Without recorded times the points are assumed to have been measured in the order of the map, at
+    equal intervals.
+    """
     count = data.sizes["point"]
     time = (data["time_s"].values if "time_s" in data else np.arange(count)).astype(float)
     return np.asarray((time - time.min()) / (np.ptp(time) or 1.0))
 
 
-def without_remainder(instrument: Instrument, data: xr.Dataset) -> Floats:
-    """A map's readings (n, 3) in T, NaN where there are none, without what is not linear in B.
+def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
+    """Return the values (n, 3) in T of a map without the part that is not linear in B.
+
+    The nonlinear part depends on the field, which is found by fixed-point iteration of the law of
+    the sensors. Components that were not measured stay NaN.
 
     Raises
     ------
     MeasurementError
-        If a sensor needs a component that the map does not hold, or the law has no inverse.
+        If the planar Hall effect needs a component that the map does not hold, or the iteration
+        does not converge.
     """
     shown = np.asarray(data["B_T"].values, float)
     missing = np.isnan(shown)
@@ -164,9 +204,9 @@ def without_remainder(instrument: Instrument, data: xr.Dataset) -> Floats:
     linear = instrument.with_(rotation_rad=(0.0, 0.0, 0.0))
     matrix, field = sensor_matrix(linear), np.nan_to_num(shown)
     for _ in range(ROUNDS):
-        rest = remainder(instrument, field, time)
+        rest = nonlinear_part(instrument, field, time)
         wrong = np.where(missing, 0.0, np.nan_to_num(shown) - field @ matrix.T - rest)
-        field = field + wrong  # the law is nearly the identity
+        field = field + wrong  # converges, since the law is nearly the identity
         if not np.abs(wrong).max() > CONVERGED_T:
             return shown - rest
     raise MeasurementError(must_be(
@@ -175,11 +215,11 @@ def without_remainder(instrument: Instrument, data: xr.Dataset) -> Floats:
 
 
 def _check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:
-    """The planar Hall effect in a component that was read needs the other two."""
+    """Check that the planar Hall effect is corrected only where all components were measured."""
     for axis, name in enumerate(COMPONENTS):
         others = [j for j in range(3) if j != axis]
         if instrument.planar_hall_per_T[axis] and (
                 ~missing[:, axis] & missing[:, others].any(axis=1)).any():
             raise MeasurementError(must_be(
-                "components", "map", f"all three where B{name} was read, whose planar Hall effect "
-                "the study gives", "some missing", "Set instrument.planar_hall_per_T to 0."))
+                "components", "map", f"all three where B{name} was read, since the study states "
+                "its planar Hall effect", "some missing", "Set instrument.planar_hall_per_T to 0."))

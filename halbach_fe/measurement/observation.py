@@ -1,8 +1,9 @@
-"""From B at points to the readings that an inference compares: labelled rows of numbers.
+"""From B at the sensors to the readings that an inference compares with a model.
 
-The mapper's probe turns B where it was into a map (`halbach_fe.measurement.instrument`); an
-analysis turns the map into readings: a selection for flux densities, Fourier's for circles. An
-`Observation` is both.
+Two linear steps lead from the field to the readings. The mapper's sensors turn B at their positions
+into a field map (`halbach_fe.measurement.instrument`). The analysis turns the map into readings:
+flux densities are a selection of the map's components, Fourier coefficients are sums over the
+points of circles. An `Observation` holds the second step, and both steps combined.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import probe
+from halbach_fe.measurement.instrument import sensor_model
 from halbach_fe.study.measurement import (
     CirclePositions,
     FluxDensity,
@@ -27,27 +28,29 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 RADIUS_M = 1e-4
-"""How well a radius is met: maps have rounded coordinates, and circles lie farther apart."""
+"""Largest distance in m of a reading from a held-out radius. Coordinates of maps are rounded, and
+the radii of circles differ by more than this tolerance."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Readings as linear functions of B at points.
+    """Readings as linear functions of B at the sensors, and of a field map.
 
     Attributes
     ----------
     points : ndarray, shape (n, 3), in m
-        Where sensors were.
+        Positions of the sensors, by the study's instrument.
     operator : sparse array, shape (readings, 3 n)
-        Applied to B in T there, flattened point by point.
+        Maps B in T at the sensors, flattened point by point, to the readings; both steps combined.
     analysis : sparse array, shape (readings, 3 m)
-        Applied to a map of m points, flattened point by point.
+        Maps B in T of the field map's m points, flattened point by point, to the readings.
     map_points : ndarray, shape (m, 3), in m
-        Where the map says they were.
+        Positions as the map states them.
     labels : tuple of str
-        Of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
+        Name of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
     positions : ndarray, shape (readings, 3), in m
-        Where each reading belongs; for a Fourier coefficient where its circle begins, at angle 0.
+        Position of each reading as the map states it; for a Fourier coefficient the point of its
+        circle at angle 0.
     """
 
     points: Floats
@@ -62,104 +65,146 @@ class Observation:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """x, y or z of each reading; nothing for a Fourier coefficient."""
+        """Component x, y or z of each reading; empty for a Fourier coefficient."""
         return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
 
     @property
     def radii(self) -> Floats:
-        """Distance of each reading from the z axis, (readings,) in m: of its point or circle."""
+        """Distance in m of each reading's point, or radius of its circle, from the z axis."""
         return np.hypot(self.positions[:, 0], self.positions[:, 1])
 
     def apply(self, fields: Floats) -> Floats:
-        """Readings of fields (..., n, 3) in T; shape (..., readings)."""
+        """Return the readings (..., readings) that the sensors give of fields B (..., n, 3) in T.
+
+        Use this method for a computed field at ``points``; for the values of a map use `read`.
+        """
         flat = fields.reshape(-1, 3 * len(self.points))
         return np.asarray(self.operator @ flat.T).T.reshape(*fields.shape[:-2], len(self))
 
     def part(self, rows: slice) -> tuple[Ints, sparse.csr_array]:
-        """Indices (k,) of the points that some readings see, and the operator (rows, 3 k) there."""
-        own = self.operator[rows]
-        seen, place = np.unique(own.indices // 3, return_inverse=True)
-        return seen, sparse.csr_array((own.data, 3 * place + own.indices % 3, own.indptr),
-                                      shape=(own.shape[0], 3 * len(seen)))
+        """Restrict the operator to some readings and the points that they depend on.
+
+        Parameters
+        ----------
+        rows : slice
+            The r readings.
+
+        Returns
+        -------
+        used : ndarray of int, shape (k,)
+            Indices of the points on which the readings depend.
+        operator : sparse array, shape (r, 3 k)
+            Maps B at these points to the readings.
+        """
+        operator = self.operator[rows]
+        used, place = np.unique(operator.indices // 3, return_inverse=True)
+        return used, sparse.csr_array((operator.data, 3 * place + operator.indices % 3,
+                                       operator.indptr),
+                                      shape=(operator.shape[0], 3 * len(used)))
 
     def read(self, map_fields: Floats) -> Floats:
-        """Readings (..., readings) of what a map shows, (..., m, 3) in T."""
+        """Return the readings (..., readings) of the values (..., m, 3) in T of a field map.
+
+        The map already contains the response of the sensors, so that only the analysis is applied;
+        for a field B at the sensors use `apply`.
+        """
         flat = map_fields.reshape(-1, self.analysis.shape[1])
         return np.asarray(self.analysis @ flat.T).T.reshape(*map_fields.shape[:-2], len(self))
 
     def magnitude(self, field: Floats) -> Floats:
-        """Size of a field (n, 3) in T as every reading sees it, whatever its direction or phase:
-        ``|B|`` at the point, or the amplitude of the harmonic.
+        """Return the magnitude (readings,) in T of a field (n, 3) in T at each reading.
+
+        The magnitude does not depend on the direction or phase of the field: it is ``|B|`` at the
+        point of a flux density, and the amplitude ``hypot(A_k, B_k)`` of the harmonic of a Fourier
+        coefficient.
         """
-        sensors = 3 * len(self.points) // self.analysis.shape[1]  # at each point of the map
-        single = np.diff(self.analysis.indptr) == 1  # one component at one point
+        sensors = 3 * len(self.points) // self.analysis.shape[1]  # per point of the map
+        single = np.diff(self.analysis.indptr) == 1  # flux densities depend on one component
         point = self.analysis.indices[self.analysis.indptr[:-1]] // len(COMPONENTS)
         result = np.linalg.norm(field, axis=1)[::sensors][point]
         if not single.all():
-            harmonics = max(int(label[1:]) for label, one in zip(self.labels, single, strict=True)
-                            if not one)
-            # A_1 ... A_K, B_1 ... B_K of each circle
+            harmonics = max(int(label[1:])
+                            for label, flux_density in zip(self.labels, single, strict=True)
+                            if not flux_density)
+            # the coefficients of each circle are A_1 ... A_K, B_1 ... B_K
             parts = self.apply(field)[~single].reshape(-1, 2, harmonics)
             result[~single] = np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel()
         return result
 
 
-def together(one: Observation, other: Observation) -> Observation:
-    """The readings of two maps, one after the other."""
-    def joined(first: sparse.csr_array, second: sparse.csr_array) -> sparse.csr_array:
-        return sparse.csr_array(sparse.block_diag([first, second]))
+def concatenate(first: Observation, second: Observation) -> Observation:
+    """Return the readings of a first map, followed by those of a second."""
+    def joined(upper: sparse.csr_array, lower: sparse.csr_array) -> sparse.csr_array:
+        return sparse.csr_array(sparse.block_diag([upper, lower]))
 
     return Observation(
-        np.vstack([one.points, other.points]), joined(one.operator, other.operator),
-        joined(one.analysis, other.analysis), np.vstack([one.map_points, other.map_points]),
-        one.labels + other.labels, np.vstack([one.positions, other.positions]))
+        np.vstack([first.points, second.points]), joined(first.operator, second.operator),
+        joined(first.analysis, second.analysis), np.vstack([first.map_points, second.map_points]),
+        first.labels + second.labels, np.vstack([first.positions, second.positions]))
 
 
-def observe(study: Study, points: Floats, measured: NDArray[np.bool_]) -> Observation:
-    """The study's observation on the points of a map.
+def observe(
+    study: Study, points: Floats, measured: NDArray[np.bool_], where: str = "map"
+) -> Observation:
+    """Return the study's observation at the points of a map.
 
     Parameters
     ----------
+    study : Study
     points : ndarray, shape (n, 3), in m
+        Positions as the map states them.
     measured : ndarray of bool, shape (n, 3)
-        Which components the map holds at each point.
+        Whether the map holds a component at a point.
+    where : str
+        What error messages call the map.
+
+    Raises
+    ------
+    MeasurementError
+        If the map lacks the components that the study observes, or its points do not form the
+        circles that Fourier coefficients need.
     """
     if study.observation.quantity == "fourier_coefficients":
         if not measured[:, :2].all():
-            raise MeasurementError(must_be("components", "map",
+            raise MeasurementError(must_be("components", where,
                                            "Bx and By at every point, for the Fourier "
                                            "coefficients of B_r", "points without them"))
-        analysis, labels, positions = fourier_analysis(points, study.observation)
+        analysis, labels, positions = fourier_analysis(points, study.observation, where)
     else:
         wanted = np.array([name in study.observation.components for name in COMPONENTS])
         point, component = np.nonzero(measured & wanted)
         if not len(point):
             raise MeasurementError(must_be(
-                "components", "map", f"some of {', '.join(study.observation.components)}, which "
+                "components", where, f"some of {', '.join(study.observation.components)}, which "
                 "the study observes", "none of them"))
         analysis = sparse.csr_array(
             (np.ones(len(point)), (np.arange(len(point)), 3 * point + component)),
             shape=(len(point), 3 * len(points)))
         labels, positions = tuple(f"B{COMPONENTS[c]}" for c in component), points[point]
-    used = probe(study.instrument, points)
-    return Observation(used.points, sparse.csr_array(analysis @ used.operator), analysis, points,
-                       labels, positions)
+    sensors = sensor_model(study.instrument, points)
+    return Observation(sensors.points, sparse.csr_array(analysis @ sensors.operator), analysis,
+                       points, labels, positions)
 
 
 def _on_circles(points: Floats, positions: CirclePositions) -> NDArray[np.bool_]:
-    """Which points (n, 3) in m have which of the radii (n, radii)."""
+    """Return whether each of points (n, 3) in m lies at each of the radii, (n, radii)."""
     radius = np.hypot(points[:, 0], points[:, 1])
     return np.isclose(radius[:, None], positions.radius_m, rtol=1e-6)
 
 
-def predicted_as(study: Study, data: xr.Dataset) -> Study:
-    """The study as it observes another map, which is only predicted: itself, or if it observes
-    Fourier coefficients and the map has points on none of its circles, flux densities there.
+def study_for_validation_map(study: Study, data: xr.Dataset) -> Study:
+    """Return the study with an observation that fits a validation map.
+
+    A validation map is predicted, not used for the update. Its points may differ from those of the
+    main map: if the study observes Fourier coefficients but no point of the validation map lies on
+    the study's circles, flux densities at its points are observed instead. Otherwise the study is
+    returned unchanged.
 
     Raises
     ------
     MeasurementError
-        If such a map does not say how noisy it is; the study's noise is that of the coefficients.
+        If flux densities are observed instead and the map does not state their noise; the study's
+        noise is that of the Fourier coefficients.
     """
     observed = study.observation
     if observed.quantity == "flux_density" or _on_circles(
@@ -167,41 +212,48 @@ def predicted_as(study: Study, data: xr.Dataset) -> Study:
         return study
     if "sigma_T" not in data:
         raise MeasurementError(must_be(
-            "sigma_T", "map", "given, as the study's noise is that of Fourier coefficients and the "
-            "map has points on none of its circles", "nothing", "Add the column sigma_T."))
+            "sigma_T", "held-out map", "given, as the study's noise is that of Fourier "
+            "coefficients and the map has points on none of its circles", "nothing",
+            "Add the column sigma_T."))
     return study.with_(
         observation=FluxDensity(quantity="flux_density", positions=observed.positions))
 
 
 def circles(
-    points: Floats, settings: FourierCoefficients
+    points: Floats, settings: FourierCoefficients, where: str = "map"
 ) -> list[tuple[float, NDArray[np.int64]]]:
-    """Group points into full circles of the study's radii: for each its radius in m and the
-    indices of its points by angle.
+    """Group points into full circles about the z axis at the study's radii.
+
+    Returns
+    -------
+    circles : list of (float, ndarray of int)
+        For each circle its radius in m, and the indices of its points in the order of their angle.
 
     Raises
     ------
     MeasurementError
-        If the points are not circles of equally spaced points about the z axis.
+        If a point is at none of the radii, or the points of a circle are too few for the study's
+        harmonics or not equally spaced.
     """
     radii = np.array(settings.positions.radius_m)
     on_circle = _on_circles(points, settings.positions)
     if not on_circle.any(axis=1).all():
         raise MeasurementError(must_be(
-            "points", "map", f"on circles of radius {', '.join(f'{one:g}' for one in radii)} m, "
-            "as the study's Fourier coefficients need", "points at other radii",
+            "points", where,
+            f"on circles of radius {', '.join(f'{radius:g}' for radius in radii)} m, as the study's"
+            " Fourier coefficients need", "points at other radii",
             "Observe flux_density instead."))
     found = []
-    own = radii[np.argmax(on_circle, axis=1)]
-    for radius, z in np.unique(np.column_stack([own, np.round(points[:, 2], 9)]), axis=0):
-        index = np.flatnonzero((own == radius) & (np.abs(points[:, 2] - z) < 1e-9))
+    radius_of = radii[np.argmax(on_circle, axis=1)]
+    for radius, z in np.unique(np.column_stack([radius_of, np.round(points[:, 2], 9)]), axis=0):
+        index = np.flatnonzero((radius_of == radius) & (np.abs(points[:, 2] - z) < 1e-9))
         angle = np.arctan2(points[index, 1], points[index, 0]) % (2 * np.pi)
         order = np.argsort(angle)
         steps = np.diff(angle[order], append=angle[order][0] + 2 * np.pi)
         if len(index) <= 2 * settings.harmonics or not np.allclose(
                 steps, 2 * np.pi / len(index), atol=1e-6):
             raise MeasurementError(must_be(
-                f"circle of radius {radius:g} m at z = {z:g} m", "map",
+                f"circle of radius {radius:g} m at z = {z:g} m", where,
                 f"more than {2 * settings.harmonics} equally spaced points", f"{len(index)} points"
             ))
         found.append((float(radius), index[order]))
@@ -209,16 +261,32 @@ def circles(
 
 
 def fourier_analysis(
-    points: Floats, settings: FourierCoefficients
+    points: Floats, settings: FourierCoefficients, where: str = "map"
 ) -> tuple[sparse.csr_array, tuple[str, ...], Floats]:
-    """Fourier coefficients of B_r on the circles that points (n, 3) in m form: matrix (readings,
-    3 n), labels and positions (readings, 3) in m.
+    """Return the Fourier analysis of B_r on the circles that the points of a map form.
+
+    On a circle ``B_r = sum_k A_k cos(k phi) + B_k sin(k phi)``.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    settings : FourierCoefficients
+
+    Returns
+    -------
+    matrix : sparse array, shape (readings, 3 n)
+        Maps B, flattened point by point, to the coefficients A_1 ... A_K, B_1 ... B_K of each
+        circle.
+    labels : tuple of str
+        ``A1`` ... ``B8`` of each reading.
+    positions : ndarray, shape (readings, 3), in m
+        Point of the circle at angle 0.
     """
     order = np.arange(1, settings.harmonics + 1)
     rows, columns, values = [], [], []
     labels: list[str] = []
     positions = []
-    for radius, index in circles(points, settings):
+    for radius, index in circles(points, settings, where):
         angle = np.arctan2(points[index, 1], points[index, 0])
         wave = np.vstack([np.cos(np.outer(order, angle)), np.sin(np.outer(order, angle))])
         wave *= 2 / len(index)
@@ -234,31 +302,33 @@ def fourier_analysis(
     return matrix, tuple(labels), np.array(positions)
 
 
-def excluded(study: Study, count: int) -> NDArray[np.bool_]:
-    """Tell which components (count, 3) of a map of so many rows the study leaves out.
+def excluded_components(study: Study, count: int) -> NDArray[np.bool_]:
+    """Return which components (count, 3) of a map with ``count`` rows the study excludes.
 
     Raises
     ------
     MeasurementError
-        If the map has no such row.
+        If the study excludes a reading in a row that the map does not have.
     """
     found = np.zeros((count, len(COMPONENTS)), bool)
-    for one in study.inference.excluded_readings:
-        if one.row > count:
+    for reading in study.inference.excluded_readings:
+        if reading.row > count:
             raise MeasurementError(must_be(
-                "rows", "map", f"at least the {one.row} that inference.excluded_readings names",
+                "rows", "map", f"at least the {reading.row} that inference.excluded_readings names",
                 f"{count}", "Is it another map?"))
-        found[one.row - 1, [COMPONENTS.index(name) for name in one.components]] = True
+        found[reading.row - 1, [COMPONENTS.index(name) for name in reading.components]] = True
     return found
 
 
-def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:
-    """Tell which readings the study keeps from the update, (readings,).
+def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool_]:
+    """Return which readings (readings,) the study holds out of the update.
+
+    A reading is held out if any key of the study's ``inference.held_out`` selects it.
 
     Raises
     ------
     MeasurementError
-        If a key of the study holds out none, or all together hold out all.
+        If a key selects no reading, or all keys together select all readings.
     """
     settings = study.inference.held_out
     chosen = np.zeros(len(observation), bool)
@@ -275,15 +345,15 @@ def held_out(study: Study, observation: Observation) -> NDArray[np.bool_]:
                 "Remove inference.held_out, or make its window smaller."))
     named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, RADIUS_M)
              for radius in settings.radii_m}
-    named |= {f"components = {one}": np.array(observation.components) == one
-              for one in settings.components}
+    named |= {f"components = {component}": np.array(observation.components) == component
+              for component in settings.components}
     named |= {f"z_ranges_m = {low:g}, {high:g}": (z >= low) & (z <= high)
               for low, high in settings.z_ranges_m}
     for name, mask in named.items():
         if not mask.any():
             raise MeasurementError(must_be(
                 "readings", "map", f"such that `inference.held_out.{name}` holds some of them out",
-                "none", "Correct or remove it."))
+                "none", "Correct or remove this key."))
         chosen = chosen | mask
     if chosen.all():
         raise MeasurementError(must_be(

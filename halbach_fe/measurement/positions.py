@@ -1,4 +1,4 @@
-"""Points of a study's positions."""
+"""The points at which a study observes the field."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.study.measurement import (
-    GridPositions,
-    Positions,
-)
+from halbach_fe.study.measurement import GridPositions, Positions
 
 
 def points_from(positions: Positions) -> Floats:
-    """Expand the positions of a study into points (n, 3) in m."""
+    """Return the points (n, 3) in m of a study's positions: a line, a list, a grid or circles."""
     if positions.kind == "line":
         return np.linspace(positions.start_m, positions.end_m, positions.count)
     if positions.kind == "points":
@@ -30,11 +27,14 @@ def points_from(positions: Positions) -> Floats:
 
 
 def grid_axes(positions: GridPositions) -> list[Floats]:
-    """Coordinates of a grid along x, y and z in m."""
+    """Return the coordinates in m of a grid along x, y and z, one array per axis."""
     return [np.linspace(start, end, count) for start, end, count in zip(
         positions.start_m, positions.end_m, positions.count, strict=True)]
 
 
 def on_grid(axes: Sequence[Floats]) -> Floats:
-    """Points (n, 3) of the grid with these coordinates along x, y and z; z changes fastest."""
+    """Return the points (n, 3) of a grid with given coordinates along x, y and z.
+
+    The z coordinate changes fastest.
+    """
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Noise of readings: of the points of a map, by region, and by uncertain positions."""
+"""Noise covariance of readings: the noise stated by map or study, and uncertain positions."""
 
 from __future__ import annotations
 
@@ -16,24 +16,31 @@ from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.vacuum_field import gradient_of
 from halbach_fe.stats.noise import NoiseCovariance
-from halbach_fe.study.measurement import (
-    NoiseSettings,
-)
+from halbach_fe.study.measurement import NoiseSettings
 
 ROUNDING = 1e-12
-"""Correlations below it are none: sums over a circle's points cancel to 1e-15."""
+"""Correlation coefficient below which readings count as independent. Sums over the points of a
+circle that cancel exactly leave rounding errors of 1e-15."""
 
 
 def noise_regions(
     noise: NoiseSettings, z: Floats, components: Sequence[str]
 ) -> NDArray[np.int64]:
-    """Index of the noise region of each reading, at z in m and of a component: the first that
-    fits.
+    """Return for each reading the index of the first noise region of the study that contains it.
+
+    Parameters
+    ----------
+    noise : NoiseSettings
+        The study's noise.
+    z : ndarray, shape (readings,), in m
+    components : sequence of str
+        Component of each reading, x, y or z; empty for a Fourier coefficient, which a region
+        contains whatever its components.
 
     Raises
     ------
     StudyError
-        If some reading is in none.
+        If a reading is in no region.
     """
     region = np.full(len(z), -1)
     for number, window in reversed(list(enumerate(noise.regions))):
@@ -50,12 +57,19 @@ def noise_regions(
 
 
 def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) -> NoiseCovariance:
-    """Noise of the readings: of the map's points where it says, else by region; and in both cases
-    what uncertain positions add.
+    """Return the noise covariance of the readings of a map.
 
-    For Fourier coefficients the noise of points is propagated, with the correlations that it
-    leaves within a circle unless it is the same everywhere; the regions' sigma is that of the
-    coefficients themselves.
+    If the map states the noise of its points (``sigma_T``), it is propagated to the readings;
+    otherwise each reading has the sigma of its noise region in the study. In both cases the effect
+    of uncertain positions is added.
+
+    For Fourier coefficients, noise that differs along a circle leaves the coefficients of this
+    circle correlated. A region's sigma is that of the coefficients, not that of the points.
+
+    Raises
+    ------
+    StudyError
+        If neither map nor study states the noise.
     """
     settings = magnet.study.noise
     if "sigma_T" in data:
@@ -65,23 +79,38 @@ def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) ->
     elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {magnet.name} must say how noisy the readings are, since the "
-            "map does not; instead it is missing. Add [[noise.regions]], or sigma_T to the map.")
+            "map has no sigma_T; instead it is missing. Add [[noise.regions]] to the study, or "
+            "sigma_T to the map.")
     else:
         sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
             settings, observation.positions[:, 2], observation.components)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
-        moved = displacement(magnet, observation, np.array(settings.position_sd_m))
+        moved = readings_per_displacement(magnet, observation, np.array(settings.position_sd_m))
         covariance = covariance + moved @ moved.T
     return NoiseCovariance(_without_rounding(sparse.csr_array(covariance)))
 
 
-def displacement(magnet: Magnet, observation: Observation, sd: Floats) -> sparse.csr_array:
-    """Change of the readings (readings, 3 n) in T when each point is moved by a standard deviation
-    (3,) in m along each axis.
+def readings_per_displacement(
+    magnet: Magnet, observation: Observation, sd: Floats
+) -> sparse.csr_array:
+    """Return the changes of the readings if each of n points is displaced along each axis.
 
-    The gradient is that of the nominal blocks in vacuum. What permeability and iron react with, in
-    the bore some per cent of the field, is left out of this scale of the noise.
+    The field gradient is that of the nominal blocks in vacuum. The reaction field of recoil
+    permeability and iron, some per cent of the field in the bore, is neglected: the result only
+    sets the size of the noise.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    observation : Observation
+    sd : ndarray, shape (3,), in m
+        Displacements along x, y and z, usually standard deviations.
+
+    Returns
+    -------
+    changes : sparse array, shape (readings, 3 n), in T
+        One column for each point and axis.
     """
     points = probe_points(magnet.study.instrument, observation.map_points)
     gradient = gradient_of(magnet.blocks, points) * sd
@@ -91,8 +120,10 @@ def displacement(magnet: Magnet, observation: Observation, sd: Floats) -> sparse
 
 
 def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:
-    """The covariance without correlations below `ROUNDING`: equal noise all around a circle leaves
-    its coefficients independent.
+    """Return the covariance without correlations below `ROUNDING`.
+
+    Equal noise at all points of a circle leaves its Fourier coefficients independent; without
+    rounding errors, their covariance is diagonal.
     """
     entries = covariance.tocoo()
     rows, columns = entries.coords

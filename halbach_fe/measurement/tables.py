@@ -1,4 +1,4 @@
-"""CSV tables, read with one sentence for what is wrong in them."""
+"""CSV tables with attributes in their comments; errors name the file, the line and the cell."""
 
 from __future__ import annotations
 
@@ -16,14 +16,30 @@ from halbach_fe.core.numbers import parse_number as number_in
 def csv_table(
     raw: bytes, where: str
 ) -> tuple[dict[str, str], list[str], Iterator[tuple[int, list[str]]]]:
-    """Split CSV into the attributes of its ``# key: value`` comments, its header and its rows,
-    each with its line number.
+    """Split the content of a CSV file into attributes, header and rows.
+
+    Parameters
+    ----------
+    raw : bytes
+        Content of the file.
+    where : str
+        Name of the file in error messages.
+
+    Returns
+    -------
+    attributes : dict
+        Key and value of each comment ``# key: value``.
+    header : list of str
+        Names of the columns.
+    rows : iterator of (int, list of str)
+        Line number and cells of each row.
 
     Raises
     ------
     MeasurementError
-        If it is no text or has no header; from the iterator, which lets the caller judge the
-        header first, if there are no rows or one has another length than the header.
+        If the content is not UTF-8 text, or has no header. The iterator raises it if there are no
+        rows, or a row has another length than the header; the caller can thus check the header
+        first.
     """
     try:
         text = raw.decode("utf-8-sig")
@@ -52,6 +68,7 @@ def csv_table(
 def _equally_long(
     count: int, rows: list[tuple[int, list[str]]], where: str
 ) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows; raise MeasurementError if there are none, or one has not ``count`` cells."""
     if not rows:
         raise MeasurementError(must_be("content", where, "at least one reading",
                                        "a header alone"))
@@ -63,7 +80,7 @@ def _equally_long(
 
 
 def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> None:
-    """Refuse a header with a column that is not known."""
+    """Raise MeasurementError if the header has an unknown column."""
     for name in header:
         if name not in known:
             raise MeasurementError(must_be("header", where, f"made of {', '.join(known)}",
@@ -72,7 +89,7 @@ def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> No
 
 def write_csv(columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str],
               path: Path) -> None:
-    """Write columns by name, with attributes as comments; NaN is an empty cell."""
+    """Write named columns, with attributes as comments; NaN becomes an empty cell."""
     with path.open("w", encoding="utf-8", newline="") as file:
         for key, value in attributes.items():
             file.write(f"# {_one_line(key)}: {_one_line(value)}\n")
@@ -103,14 +120,20 @@ def _cells(line: str, number: int, where: str) -> list[str]:
 
 
 def _check_printable(names: Iterable[str], what: str, where: str) -> None:
-    """Serial numbers, types and scans go to terminals and into other files."""
+    """Raise MeasurementError for control characters.
+
+    Serial numbers, types and scans are printed in terminals and written to other files.
+    """
     for name in names:
         if not name.isprintable():
             raise MeasurementError(must_be(what, where, "without control characters", f"'{name}'"))
 
 
 def finite(cell: str, what: str, where: str, hint: str = "") -> float:
-    """The number in a cell; MeasurementError if it is none, or not finite."""
+    """Return the number in a cell; raise MeasurementError if the cell holds no finite number.
+
+    ``what`` and ``where`` name the cell and the file in the message; ``hint`` is appended to it.
+    """
     try:
         return number_in(cell)
     except ValueError:

@@ -1,1 +1,1 @@
-"""Pages and figures."""
+"""HTML pages, figures, tables and JSON summaries of results."""

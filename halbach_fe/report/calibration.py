@@ -1,4 +1,4 @@
-"""Rank histograms of a simulation-based calibration."""
+"""The page of a simulation-based calibration, with its rank histograms."""
 
 from __future__ import annotations
 
@@ -17,16 +17,29 @@ def write_calibration(
     ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, object]],
     folder: Path,
 ) -> None:
-    """Write calibration.html and ranks.png: ranks (repeats, parameters) by case, among draws."""
+    """Write calibration.html and ranks.png.
+
+    Parameters
+    ----------
+    ranks : mapping
+        For each kind of posterior, the ranks of the true parameters among the posterior draws,
+        shape (repeats, parameters).
+    draws : int
+        Number of posterior draws per repeat.
+    results : mapping
+        Rows of the page's table by kind of posterior.
+    folder : Path
+    """
     figure = Figure(figsize=(3.6 * len(ranks), 3.2), layout="constrained")
-    for axis, (name, found) in zip(figure.subplots(1, len(ranks), squeeze=False)[0],
+    for axis, (name, case_ranks) in zip(figure.subplots(1, len(ranks), squeeze=False)[0],
                                    ranks.items(), strict=True):
         edges = np.linspace(0, draws + 1, BINS + 1)
-        axis.hist(found.ravel(), edges, density=True, color=POSTERIOR)
+        axis.hist(case_ranks.ravel(), edges, density=True, color=POSTERIOR)
         axis.axhline(1 / (draws + 1), color=PUBLISHED)
-        axis.set(title=name, xlabel="rank of the truth", yticks=[])
+        axis.set(title=name, xlabel="rank of the true value", yticks=[])
         axis.title.set_fontsize(9)
-    pictures = save({"ranks.png": (figure, "Ranks of the truth among draws of the posterior, all "
-                                   "parameters; the line is what a calibrated posterior gives")},
+    pictures = save({"ranks.png": (figure, "Ranks of the true parameters among draws of the "
+                                   "posterior, all parameters together; a calibrated posterior "
+                                   "gives the horizontal line")},
                     folder)
     write_page(folder / "calibration.html", "calibration.html.j2", pictures, results=results)

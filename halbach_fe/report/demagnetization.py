@@ -17,17 +17,21 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
-from halbach_fe.report.view import Colours, Known, magnet_view
+from halbach_fe.report.view import BlockValues, Colours, magnet_view
 
 PAST = "#D55E00"
+"""Colour of the knee and of cells past it."""
+
 SWEEP_K = 40.0
-"""How far the curve of temperatures goes beyond the magnet's, and that of the last of `SHARES`."""
+"""Margin in K by which the temperature axis extends beyond the magnet's temperature and beyond the
+limit temperature of the last of `SHARES`."""
 
 WORST_ROWS = 12
+"""Number of blocks in the page's table."""
 
 
 def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
-    """What a script wants to know of the margin."""
+    """Return the content of demagnetization.json: margins, shares and limit temperatures."""
     material, worst = found.material, int(np.argmin(found.margin))
     block = found.blocks[found.cells.block[worst]]
     temperature = material.temperature_C
@@ -46,7 +50,7 @@ def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
 
 
 def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
-    """Write demagnetization.json, .csv (by block), .vtu (by cell), .html and the figures."""
+    """Write demagnetization.json, .csv (a row per block), .vtu (cells), .html and the figures."""
     summary, rows = demagnetization_summary(found), found.by_block()
     write_text(folder / "demagnetization.json",
                json.dumps(summary, indent=1, allow_nan=False) + "\n")
@@ -56,20 +60,23 @@ def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
         }, temporary)
     write_vtu(found, folder / "demagnetization.vtu")
     pictures = save({
-        "demagnetization_map.png": (_map(found), "H along the magnetization in the blocks; cells "
-                                    "past the knee, if any, are outlined"),
-        "demagnetization_temperature.png": (_temperatures(found), "Share of the magnet's volume "
-                                            "past the knee, by temperature"),
-        "demagnetization_blocks.png": (_slots(found), "H along the magnetization by slot: the mean "
-                                       "of the blocks, and the least in any cell of them"),
+        "demagnetization_map.png": (
+            _map_figure(found), "H along the magnetization in the blocks; cells past the knee, if "
+            "any, are outlined"),
+        "demagnetization_temperature.png": (
+            _temperature_figure(found), "Share of the magnet's volume past the knee against the "
+            "temperature"),
+        "demagnetization_blocks.png": (
+            _slots_figure(found), "H along the magnetization by slot: mean of each block, and "
+            "smallest value in any of its cells"),
     }, folder)
     write_page(folder / "demagnetization.html", "demagnetization.html.j2", pictures,
                study=found.study, summary=summary, material=found.material,
-               rows=worst_blocks(rows), blocks=len(rows), view=_view(found, rows))
+               rows=worst_block_table(rows), blocks=len(rows), view=_view(found, rows))
 
 
-def worst_blocks(rows: list[dict[str, float | int]]) -> list[dict[str, str]]:
-    """The blocks with the least margin, as text."""
+def worst_block_table(rows: list[dict[str, float | int]]) -> list[dict[str, str]]:
+    """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
     return [{"ring": str(row["ring"]), "slot": str(row["slot"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
@@ -80,17 +87,22 @@ def worst_blocks(rows: list[dict[str, float | int]]) -> list[dict[str, str]]:
 
 
 def _layers(found: DemagnetizationMap) -> dict[str, Ints]:
-    """Cells to draw, by what they are: nearest to the middle, and the layer of the least margin."""
+    """Return the numbers of the cells to draw, by title of the panel.
+
+    The panels show the layer of cells nearest to z = 0 and the layer with the smallest margin;
+    a single panel if these are the same, or mirror images.
+    """
     z = found.cells.middles[:, 2].round(9)
     middle = z[np.argmin(np.abs(z))]
     worst = z[np.argmin(found.margin)]
     if np.isclose(abs(worst), abs(middle)):
         return {f"z = {1e3 * worst:.0f} mm" if np.ptp(z) else "": np.flatnonzero(z == worst)}
-    return {f"z = {1e3 * one:.0f} mm{words}": np.flatnonzero(z == one)
-            for one, words in ((middle, ""), (worst, ", least margin"))}
+    return {f"z = {1e3 * height:.0f} mm{words}": np.flatnonzero(z == height)
+            for height, words in ((middle, ""), (worst, ", smallest margin"))}
 
 
-def _map(found: DemagnetizationMap) -> Figure:
+def _map_figure(found: DemagnetizationMap) -> Figure:
+    """Draw H along the magnetization in layers of cells."""
     layers = _layers(found)
     figure = Figure(figsize=(5.2 * len(layers) + 1, 5), layout="constrained")
     limits = 1e-3 * float(found.along.min()), 1e-3 * float(found.along.max())
@@ -112,7 +124,8 @@ def _map(found: DemagnetizationMap) -> Figure:
     return figure
 
 
-def _temperatures(found: DemagnetizationMap) -> Figure:
+def _temperature_figure(found: DemagnetizationMap) -> Figure:
+    """Draw the share of the volume past the knee against the temperature."""
     material = found.material
     figure = Figure(figsize=(8, 3.4), layout="constrained")
     axis = figure.subplots()
@@ -122,38 +135,40 @@ def _temperatures(found: DemagnetizationMap) -> Figure:
                               hottest + SWEEP_K, 241)
     axis.plot(temperature, 100 * found.share_beyond(temperature), color=POSTERIOR)
     axis.axvline(material.temperature_C, color=PRIOR, ls="--",
-                 label=f"the magnet's, {material.temperature_C:g} °C")
-    axis.set(xlabel="temperature in °C", ylabel="past the knee, % of volume", ylim=(0, None))
+                 label=f"temperature of the magnet, {material.temperature_C:g} °C")
+    axis.set(xlabel="temperature in °C", ylabel="volume past the knee in %", ylim=(0, None))
     axis.legend()
     axis.grid(alpha=0.3)
     return figure
 
 
-def _slots(found: DemagnetizationMap) -> Figure:
+def _slots_figure(found: DemagnetizationMap) -> Figure:
+    """Draw the mean and the smallest H of every block by slot."""
     rows = found.by_block()
     figure = Figure(figsize=(8, 3.4), layout="constrained")
     axis = figure.subplots()
     slots = np.array([row["slot"] for row in rows])
     for key, words, colour, shift in (("mean_H_A_per_m", "mean", POSTERIOR, -0.15),
-                                      ("least_H_A_per_m", "least", MEASURED, 0.15)):
+                                      ("least_H_A_per_m", "smallest", MEASURED, 0.15)):
         values = 1e-3 * np.array([row[key] for row in rows])
         axis.plot(slots + shift, values, "o", ms=4, color=colour, label=words, alpha=0.7)
     axis.axhline(-1e-3 * float(knee(found.material, found.material.temperature_C)), color=PAST,
                  label="knee")
     axis.axhline(0, color=PUBLISHED, lw=0.8)
-    axis.set(xlabel="slot", ylabel="H in kA/m")
+    axis.set(xlabel="slot", ylabel="H along the\nmagnetization in kA/m")
     axis.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1))
     axis.grid(alpha=0.3)
     return figure
 
 
 def _view(found: DemagnetizationMap, rows: list[dict[str, float | int]]) -> Markup:
+    """Return the view of the magnet with blocks coloured by their smallest margin."""
     size, count = found.study.dimension, len(found.blocks)
     magnetization: Floats = np.array([block.magnetization[:size] for block in found.blocks])
     margin, words = np.zeros(count), ["not magnetized"] * count
     for number, row in zip(np.unique(found.cells.block), rows, strict=True):
         margin[number] = 1e-3 * row["margin_A_per_m"]
-        words[number] = f"least margin {margin[number]:+.0f} kA/m"
-    return magnet_view(found.magnet, Known(magnetization, Colours(
-        margin, "least margin<br>to the knee in kA/m", words,
+        words[number] = f"smallest margin {margin[number]:+.0f} kA/m"
+    return magnet_view(found.magnet, BlockValues(magnetization, Colours(
+        margin, "smallest margin<br>to the knee in kA/m", words,
         (min(0.0, float(margin.min())), max(0.0, float(margin.max()))))))

@@ -1,21 +1,26 @@
-"""Words, tables and the HTML page of a diagnosis."""
+"""Sentences, tables and the HTML page of a diagnosis."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from halbach_fe.diagnosis.discriminating_measurements import ENOUGH, Separation
+from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.loo_residuals import DISCOVERIES, ResidualGroup
-from halbach_fe.diagnosis.model_selection import ALIKE, EFFECT_ODDS, FOUND, MOST
+from halbach_fe.diagnosis.model_selection import (
+    DETECTION_LOG_ODDS,
+    EFFECT_PRIOR_ODDS,
+    INDISTINGUISHABLE_LOG_EVIDENCE,
+    MAX_EFFECTS,
+)
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
-    NOTHING,
+    EMPTY_CELL,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
-    others,
+    other_findings,
     place_in_words,
     region_scores,
     rivals,
@@ -24,123 +29,149 @@ from halbach_fe.inference.result import ALL_READINGS
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.page import save, write_page
-from halbach_fe.report.view import of_update
+from halbach_fe.report.view import view_of_inference
 
-UNUSUAL = 20.0
-"""Prior standard deviations: what nobody would expect of a magnet that was built with care."""
+UNUSUAL_AMPLITUDE = 20.0
+"""Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
+magnet that is built with care."""
 
 FIGURES = {
-    "groups": (figures.groups, "Chi² per reading of groups of readings, each foretold by all "
-               "others; filled where chance is no explanation"),
-    "residuals": (figures.residuals, "Standardized difference of each training reading from what "
-                  "all others foretell"),
-    "probabilities": (figures.probabilities, "Posterior probability of each effect of the "
-                      "catalogue if at most one is missing, and nothing else; log Bayes factors of "
-                      "what was found and of what would do as well, dashed: what an effect needs"),
-    "profile": (figures.profile, "The readings that fitted worst, with the updated model's "
-                "predictions, and what is left; the band holds 95 % of it by prediction and noise"),
+    "groups": (figures.groups, "Chi² per reading of groups of readings, each group predicted from "
+               "all other readings; markers are filled if the group disagrees with the model"),
+    "residuals": (figures.residuals, "Standardized leave-one-out residuals of the training "
+                  "readings"),
+    "probabilities": (figures.probabilities, "Left: posterior probability of each effect of the "
+                      "catalogue, if at most one effect is missing and nothing else. Right: log "
+                      "Bayes factors of the identified effects and of their alternatives; the "
+                      "dashed line is the threshold"),
+    "profile": (figures.profile, "The readings with the largest residuals before the diagnosis, "
+                "the predictions of the updated models, and their residuals; the band holds 95 % "
+                "of the residuals by the uncertainty of prediction and noise"),
     "magnetizations": (figures.magnetizations, "Inferred change of the magnetizations from the "
                        "prior by ring and slot, along and across the easy axis and along the "
                        "magnet")}
+"""Function that draws each figure of the page, and its caption."""
+
 UNKNOWN_ADVICE = {
-    "field": "Look for a source outside the bore, nearest to where the unexplained field is "
-             "largest; readings beyond the map's end there would show more of it.",
-    "instrument": "The same map with the probe turned by 180° shows which sensor it is: its errors "
-                  "turn with it.",
-    "either": "The same map with the probe turned by 180° tells a field from the sensors: their "
-              "errors turn with them."}
+    "field": "Look for a source outside the bore, near the point at which the unexplained field is "
+             "largest. Readings beyond the end of the map at that point would show more of the "
+             "field.",
+    "instrument": "The same map with the probe turned by 180° shows which sensor is in error: the "
+                  "error turns with the sensor.",
+    "either": "The same map with the probe turned by 180° tells a field from the sensors: errors "
+              "of the sensors turn with the probe."}
+"""Advice on the next measurement by the kind of an unknown cause."""
+
 UNKNOWN_KINDS = {
-    "field": "a smooth field, as of a source that no effect of the catalogue is",
-    "instrument": "a smooth error of the sensors that no field could be",
-    "either": "something smooth, a field or an error of the sensors"}
+    "field": "a smooth field from a source that is not in the catalogue",
+    "instrument": "a smooth error of the sensors, which no field could be",
+    "either": "a smooth field or a smooth error of the sensors"}
+"""Description of an unknown cause by its kind."""
 
 
 def verdict(diagnosis: Diagnosis) -> list[str]:
-    """What was found, in sentences."""
+    """Describe the result of a diagnosis in sentences."""
     titles = _catalogue_titles(diagnosis)
     before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
-    said = [one.sentence for one in others(diagnosis)]
-    if diagnosis.numerical:
-        return said
-    if diagnosis.named:
-        fits = diagnosis.at_rest and after.prior_conflict <= after.conflict_limit
-        start = "The map is explained by" if fits else "The catalogue comes nearest with"
-        said.append(f"{start}: " + "; ".join(
-            _named(one, titles) for one in diagnosis.named) + ".")
-        said += [f"It does not tell {_title(one.hypothesis.effect.name, titles)} from "
-                 f"{_either(_titles(one, titles))}." for one in diagnosis.named if rivals(one)]
-        unusual = [f"{_title(one.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
-                   for one in diagnosis.named if (ratio := _over_usual(one)) > UNUSUAL]
+    sentences = [finding.sentence for finding in other_findings(diagnosis)]
+    if diagnosis.solver_error:
+        return sentences
+    if diagnosis.identified:
+        fits = diagnosis.converged and after.prior_conflict <= after.conflict_limit
+        start = "The map is explained by" if fits else (
+            "The best explanation from the catalogue, which leaves a misfit, is")
+        sentences.append(f"{start}: " + "; ".join(
+            _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
+        sentences += [
+            f"The map does not tell {_title(effect.hypothesis.effect.name, titles)} from "
+            f"{_joined_by_or(_titles(effect, titles))}."
+            for effect in diagnosis.identified if rivals(effect)]
+        unusual = [f"{_title(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
+                   for effect in diagnosis.identified
+                   if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
         if unusual:
-            said.append("Far larger than is usual (the prior's standard deviation): "
-                        f"{', '.join(unusual)}. Unless another measurement confirms it, take that "
-                        "for a sign of something else.")
-        if not diagnosis.at_rest:
-            said.append(f"After {diagnosis.rounds} rounds the search had not come to rest: what "
-                        "is missing, or how much of it, still changed.")
-        if len(diagnosis.named) == MOST:
-            said.append(f"These are {MOST} effects, as many as are looked for: so many at once are "
-                        "a fit rather than a diagnosis, and some stand for something else.")
+            sentences.append(
+                "Far larger than usual (relative to the prior's standard deviation): "
+                f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
+                "suspect another cause.")
+        if not diagnosis.converged:
+            sentences.append(
+                f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
+                "their amplitudes still changed.")
+        if len(diagnosis.identified) == MAX_EFFECTS:
+            sentences.append(
+                f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
+                "many effects together are a fit rather than a diagnosis, and some of them take "
+                "the place of another cause.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
-        start = "Nothing else is missing: then" if said else "Nothing is missing:"
-        return [*said, f"{start} the map agrees with the study within noise (chi² per reading "
+        start = "Nothing else is missing: with that," if sentences else "Nothing is missing:"
+        return [*sentences, f"{start} the map agrees with the study within noise (chi² per reading "
                 f"{after.prior_conflict:.3g})."]
     if unknown is not None:
-        x, y, z = (f"{1e3 * one:.0f}" for one in unknown.at_m)
-        start = ("As well it could be one thing outside the catalogue in place of all of them"
-                 if unknown.as_well else "Something outside the catalogue "
-                 + ("remains" if diagnosis.named else "is missing"))
-        said.append(
+        x, y, z = (f"{1e3 * component:.0f}" for component in unknown.at_m)
+        start = ("A single cause outside the catalogue could equally well take the place of all of "
+                 "them" if unknown.ambiguous else "Something outside the catalogue "
+                 + ("remains" if diagnosis.identified else "is missing"))
+        sentences.append(
             f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
             f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
             f"{unknown.log_bayes_factor:.0f}).")
         if unknown.source_m is not None:
-            x, y, z = (f"{1e3 * one:.0f}" for one in unknown.source_m)
-            said.append(f"If it is a small magnetized object, then near ({x}, {y}, {z}) mm.")
-    elif not diagnosis.named:
-        return [*said, f"The map disagrees with the study (chi² per reading "
+            x, y, z = (f"{1e3 * component:.0f}" for component in unknown.source_m)
+            sentences.append("If the source is a small magnetized object, it is near "
+                             f"({x}, {y}, {z}) mm.")
+    elif not diagnosis.identified:
+        return [*sentences, f"The map disagrees with the study (chi² per reading "
                 f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
-                "no effect of the catalogue explains it, nor anything smooth: look at the noise."]
-    if diagnosis.named:
-        held = ["".join(f", of held-out ones {one.chi2_per_reading:.3g}" for one in found[1:2])
-                for found in (region_scores(before, diagnosis.left_out_before),
-                              region_scores(after, diagnosis.left_out_after))]
-        said.append(f"With {'it' if len(diagnosis.named) == 1 else 'them'} in the model, chi² per "
-                    f"reading is {after.prior_conflict:.3g}{held[1]} (before: "
-                    f"{before.prior_conflict:.3g}{held[0]}).")
+                "no effect of the catalogue explains the difference, nor does a smooth field or "
+                "sensor error. Check the noise of the study."]
+    if diagnosis.identified:
+        held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
+                        for fit in fits[1:2])
+                for fits in (region_scores(before, diagnosis.loo_residuals_before),
+                              region_scores(after, diagnosis.loo_residuals_after))]
+        added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
+        sentences.append(
+            f"With {added} in the model, chi² per training reading is "
+            f"{after.prior_conflict:.3g}{held[1]} (before: {before.prior_conflict:.3g}{held[0]}).")
         if after.prior_conflict > after.conflict_limit and unknown is None:
-            said.append("That is still too much: they are not all that is wrong.")
-    return said
+            sentences.append("That is still too large: another cause is missing.")
+    return sentences
 
 
-def _over_usual(named: IdentifiedEffect) -> float:
-    """The largest amplitude over its prior standard deviation; of what is there or not, none."""
-    first = int(named.hypothesis.effect.certain or named.hypothesis.effect.discrete)
+def _over_prior_sd(identified: IdentifiedEffect) -> float:
+    """Return the largest ratio of an amplitude to its prior standard deviation.
+
+    Amplitudes that only say whether an effect is present are ignored.
+    """
+    effect = identified.hypothesis.effect
+    first = int(effect.is_binary or effect.applied_in_full)
     return max((abs(value) / parameter.sd for value, parameter in zip(
-        named.values[first:], named.parameters[first:], strict=True)), default=0.0)
+        identified.values[first:], identified.parameters[first:], strict=True)), default=0.0)
 
 
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Rows of what a study lacks, as text."""
-    found = [{"effect": one.name, "place": one.place, "amplitude": one.amount,
-              "log Bayes factor": one.factor, "it could be": one.instead}
-             for one in others(diagnosis)]
+    """Return the rows of a table of all findings, as text."""
+    found = [{"effect": finding.name, "place": finding.place, "amplitude": finding.amount,
+              "log Bayes factor": finding.factor, "it could be": finding.instead}
+             for finding in other_findings(diagnosis)]
     return found + [
-        {"effect": one.found.candidate.effect, "place": place_in_words(one.hypothesis.place),
-         "amplitude": "; ".join(amounts(one)),
-         "log Bayes factor": f"{one.found.log_bayes_factor:.1f}",
-         "it could be": ", ".join(candidate.effect for candidate, _ in rivals(one)) or NOTHING}
-        for one in diagnosis.named]
+        {"effect": effect.selection.candidate.effect,
+         "place": place_in_words(effect.hypothesis.place),
+         "amplitude": "; ".join(amounts(effect)),
+         "log Bayes factor": f"{effect.selection.log_bayes_factor:.1f}",
+         "it could be": ", ".join(rival.effect for rival, _ in rivals(effect)) or EMPTY_CELL}
+        for effect in diagnosis.identified]
 
 
 def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Rows of scores before and after, as text."""
-    found = [region_scores(one.update, one.left_out) for one in states(diagnosis)]
+    """Return the rows of a table of the model's fit before and after the diagnosis, as text."""
+    found = [region_scores(state.update, state.loo_residuals) for state in states(diagnosis)]
     rows = []
-    for number, one in enumerate(found[0]):
-        region = "" if one.region == ALL_READINGS else f", {one.region}"
-        rows.append({"readings": f"{one.part}{region}", "count": str(one.readings)} | {
-            name: " → ".join(text(getattr(state[number], key)) for state in found)
+    for number, fit in enumerate(found[0]):
+        region = "" if fit.region == ALL_READINGS else f", {fit.region}"
+        rows.append({"readings": f"{fit.part}{region}", "count": str(fit.readings)} | {
+            name: " → ".join(text(getattr(fits[number], key)) for fits in found)
             for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
                                     ("median error", "median_relative_error", _percent),
                                     ("95 % band holds", "coverage95", _fraction))})
@@ -151,118 +182,140 @@ def write_diagnosis_report(
     diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path,
     assumptions: Sequence[str] = (),
 ) -> None:
-    """Write diagnosis.html, self-contained, and its figures as PNG into ``folder``.
+    """Write the self-contained page diagnosis.html, and its figures as PNG, into ``folder``.
 
-    ``assumptions`` are sentences that the reader must know before the result.
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    separations : sequence of Separation
+        Further measurements, see `halbach_fe.diagnosis.discriminating_measurements.separations`.
+    folder : Path
+    assumptions : sequence of str
+        Sentences that the page shows before the result.
     """
     drawn = {name: (draw(diagnosis), text) for name, (draw, text) in FIGURES.items()}
-    pictures = save({f"diagnosis_{name}.png": one for name, one in drawn.items()}, folder)
+    pictures = save({f"diagnosis_{name}.png": each for name, each in drawn.items()}, folder)
     titles = _catalogue_titles(diagnosis)
     write_page(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, verdict=verdict(diagnosis), assumptions=assumptions,
-        shown=dict(zip(drawn, pictures, strict=True)), view=of_update(diagnosis.after),
-        found=[{"what": one.title, "where": one.place, "how much": one.amount,
-                "log Bayes factor": one.factor, "kind": one.kind} for one in others(diagnosis)]
-        + [_entry(one, titles) for one in diagnosis.named],
+        shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(diagnosis.after),
+        found=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
+                "log Bayes factor": finding.factor, "kind": finding.kind}
+               for finding in other_findings(diagnosis)]
+        + [_entry(effect, titles) for effect in diagnosis.identified],
         changes=change_table(diagnosis), disagreeing="; ".join(
-            f"{one.when}: {_disagreeing(one.groups)}" for one in states(diagnosis)),
-        states=[one.when for one in states(diagnosis)],
-        classes=[f"The map would be the same with {_either(texts)}." for error in diagnosis.gross
-                 if (texts := [one.text for one in error.alternatives])]
-        + [_class(one, titles) for one in diagnosis.named if rivals(one)],
+            f"{state.when}: {_disagreement_summary(state.groups)}" for state in states(diagnosis)),
+        states=[state.when for state in states(diagnosis)],
+        classes=[f"The map would be the same with {_joined_by_or(texts)}."
+                 for error in diagnosis.gross_errors
+                 if (texts := [alternative.text for alternative in error.alternatives])]
+        + [_equivalence_sentence(effect, titles)
+           for effect in diagnosis.identified if rivals(effect)],
         structure=figures.structure(diagnosis),
-        further=[_next(one, own, titles) for one in diagnosis.named
-                 if (own := [two for two in separations if two.named == one.hypothesis])],
-        ground={"found": FOUND, "alike": ALIKE, "odds": round(1 / EFFECT_ODDS), "enough": ENOUGH,
+        further=[_further_measurements(effect, own, titles) for effect in diagnosis.identified
+                 if (own := [pair for pair in separations
+                             if pair.identified == effect.hypothesis])],
+        ground={"found": DETECTION_LOG_ODDS, "alike": INDISTINGUISHABLE_LOG_EVIDENCE,
+                "odds": round(1 / EFFECT_PRIOR_ODDS), "enough": SEPARATING_GAIN,
                 "discoveries": DISCOVERIES},
         advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else
-        "None of the measurements that are known here would tell them apart." if any(
-            rivals(one) for one in diagnosis.named) else "",
+        "None of the candidate measurements would distinguish the effects from their alternatives."
+        if any(rivals(effect) for effect in diagnosis.identified) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
-def _named(one: IdentifiedEffect, titles: dict[str, str]) -> str:
-    """An effect in words, with its place and amplitude."""
-    effect = one.hypothesis.effect
-    parts = [_title(effect.name, titles), place_in_words(one.hypothesis.place),
-             "" if effect.certain else "; ".join(amounts(one))]
+def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
+    """Describe an effect with its place and amplitudes."""
+    effect = identified.hypothesis.effect
+    parts = [_title(effect.name, titles), place_in_words(identified.hypothesis.place),
+             "" if effect.is_binary else "; ".join(amounts(identified))]
     return ", ".join(part for part in parts if part)
 
 
 def _catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
-    """Effects in words."""
+    """Return the descriptions of all effects by name."""
     return {effect.name: effect.title for effect in (
-        *catalogue(), *(one.hypothesis.effect for one in diagnosis.named))}
+        *catalogue(), *(identified.hypothesis.effect for identified in diagnosis.identified))}
 
 
-def _titles(named: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
-    """Rivals of an effect in words."""
-    return [_title(candidate.effect, titles) for candidate, _ in rivals(named)]
+def _titles(identified: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
+    """Return the descriptions of an effect's rivals."""
+    return [_title(candidate.effect, titles) for candidate, _ in rivals(identified)]
 
 
 def _title(name: str, titles: dict[str, str]) -> str:
-    """An effect in words, with its name if others have the same words."""
+    """Return the description of an effect, with its name if other effects have the same
+    description.
+    """
     title = titles.get(name, name)
     return f"{title} ({name})" if list(titles.values()).count(title) > 1 else title
 
 
-def _disagreeing(found: Sequence[ResidualGroup]) -> str:
-    """How many groups of readings disagree, and which most."""
-    wrong = [one for one in found if one.disagrees]
+def _disagreement_summary(found: Sequence[ResidualGroup]) -> str:
+    """Describe how many groups of readings disagree with the model, and which disagrees most."""
+    wrong = [group for group in found if group.disagrees]
     if not wrong:
         return f"none of {len(found)}"
-    worst = max(wrong, key=lambda one: one.chi2_per_reading)
+    worst = max(wrong, key=lambda group: group.chi2_per_reading)
     return (f"{len(wrong)} of {len(found)}, most of all {worst.name} "
             f"({worst.chi2_per_reading:.2g})")
 
 
-def _class(one: IdentifiedEffect, titles: dict[str, str]) -> str:
-    """What cannot be told apart, in words."""
+def _equivalence_sentence(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
+    """Name the effects that the readings cannot distinguish from an identified effect."""
     found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
-             for title, (candidate, factor) in zip(_titles(one, titles), rivals(one), strict=True)]
-    return (f"What is called {_title(one.hypothesis.effect.name, titles)} here (log Bayes factor "
-            f"{one.found.log_bayes_factor:.1f}) could as well be: {'; '.join(found)}.")
+             for title, (candidate, factor) in zip(
+                 _titles(identified, titles), rivals(identified), strict=True)]
+    name = _title(identified.hypothesis.effect.name, titles)
+    return (f"Instead of {name} (log Bayes factor {identified.selection.log_bayes_factor:.1f}), "
+            f"the cause may equally well be: {'; '.join(found)}.")
 
 
-def _entry(one: IdentifiedEffect, titles: dict[str, str]) -> dict[str, str]:
-    """Row of the page's table of effects."""
-    effect = one.hypothesis.effect
-    return {"what": _title(effect.name, titles),
-            "where": place_in_words(one.hypothesis.place) or NOTHING,
-            "how much": "; ".join(text.replace(" ", "\u00a0") for text in amounts(one)),
-            "log Bayes factor": f"{one.found.log_bayes_factor:.1f}", "kind": effect.kind}
+def _entry(identified: IdentifiedEffect, titles: dict[str, str]) -> dict[str, str]:
+    """Return the row of an effect in the page's table of findings."""
+    effect = identified.hypothesis.effect
+    return {"finding": _title(effect.name, titles),
+            "place": place_in_words(identified.hypothesis.place) or EMPTY_CELL,
+            "amplitude": "; ".join(text.replace(" ", "\u00a0") for text in amounts(identified)),
+            "log Bayes factor": f"{identified.selection.log_bayes_factor:.1f}",
+            "kind": effect.kind}
 
 
-def _either(parts: Sequence[str]) -> str:
+def _joined_by_or(parts: Sequence[str]) -> str:
+    """Join phrases by commas and a final "or"."""
     return " or ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
-def _next(
-    named: IdentifiedEffect, own: Sequence[Separation], titles: dict[str, str],
+def _further_measurements(
+    identified: IdentifiedEffect, own: Sequence[Separation], titles: dict[str, str],
 ) -> dict[str, object]:
-    """What would separate an effect from its rivals, in words and numbers."""
-    choices = {choice.name: choice.title for one in own for choice in one.options}
+    """Return what the page shows on measurements that distinguish an effect from its rivals."""
+    candidates = {candidate.name: candidate.title for pair in own for candidate in pair.candidates}
     return {
-        "what": _title(named.hypothesis.effect.name, titles),
-        "advice": [(_title(one.rival.effect.name, titles),
-                    one.recommended.title if one.recommended else "") for one in own],
+        "what": _title(identified.hypothesis.effect.name, titles),
+        "advice": [(_title(pair.rival.effect.name, titles),
+                    pair.recommended.title if pair.recommended else "") for pair in own],
         "rows": [{"measurement": title} | {
-            f"against {one.rival.effect.name}": _gain(one.gains[name]) for one in own}
-            for name, title in choices.items()]}
+            f"against {pair.rival.effect.name}": _gain(pair.gains[name]) for pair in own}
+            for name, title in candidates.items()]}
 
 
 def _gain(value: float) -> str:
+    """Format a gain in the log Bayes factor."""
     return f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
 
 
 def _percent(value: float | None) -> str:
-    return NOTHING if value is None else f"{100 * value:.2g}\u00a0%"
+    """Format a fraction in percent, with two digits."""
+    return EMPTY_CELL if value is None else f"{100 * value:.2g}\u00a0%"
 
 
 def _fraction(value: float) -> str:
+    """Format a fraction in percent, with one decimal."""
     return f"{100 * value:.1f}\u00a0%"
 
 
 def _figure(value: float) -> str:
+    """Format a number with three digits."""
     return f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis, before and after."""
+"""Figures of a diagnosis, for the model before and after it."""
 
 from __future__ import annotations
 
@@ -15,46 +15,60 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
-from halbach_fe.diagnosis.model_selection import FOUND
+from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
-from halbach_fe.report.prediction import places
+from halbach_fe.report.prediction import axis_of_readings
 
-MOST_BARS = 8
+MAX_BARS = 8
+"""Largest number of bars of a chart, and of rows of residuals."""
 RESIDUAL_LIMIT = 5.0
-"""Standard deviations at the end of the colour scale."""
+"""Standardized residual at the end of the colour scale."""
 
 GROUP_TITLES = {"z": "along z", "angle": "by angle", "radius": "by radius", "label": "by reading"}
+"""Titles of the kinds of groups of readings."""
 
 
 @dataclass(frozen=True)
 class State:
-    """A model in a report: the study as it was, or with what was missing."""
+    """A model in a report: the study before the diagnosis, or with the findings.
+
+    Attributes
+    ----------
+    when : str
+        Label of the state.
+    update : InferenceResult
+    groups : sequence of ResidualGroup
+    loo_residuals : ndarray, shape (n,)
+        Standardized leave-one-out residuals of the training readings.
+    colour, marker : str
+        Of the state in figures.
+    """
 
     when: str
     update: InferenceResult
     groups: Sequence[ResidualGroup]
-    left_out: Floats
+    loo_residuals: Floats
     colour: str
     marker: str
 
 
 def states(diagnosis: Diagnosis) -> list[State]:
-    """Before and after; one state if nothing was added."""
-    before = State("before", diagnosis.before, diagnosis.groups_before, diagnosis.left_out_before,
-                   PRIOR, "o")
-    after = State("after", diagnosis.after, diagnosis.groups_after, diagnosis.left_out_after,
-                  POSTERIOR, "s")
+    """Return the states before and after a diagnosis; one state if the diagnosis added nothing."""
+    before = State("before", diagnosis.before, diagnosis.groups_before,
+                   diagnosis.loo_residuals_before, PRIOR, "o")
+    after = State("after", diagnosis.after, diagnosis.groups_after,
+                  diagnosis.loo_residuals_after, POSTERIOR, "s")
     if diagnosis.study == diagnosis.before.study:
-        return [replace(after, when="the study as it is")]
+        return [replace(after, when="the study without changes")]
     return [before, after]
 
 
 def groups(diagnosis: Diagnosis) -> Figure:
-    """Chi-squared of groups of readings; the kind with most of them on the left."""
-    kinds = [one.kind for one in diagnosis.groups_before]
+    """Draw chi-squared of groups of readings, with the kind that has most groups on the left."""
+    kinds = [group.kind for group in diagnosis.groups_before]
     sizes = {kind: kinds.count(kind) for kind in kinds}
     if not sizes:
         return _empty("too few readings to group them")
@@ -67,17 +81,17 @@ def groups(diagnosis: Diagnosis) -> Figure:
         axes += right[0].subplots(len(others), 1, sharex=True, squeeze=False, gridspec_kw={
             "height_ratios": [sizes[kind] + 0.5 for kind in others]})[:, 0].tolist()
     shown = states(diagnosis)
-    everything = [one.chi2_per_reading for state in shown for one in state.groups]
+    everything = [group.chi2_per_reading for state in shown for group in state.groups]
     limits = max(0.1, 0.9 * min(0.9, *everything)), 1.1 * max(1.1, *everything)
     for axis, kind in zip(axes, [first, *others], strict=True):
-        names = [one.name for one in diagnosis.groups_before if one.kind == kind]
+        names = [group.name for group in diagnosis.groups_before if group.kind == kind]
         axis.axvline(1.0, color=PUBLISHED, lw=0.8)
         for state in shown:
-            for one in state.groups:
-                if one.kind == kind and one.name in names:
-                    axis.plot(max(one.chi2_per_reading, limits[0]), names.index(one.name),
+            for group in state.groups:
+                if group.kind == kind and group.name in names:
+                    axis.plot(max(group.chi2_per_reading, limits[0]), names.index(group.name),
                               state.marker, ms=6, color=state.colour, clip_on=False,
-                              mfc=state.colour if one.disagrees else "white")
+                              mfc=state.colour if group.disagrees else "white")
             axis.plot([], [], state.marker, color=state.colour, label=state.when)
         axis.set_yticks(range(len(names)), names, fontsize="small")
         axis.set_ylim(len(names) - 0.4, -0.6)
@@ -97,14 +111,14 @@ def groups(diagnosis: Diagnosis) -> Figure:
 
 
 def residuals(diagnosis: Diagnosis) -> Figure:
-    """Standardized residuals, in a row for each component (or kind of coefficient) and radius."""
+    """Draw standardized residuals, one row for each component (or coefficient) and radius."""
     observation = diagnosis.before.observation
     chosen = ~diagnosis.before.held_out
     labels = np.array(["".join(c for c in label if not c.isdigit())
                        for label in observation.labels])[chosen]
     radius = np.round(observation.radii[chosen], 5)
     rows = [(label, r) for label in dict.fromkeys(labels.tolist()) for r in np.unique(radius)]
-    apart = len(rows) <= MOST_BARS
+    apart = len(rows) <= MAX_BARS
     if not apart:
         rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
     shown = states(diagnosis)
@@ -115,7 +129,7 @@ def residuals(diagnosis: Diagnosis) -> Figure:
         mine = np.flatnonzero((labels == label) & ((radius == r) | (not apart)))
         for axis, state in zip(row, shown, strict=True):
             coloured |= _residual_map(axis, diagnosis.before, np.flatnonzero(chosen)[mine],
-                                      state.left_out[mine])
+                                      state.loo_residuals[mine])
         row[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
                           + "\n" + row[0].get_ylabel())
         for axis in row[1:]:
@@ -131,10 +145,16 @@ def residuals(diagnosis: Diagnosis) -> Figure:
 
 
 def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: Floats) -> bool:
-    """Residuals over z and angle, or along a line or circle where there is no more; tells which."""
+    """Draw residuals over z and angle, or over one of them if the readings are on a line or circle.
+
+    Returns
+    -------
+    bool
+        Whether the residuals are shown by colour.
+    """
     x, y, z = update.observation.positions[readings].T
-    numbers = ["".join(c for c in update.observation.labels[one] if c.isdigit())
-               for one in readings]
+    numbers = ["".join(c for c in update.observation.labels[reading] if c.isdigit())
+               for reading in readings]
     up = np.degrees(np.arctan2(y, x)) % 360
     name = "angle in °"
     if all(numbers):
@@ -151,7 +171,7 @@ def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: F
     limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
     if len(columns) * len(rows) <= 4 * len(values) and len(columns) > 1:
         grid = np.full((len(rows), len(columns)), np.nan)
-        order = np.argsort(np.abs(values))  # the largest of a cell shows
+        order = np.argsort(np.abs(values))  # the largest residual of a cell is drawn last
         grid[row[order], column[order]] = values[order]
         axis.pcolormesh(columns, rows, grid, shading="nearest", rasterized=True, **limits)
     else:
@@ -166,19 +186,20 @@ def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: F
 
 
 def _colours(limit: float) -> ScalarMappable:
+    """Return the colour scale of values between -``limit`` and ``limit``."""
     return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
 
 
 def probabilities(diagnosis: Diagnosis) -> Figure:
-    """Probability of each effect; Bayes factors of what was found and of its rivals."""
-    top = sorted(diagnosis.probabilities.items(), key=lambda one: -one[1])[:MOST_BARS]
+    """Draw the probabilities of effects, and Bayes factors of identified effects and rivals."""
+    top = sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])[:MAX_BARS]
     bars = []
-    for one in diagnosis.named:
-        bars.append((one.found.candidate.name, one.found.log_bayes_factor, POSTERIOR))
-        bars += [(f"or {candidate.name}", factor, PUBLISHED) for candidate, factor in rivals(one)]
+    for effect in diagnosis.identified:
+        bars.append((effect.selection.candidate.name, effect.selection.log_bayes_factor, POSTERIOR))
+        bars += [(f"or {rival.name}", factor, PUBLISHED) for rival, factor in rivals(effect)]
     if diagnosis.unknown is not None:
         bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
-    bars = bars[:2 * MOST_BARS]
+    bars = bars[:2 * MAX_BARS]
     figure = Figure(figsize=(9, 1.4 + 0.3 * max(len(top), len(bars))), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
@@ -187,17 +208,17 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
         left.text(100 * value + 1, height, said, va="center", fontsize="small")
     left.set_xlim(0, 130)
     left.set_xticks(range(0, 101, 20))
-    left.set_xlabel("probability in %, if at most one is missing")
+    left.set_xlabel("probability in %, if at most one effect is missing")
     if bars:
         right.barh(range(len(bars)), [value for _, value, _ in bars],
                    color=[colour for *_, colour in bars])
         right.set_yticks(range(len(bars)), [name for name, *_ in bars])
-        right.set_xscale("log")  # from a handful to a hundred thousand
+        right.set_xscale("log")  # factors range from a few to 1e5
         right.set_xlim(left=1)
-        right.axvline(FOUND, color=MEASURED, lw=0.8, ls="--")
+        right.axvline(DETECTION_LOG_ODDS, color=MEASURED, lw=0.8, ls="--")
         right.set_xlabel("log Bayes factor")
     else:
-        right.text(0.5, 0.5, "no effect was found", ha="center", transform=right.transAxes)
+        right.text(0.5, 0.5, "no effect was identified", ha="center", transform=right.transAxes)
         right.set_axis_off()
     for axis in (left, right):
         axis.set_ylim(max(len(top), len(bars)) - 0.4, -0.6)
@@ -205,9 +226,9 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
 
 
 def profile(diagnosis: Diagnosis) -> Figure:
-    """The readings that fitted worst, their predictions, and what is left."""
+    """Draw the readings with the largest residuals, their predictions and residuals."""
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
-    label, index, along, name = _line(before, diagnosis.left_out_before)
+    label, index, along, name = _line(before, diagnosis.loo_residuals_before)
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
@@ -234,21 +255,38 @@ def profile(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def _line(update: InferenceResult, left_out: Floats) -> tuple[str, Ints, Floats, str]:
-    """The readings of a profile: the line along z, circle, or coefficients of one kind that fitted
-    worst.
+def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Floats, str]:
+    """Return the readings of the profile.
 
-    ``left_out`` are the standardized residuals of the training readings.
+    These are the readings with the largest residuals of all lines along z, circles, or coefficients
+    of one kind.
+
+    Parameters
+    ----------
+    update : InferenceResult
+    loo_residuals : ndarray, shape (n,)
+        Standardized leave-one-out residuals of the training readings.
+
+    Returns
+    -------
+    label : str
+        Component or kind of the readings.
+    index : ndarray of int
+        Numbers of the readings.
+    along : ndarray
+        Their coordinates on the abscissa.
+    name : str
+        Name of the abscissa.
     """
     worst = np.full(len(update.readings), np.nan)
-    worst[~update.held_out] = left_out**2
-    along, name = places(update)
+    worst[~update.held_out] = loo_residuals**2
+    along, name = axis_of_readings(update)
     labels = np.array([label[0] if name == "harmonic" else label
                        for label in update.observation.labels])
     apart = np.round(update.observation.positions[:, :2] if name.startswith("z")
                      else update.observation.radii[:, None], 6)
-    groups = [np.flatnonzero((labels == label) & (apart == one).all(axis=1))
-              for label in dict.fromkeys(labels.tolist()) for one in np.unique(apart, axis=0)]
+    groups = [np.flatnonzero((labels == label) & (apart == location).all(axis=1))
+              for label in dict.fromkeys(labels.tolist()) for location in np.unique(apart, axis=0)]
     longest = max(len(group) for group in groups)
     index = max((group for group in groups if 2 * len(group) >= longest
                  and not np.isnan(worst[group]).all()),
@@ -258,13 +296,15 @@ def _line(update: InferenceResult, left_out: Floats) -> tuple[str, Ints, Floats,
 
 
 def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
-    """Magnetizations (parameters, ...) in A/m by block, (blocks, ...): along and across the easy
-    axis and along z, in % and mrad of the nominal one.
+    """Split magnetizations (parameters, ...) in A/m into components for each block.
+
+    Each component (blocks, ...) is relative to the magnitude of the nominal magnetization: along
+    the easy axis in %, across it and along z in mrad.
     """
     dimension = update.study.dimension
     nominal = update.response.nominal.reshape(-1, dimension)
     length = np.linalg.norm(nominal, axis=1)
-    length[length == 0] = np.inf  # a block that is missing
+    length[length == 0] = np.inf  # a missing block has no magnetization
     axis = nominal / length[:, None]
     across = np.zeros_like(axis)
     across[:, 0], across[:, 1] = -axis[:, 1], axis[:, 0]
@@ -277,14 +317,14 @@ def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
 
 
 def _deviations(update: InferenceResult) -> dict[str, Floats]:
-    """Posterior less prior mean by component, (rings, slots)."""
+    """Return posterior less prior mean of each component, (rings, slots)."""
     array = update.study.array
     return {name: values.reshape(array.rings, array.blocks_per_ring) for name, values in
             _parts(update, update.posterior.mean - update.prior.mean).items()}
 
 
 def magnetizations(diagnosis: Diagnosis) -> Figure:
-    """Posterior less prior mean of every block, by ring and slot."""
+    """Draw posterior less prior mean of every block's magnetization by ring and slot."""
     shown = states(diagnosis)
     found = [_deviations(state.update) for state in shown]
     array = diagnosis.before.study.array
@@ -292,9 +332,9 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
                     layout="constrained")
     axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(axes, found[0], strict=True):
-        limit = max(float(np.abs(one[name]).max()) for one in found) or 1.0
-        for axis, one in zip(row, found, strict=True):
-            axis.imshow(one[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
+        limit = max(float(np.abs(deviations[name]).max()) for deviations in found) or 1.0
+        for axis, deviations in zip(row, found, strict=True):
+            axis.imshow(deviations[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
                         origin="lower",
                         extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
             axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 6)))
@@ -308,7 +348,7 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
 
 
 def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Rms changes of the magnetizations, and what the prior allows."""
+    """Return the rows of a table of rms changes of the magnetizations, and their prior."""
     found = [(state.when, _deviations(state.update)) for state in states(diagnosis)]
     prior = _parts(diagnosis.before, np.asarray(diagnosis.before.prior.root))
     return [{"rms change of the magnetizations": name,
@@ -318,6 +358,7 @@ def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 
 def _empty(text: str) -> Figure:
+    """Return a figure that shows a text only."""
     figure = Figure(figsize=(8, 1), layout="constrained")
     axis = figure.subplots()
     axis.text(0.5, 0.5, text, ha="center", transform=axis.transAxes)

@@ -1,4 +1,4 @@
-"""Figures and the HTML page of an update."""
+"""Figures and the HTML page of an inference result."""
 
 from __future__ import annotations
 
@@ -11,23 +11,29 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.report.multipoles import Table, middle_table, table_csv
+from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
-from halbach_fe.report.prediction import Published, profile, quantiles, relative_error, residuals
-from halbach_fe.report.view import of_update
+from halbach_fe.report.prediction import (
+    PublishedErrors,
+    prediction_profile_figure,
+    relative_error_figure,
+    standardized_residuals_figure,
+    whitened_quantiles_figure,
+)
+from halbach_fe.report.view import view_of_inference
 from halbach_fe.response.multipoles import circle_models
 from halbach_fe.stats.linear_gaussian import contraction
 
 NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
-"""More do not find room for their numbers."""
+"""Largest numbers of slots and rings for which the contraction figure prints its values."""
 
 
-def score_table(update: InferenceResult,
-                published: Published | None = None) -> list[dict[str, str]]:
-    """Rows of the before/after table, as text."""
+def score_table(result: InferenceResult,
+                published: PublishedErrors | None = None) -> list[dict[str, str]]:
+    """Return the rows, as text, of the table that compares prior and posterior predictions."""
     rows = []
-    for score in update.scores:
+    for score in result.scores:
         row = {
             "region": score.region,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
@@ -39,8 +45,8 @@ def score_table(update: InferenceResult,
             else f"{score.chi2_posterior:.3g}",
         }
         if published is not None:
-            inside = np.isin(np.round(published.z, 6), np.round(_z_of(
-                update, score.region, score.part), 6))
+            inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
+                result, score.region, score.part), 6))
             row[f"{published.label}: prior"] = _percent(float(np.median(published.prior[inside])))
             row[f"{published.label}: posterior"] = _percent(
                 float(np.median(published.posterior[inside])))
@@ -49,83 +55,94 @@ def score_table(update: InferenceResult,
 
 
 def write_inference_report(
-    update: InferenceResult, folder: Path, published: Published | None = None,
+    result: InferenceResult, folder: Path, published: PublishedErrors | None = None,
     assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
 ) -> None:
-    """Write report.html, self-contained, and its figures as PNG into ``folder``; and
-    multipoles.csv, if the readings are of full circles.
+    """Write report.html and its figures into a folder.
 
-    ``assumptions`` are sentences that the reader must know before the numbers.
+    If the readings are on full circles, multipoles.csv is written too.
+
+    Parameters
+    ----------
+    published : PublishedErrors, optional
+        Relative errors from the literature to compare with.
+    assumptions : sequence of str
+        Sentences that state what the result rests on.
+    provenance : mapping, optional
+        Entries of the page's provenance table.
     """
-    unseen = ("of the held-out readings by prior and posterior" if update.held_out.any()
-              else "of the training readings by the prior (nothing was held out)")
+    unseen = ("of the held-out readings for prior and posterior" if result.held_out.any()
+              else "of the training readings for the prior (nothing was held out)")
     figures = {
-        "profile.png": (profile(update), "Measured readings with the prior and posterior "
-                        "prediction, and the posterior's residuals, along the line of the "
-                        "strongest reading"),
-        "relative_error.png": (relative_error(update, published), "Relative error of prior and "
-                               "posterior on the same line, logarithmic"),
-        "residuals.png": (residuals(update), "Residuals of all readings over the standard "
-                          "deviation of prediction and noise, before (top) and after the update "
-                          "(bottom); 95 % belong into the grey band, and more of the training "
-                          "readings after the update, which has seen them"),
-        "quantiles.png": (quantiles(update), f"Quantiles of residuals {unseen}, whitened by the "
-                          "full covariance of prediction and noise, against those of a normal "
-                          "distribution; on the line if all is well"),
-        "blocks.png": (_blocks(update), "Posterior change of the magnetization along the easy "
-                       "axis by ring and slot"),
-        "contraction.png": (_contraction(update), "What the readings tell of each block: by how "
-                            "much its variance shrinks from prior to posterior, 0 % nothing, "
-                            "100 % all"),
+        "profile.png": (prediction_profile_figure(result), "Readings with the predictions of "
+                        "prior and posterior, and the residuals of the posterior, along the line "
+                        "of the strongest reading"),
+        "relative_error.png": (relative_error_figure(result, published), "Relative error "
+                               "of the predictions of prior and posterior along the same line"),
+        "residuals.png": (standardized_residuals_figure(result), "Standardized residuals of "
+                          "all readings (divided by the standard deviation of prediction and "
+                          "noise) for the prior (top) and the posterior (bottom). The grey band "
+                          "should hold 95 % of them; of the training readings it holds more for "
+                          "the posterior, which is fitted to them"),
+        "quantiles.png": (whitened_quantiles_figure(result), f"Quantiles of the whitened residuals "
+                          f"{unseen} against normal quantiles; they are whitened with the full "
+                          "covariance of prediction and noise, and lie on the line if the model "
+                          "is right"),
+        "blocks.png": (_magnetization_change_figure(result), "Posterior change of the "
+                       "magnetization along the easy axis, from nominal, by ring and slot"),
+        "contraction.png": (_contraction_figure(result), "Contraction of each block: "
+                            "the decrease of its variance from prior to posterior; 0 % means that "
+                            "the readings contain no information about the block"),
     }
-    multipoles: list[Table] = [
-        (model, {"prior": model.of(update.prior), "posterior": model.of(update.posterior)})
-        for model in circle_models(update.magnet, update.observation, update.response)]
+    multipoles: list[MultipoleTable] = [
+        (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
+        for model in circle_models(result.magnet, result.observation, result.response)]
     if multipoles:
-        table_csv(update.study, multipoles, folder / "multipoles.csv")
-    array = update.study.array
+        write_multipole_csv(result.study, multipoles, folder / "multipoles.csv")
+    array = result.study.array
     write_page(
-        folder / "report.html", "inference.html.j2", save(figures, folder), study=update.study,
-        provenance=provenance, update=update, multipoles=middle_table(multipoles),
-        rows=score_table(update, published), assumptions=assumptions, array=array,
-        remanence=update.magnet.blocks[0].remanence, conflict=_conflict(update),
-        view=of_update(update))
+        folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
+        provenance=provenance, result=result, multipoles=middle_table(multipoles),
+        rows=score_table(result, published), assumptions=assumptions, array=array,
+        remanence=result.magnet.blocks[0].remanence, conflict=_conflict_sentence(result),
+        view=view_of_inference(result))
 
 
-def _conflict(update: InferenceResult) -> str:
-    """Say so when prior, model and readings cannot all be right."""
-    if update.prior_conflict <= update.conflict_limit:
+def _conflict_sentence(result: InferenceResult) -> str:
+    """Return a warning if prior, model and readings are in conflict, else an empty string."""
+    if result.prior_conflict <= result.conflict_limit:
         return ""
-    shift = float(np.max(np.abs(update.posterior.mean - update.prior.mean) / update.prior.sd))
+    shift = float(np.max(np.abs(result.posterior.mean - result.prior.mean) / result.prior.sd))
     return (f"Prior, model and readings cannot all be right: chi² per reading is "
-            f"{update.prior_conflict:.3g}, where 1 is expected and {update.conflict_limit:.2g} "
-            f"would be rare, and the largest change of a block is {shift:.1f} prior standard "
-            "deviations. Something is missing from the model (geometry, position of the readings, "
-            "iron, ...), so its error bars are too small.")
+            f"{result.prior_conflict:.3g}, where 1 is expected and more than "
+            f"{result.conflict_limit:.2g} is rare, and the largest change of a block is "
+            f"{shift:.1f} prior standard deviations. An effect is missing from the model "
+            "(geometry, position of the readings, iron, ...), so its error bars are too small.")
 
 
 def _percent(value: float | None) -> str:
     return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
 
 
-def _z_of(update: InferenceResult, region: str, part: str) -> Floats:
-    return update.observation.positions[update.chosen(region, part), 2]
+def _z_of_readings(result: InferenceResult, region: str, part: str) -> Floats:
+    return result.observation.positions[result.chosen(region, part), 2]
 
 
-def _height(rings: int) -> float:
-    """In inches, of a picture with a row a ring."""
+def _figure_height(rings: int) -> float:
+    """Return the height in inches of a figure with a row per ring."""
     return 1.8 + 0.25 * min(rings, NUMBERED_RINGS)
 
 
-def _blocks(update: InferenceResult) -> Figure:
-    array = update.study.array
-    dimension = update.study.dimension
-    nominal = update.response.nominal.reshape(-1, dimension)
-    shift = (update.posterior.mean - update.response.nominal).reshape(-1, dimension)
+def _magnetization_change_figure(result: InferenceResult) -> Figure:
+    """Draw the change of each magnetization along the easy axis, from nominal to posterior."""
+    array = result.study.array
+    dimension = result.study.dimension
+    nominal = result.response.nominal.reshape(-1, dimension)
+    shift = (result.posterior.mean - result.response.nominal).reshape(-1, dimension)
     length = np.linalg.norm(nominal, axis=1)
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
     picture = 100 * along.reshape(array.rings, array.blocks_per_ring)
-    figure = Figure(figsize=(8, _height(array.rings)), layout="constrained")
+    figure = Figure(figsize=(8, _figure_height(array.rings)), layout="constrained")
     axis = figure.subplots()
     limit = float(np.abs(picture).max()) or 1.0
     image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
@@ -140,12 +157,13 @@ def _blocks(update: InferenceResult) -> Figure:
     return figure
 
 
-def _contraction(update: InferenceResult) -> Figure:
-    array = update.study.array
-    percent = 100 * contraction(update.prior, update.posterior, update.study.dimension).reshape(
+def _contraction_figure(result: InferenceResult) -> Figure:
+    """Draw the contraction of each block: as bars for a single ring, else by ring and slot."""
+    array = result.study.array
+    percent = 100 * contraction(result.prior, result.posterior, result.study.dimension).reshape(
         array.rings, array.blocks_per_ring)
     slots = np.arange(1, array.blocks_per_ring + 1)
-    figure = Figure(figsize=(8, 3 if array.rings == 1 else _height(array.rings)),
+    figure = Figure(figsize=(8, 3 if array.rings == 1 else _figure_height(array.rings)),
                     layout="constrained")
     axis = figure.subplots()
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
@@ -153,7 +171,7 @@ def _contraction(update: InferenceResult) -> Figure:
         bars = axis.bar(slots, percent[0], color=POSTERIOR)
         if len(slots) <= NUMBERED_SLOTS:
             axis.bar_label(bars, fmt="%.0f", fontsize=7)
-        axis.set(ylabel="variance taken in %", ylim=(0, 108), yticks=range(0, 101, 20))
+        axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))
         return figure
     image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
                         extent=(0.5, len(slots) + 0.5, 0.5, array.rings + 0.5))
@@ -162,5 +180,5 @@ def _contraction(update: InferenceResult) -> Figure:
             axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
                       color="white" if value < 50 else "black")
     axis.set(ylabel="ring", yticks=range(1, array.rings + 1, max(1, array.rings // 12)))
-    figure.colorbar(image, label="variance taken in %")
+    figure.colorbar(image, label="contraction in %")
     return figure

@@ -1,4 +1,4 @@
-"""Figure and page of magnetizations that are known, beside what was inferred of them."""
+"""Figure and page that compare inferred magnetizations with the known truth."""
 
 from __future__ import annotations
 
@@ -15,43 +15,49 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
 
-def scores(one: Gaussian, truth: Floats) -> dict[str, float]:
-    """Errors of a distribution's mean, in A/m, and rms of error over standard deviation."""
-    error = one.mean - truth
+def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
+    """Return errors of the mean in A/m, and the rms of error over standard deviation."""
+    error = magnetizations.mean - truth
     return {"largest_error_A_per_m": float(np.abs(error).max()),
             "rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
-            "z_rms": float(np.sqrt(np.mean((error / one.sd) ** 2)))}
+            "z_rms": float(np.sqrt(np.mean((error / magnetizations.sd) ** 2)))}
 
 
 def write_magnetizations(
     magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
     files: str, figures: Mapping[str, object] | None = None, ring: int = 1,
 ) -> None:
-    """Write magnetizations.html, and magnetizations.png of a ring.
+    """Write magnetizations.html, and magnetizations.png with the magnetizations of a ring.
 
     Parameters
     ----------
     known : mapping
-        Distributions of the magnetizations in A/m by name, the first (the prior) in orange.
+        Distributions of the magnetizations in A/m by name; at most three are drawn, the first of
+        them (the prior) in orange.
     truth : ndarray, shape (parameters,), in A/m
     what : str
         The page's title.
     files : str
-        What stands beside the page for machines.
+        Names of the machine-readable files beside the page.
     figures : mapping, optional
-        Other numbers to list.
+        Further numbers to list, by name.
     ring : int
-        Whose magnetizations are drawn.
+        The ring that is drawn, counted from 1.
     """
     pictures = save({"magnetizations.png": (
-        _figure(magnet, known, truth, ring), f"Deviation of the magnetizations of ring {ring} from "
-        f"nominal: truth, {', '.join(known)}, with their standard deviations")}, folder)
-    rows = [(name, *scores(one, truth).values()) for name, one in known.items()]
+        _magnetizations_figure(magnet, known, truth, ring), f"Deviation of the "
+        f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are standard "
+        "deviations")}, folder)
+    rows = [(name, *error_summary(distribution, truth).values())
+            for name, distribution in known.items()]
     write_page(folder / "magnetizations.html", "magnetizations.html.j2", pictures,
                study=magnet.study, rows=rows, figures=figures or {}, what=what, machine_files=files)
 
 
-def _figure(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, ring: int) -> Figure:
+def _magnetizations_figure(
+    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, ring: int
+) -> Figure:
+    """Draw deviations of a ring's magnetizations from nominal, a panel for each component."""
     size = magnet.dimension
     slots = magnet.array.blocks_per_ring
     part = slice((ring - 1) * slots * size, ring * slots * size)
@@ -62,15 +68,16 @@ def _figure(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, ring: 
     places = np.arange(1, slots + 1)
     shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
     for axis, component in zip(axes, range(size), strict=True):
-        def of(values: Floats, component: int = component) -> Floats:
+        def in_kiloamperes_per_m(values: Floats, component: int = component) -> Floats:
             return np.asarray(1e-3 * values[component::size])
 
-        for (name, one), colour, shift in zip(known.items(), (PRIOR, POSTERIOR, SECOND), shifts,
-                                              strict=False):
-            axis.errorbar(places + shift, of(one.mean[part] - nominal), of(one.sd[part]),
-                          color=colour, fmt="o", ms=4, capsize=2, label=name)
-        axis.plot(places, of(truth[part] - nominal), "_", color=MEASURED, ms=14, mew=2,
-                  label="truth", zorder=3)
+        for (name, distribution), colour, shift in zip(
+                known.items(), (PRIOR, POSTERIOR, SECOND), shifts, strict=False):
+            axis.errorbar(places + shift, in_kiloamperes_per_m(distribution.mean[part] - nominal),
+                          in_kiloamperes_per_m(distribution.sd[part]), color=colour, fmt="o", ms=4,
+                          capsize=2, label=name)
+        axis.plot(places, in_kiloamperes_per_m(truth[part] - nominal), "_", color=MEASURED, ms=14,
+                  mew=2, label="truth", zorder=3)
         axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
         axis.grid(alpha=0.3)
     axes[0].legend(ncols=4, fontsize="small")

@@ -1,4 +1,4 @@
-"""Tables, figures and page of multipoles, and what other pages of multipoles share."""
+"""Tables, figures and page of multipoles, and the parts that other pages with multipoles share."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, save, wr
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
 
-Table = tuple[MultipoleModel, Mapping[str, Multipoles]]
-"""Where, and of which magnets by name."""
+MultipoleTable = tuple[MultipoleModel, Mapping[str, Multipoles]]
+"""A reference (circle or integral along z), and the multipoles there of magnets by name."""
 
 CONVENTION = "B_y + i B_x = sum (B_n + i A_n) ((x + i y) / R)^(n - 1); n = 1 is the dipole"
 
 DRAWS = 10_000
-"""Of multipoles, for the probability to be within a limit: to 0.5 % at worst."""
+"""Number of samples of the multipoles from which the probability of being within a limit is
+estimated, with a standard error of 0.5 % at most."""
 
 COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
 SHIFT = 0.18
-"""Of points of one order beside one another."""
+"""Horizontal distance between the markers of different magnets at the same order."""
 
 
 def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
-    """Where multipoles are taken, for scripts."""
+    """Return the reference of multipoles as entries of a JSON file."""
     return {"radius_m": model.radius, "z_m": model.z, "integrated_along_z": model.integrated,
             "main_order": model.main, "orders": list(model.orders),
             "axes_turned_by_rad": model.turn, "limit_units": limit,
@@ -38,17 +39,18 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, o
 
 
 def reference_text(model: MultipoleModel) -> str:
-    """Where multipoles are taken, for people."""
+    """Return a sentence that states the reference and the convention of multipoles."""
     where = ("of the field integrated along z" if model.integrated
              else f"at z = {model.z:g} m (Fourier coefficients of B_r)" if model.z is not None
              else "of the cross-section")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
-            f"of 1e-4 of the main one (order {model.main}; European convention, order 1 is the "
-            "dipole); b normal, a skew, along axes in which the nominal main multipole is normal.")
+            f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
+            "the dipole). b_n is normal and a_n skew, in axes turned about z such that the main "
+            "multipole of the nominal magnet is normal.")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
-    """b_n and a_n of magnets by name, with error bars of two standard deviations."""
+    """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
@@ -70,9 +72,9 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
     return figure
 
 
-def table_csv(study: Study, tables: Sequence[Table], path: Path) -> None:
-    """Write one row per magnet, place and order."""
-    rows = [{"magnet": name, "where": _where(model), "radius_m": model.radius,
+def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Path) -> None:
+    """Write multipoles.csv, with a row per magnet, reference and order."""
+    rows = [{"magnet": name, "where": _location(model), "radius_m": model.radius,
              "z_m": np.nan if model.z is None else model.z, "n": row["n"], "b_units": row["b"],
              "b_sd_units": row["b_sd"], "a_units": row["a"], "a_sd_units": row["a_sd"],
              "main": known.main, "main_sd": known.main_sd, "main_unit": model.unit}
@@ -82,24 +84,27 @@ def table_csv(study: Study, tables: Sequence[Table], path: Path) -> None:
     with atomic(path) as temporary:
         write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
             "study": study.name, "convention": CONVENTION,
-            "reference_radius_m": ", ".join(f"{one:g}" for one in radii),
+            "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
             "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
             "which the nominal one is normal",
             "axes_turned_by_rad": ", ".join(dict.fromkeys(
                 f"{model.turn:.9g}" for model, _ in tables))}, temporary)
 
 
-def _where(model: MultipoleModel) -> str:
+def _location(model: MultipoleModel) -> str:
+    """Return the name of the kind of reference."""
     return "integrated" if model.integrated else "cross-section" if model.z is None else "local"
 
 
-def middle_table(tables: Sequence[Table]) -> dict[str, object]:
-    """For a page: the table of the circle nearest to the magnet's middle, of the largest radius;
-    nothing if there is none.
+def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:
+    """Return the template variables of the table of a single circle; empty without circles.
+
+    It is the circle nearest to the middle of the magnet, and of those the largest.
     """
     if not tables:
         return {}
-    model, magnets = min(tables, key=lambda one: (abs(one[0].z or 0.0), -one[0].radius))
+    model, magnets = min(tables, key=lambda table: (
+        abs(table[0].z or 0.0), -table[0].radius))
     mains = "; ".join(f"{name} {known.main:.6g}" + (
         f" ± {known.main_sd:.2g}" if known.main_sd else "") + f" {model.unit}"
         for name, known in magnets.items())
@@ -108,51 +113,53 @@ def middle_table(tables: Sequence[Table]) -> dict[str, object]:
 
 
 def multipoles_summary(
-    study: Study, tables: Sequence[Table], limit: float | None
+    study: Study, tables: Sequence[MultipoleTable], limit: float | None
 ) -> dict[str, object]:
-    """What a script wants to know."""
+    """Return the content of multipoles.json."""
     return {"study": study.name, "tables": [
         {"reference": reference_summary(model, limit),
          **{name: plain(known, model.unit) | ({} if limit is None else {
-             "probability_within_limit": _within(known, limit)})
+             "probability_within_limit": _probability_within(known, limit)})
             for name, known in magnets.items()}} for model, magnets in tables]}
 
 
-def _within(known: Multipoles, limit: float) -> float:
+def _probability_within(known: Multipoles, limit: float) -> float:
+    """Return the probability that all unwanted multipoles are within a limit in units."""
     normals = np.random.default_rng(1).standard_normal((DRAWS, 2 * len(known.orders)))
     return met(known.sizes_of(normals), limit)
 
 
-def verdict(table: Table, limit: float | None) -> str:
-    """The last magnet's multipoles in words."""
+def multipoles_verdict(table: MultipoleTable, limit: float | None) -> str:
+    """Return sentences about the last magnet of a table, which is the best known of them."""
     model, magnets = table
     name, known = list(magnets.items())[-1]
     worst = int(np.argmax(known.sizes))
-    text = (f"By the {name} the main multipole is {known.main:.6g} ± {known.main_sd:.2g} "
-            f"{model.unit}; the largest unwanted one is that of order {known.orders[worst]}, "
-            f"{known.sizes[worst]:.3g} units.")
+    text = (f"{name.capitalize()}: the main multipole is {known.main:.6g} ± {known.main_sd:.2g} "
+            f"{model.unit}; the largest unwanted multipole is that of order {known.orders[worst]} "
+            f"with {known.sizes[worst]:.3g} units.")
     if limit is not None:
-        text += (f" All are within {limit:g} units with a probability of "
-                 f"{100 * _within(known, limit):.3g} %.")
+        text += (f" All unwanted multipoles are within {limit:g} units with a probability of "
+                 f"{100 * _probability_within(known, limit):.3g} %.")
     return text
 
 
 def write_multipoles(
-    study: Study, tables: Sequence[Table], limit: float | None, folder: Path,
+    study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
     provenance: Mapping[str, str],
 ) -> None:
     """Write multipoles.csv, multipoles.json, multipoles.html and its figures."""
-    table_csv(study, tables, folder / "multipoles.csv")
+    write_multipole_csv(study, tables, folder / "multipoles.csv")
     summary = multipoles_summary(study, tables, limit)
     write_text(folder / "multipoles.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        f"multipoles_{_where(model)}.png": (
-            multipole_figure(magnets, limit), "Unwanted multipoles, normal on the left and skew on "
-            "the right; bars are two standard deviations")
+        f"multipoles_{_location(model)}.png": (
+            multipole_figure(magnets, limit), "Unwanted multipoles, normal (left) and "
+            "skew (right); bars are two standard deviations")
         for model, magnets in tables}, folder)
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
                provenance=provenance, parts=[
-                   {"title": _where(model), "verdict": verdict((model, magnets), limit),
+                   {"title": _location(model),
+                    "verdict": multipoles_verdict((model, magnets), limit),
                     "reference": reference_text(model), "rows": text_table(**magnets),
                     "picture": picture}
                    for (model, magnets), picture in zip(tables, pictures, strict=True)])

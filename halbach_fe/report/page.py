@@ -1,4 +1,4 @@
-"""What the pages share: colours, figures on disk and inside a page, the frame of the page."""
+"""Parts that all pages share: colours, figures as files and in pages, and the page itself."""
 
 from __future__ import annotations
 
@@ -21,26 +21,33 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study
 
-# Okabe and Ito's colours, told apart by every kind of colour vision
+# M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 SECOND = "#009E73"
 IRON = "#56B4E9"
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
+"""Packages whose versions each page states."""
 
 Picture = tuple[str, str]
-"""A PNG in base64, and what it shows."""
+"""A figure in a page: the PNG in base64, and its caption."""
 
 
 def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
-    """Write figures, by file name with what each shows, as PNG; return them for a page."""
+    """Write figures as PNG files into a folder, and return them for a page.
+
+    Parameters
+    ----------
+    figures : mapping
+        Figure and caption by file name.
+    """
     pictures = []
-    for name, (figure, text) in figures.items():
+    for name, (figure, caption) in figures.items():
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=130)
         with atomic(folder / name) as temporary:
             temporary.write_bytes(buffer.getvalue())
-        pictures.append((base64.b64encode(buffer.getvalue()).decode(), text))
+        pictures.append((base64.b64encode(buffer.getvalue()).decode(), caption))
     return pictures
 
 
@@ -48,9 +55,23 @@ def write_page(
     path: Path, template: str, pictures: Sequence[Picture], study: Study | None = None,
     provenance: Mapping[str, str] | None = None, **data: object,
 ) -> None:
-    """Write a self-contained page from a template of this folder.
+    """Write a self-contained HTML page from a template of this folder.
 
-    It ends in its provenance: words by key, the programs' versions, and the study as it was read.
+    The page ends with its provenance: the entries of ``provenance``, the versions of the programs,
+    and the text of the study file as it was read.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    template : str
+        Name of the template's file.
+    pictures : sequence of Picture
+        Figures from `save`.
+    provenance : mapping, optional
+        Text by name of the entry.
+    **data
+        Variables of the template.
     """
     versions = [f"{name} {metadata.version(name)}" for name in PROGRAMS]
     text = None if study is None else tomlkit.dumps(
@@ -63,8 +84,8 @@ def write_page(
             "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
 
 
-def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    """A figure of rows that share their x axis."""
+def stacked_axes(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
+    """Return a figure, and its axes in rows that share the x axis; ``ratios`` are heights."""
     figure = Figure(figsize=(8, 2.4 + 1.7 * rows), layout="constrained")
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False,
                            gridspec_kw={"height_ratios": ratios or [1] * rows})
@@ -73,8 +94,12 @@ def axes_along(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure
     return figure, list(axes[:, 0])
 
 
-def places(points: Floats) -> tuple[Floats, str]:
-    """Where points (n, 3) in m stand along the x axis of a figure, and what that is."""
+def axis_of_points(points: Floats) -> tuple[Floats, str]:
+    """Return the abscissae (n,) of points (n, 3) in m in a figure, and the label of that axis.
+
+    The abscissa is z; for points in a single plane the angle about z; and if one of them is on the
+    axis, the number of the point.
+    """
     x, y, z = points.T
     if np.ptp(z) > 0:
         return 1e3 * z, "z in mm"
@@ -83,8 +108,8 @@ def places(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
-def draw_magnet(axis: Axes, magnet: Magnet) -> None:
-    """Outlines of a ring's blocks with arrows of their magnetization, and the iron; in mm."""
+def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
+    """Draw the first ring's blocks with arrows of their easy axes, and the iron ring, in mm."""
     t = np.linspace(0, 1, 9)
     for block in magnet.blocks[:magnet.array.blocks_per_ring]:
         outline = 1e3 * np.vstack([edge.at(t)[0] for edge in block.outline])
@@ -99,14 +124,22 @@ def draw_magnet(axis: Axes, magnet: Magnet) -> None:
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
 
 
-def geometry(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
-    """A ring with its magnetization, and where points (n, 3) in m are; beside it, if they are not
-    in one plane, by z and distance from the axis. ``others`` are held out.
+def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
+    """Draw the positions of readings in the cross-section of the magnet.
+
+    If the positions are not in a single plane, a second panel shows them by z and distance from
+    the axis.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    others : ndarray, shape (m, 3), in m, optional
+        Positions of held-out readings.
     """
     flat = np.ptp(points[:, 2]) == 0
     figure = Figure(figsize=(5.5, 5.8) if flat else (10, 5.4), layout="constrained")
     left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
-    draw_magnet(left, magnet)
+    draw_cross_section(left, magnet)
     left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
@@ -115,16 +148,16 @@ def geometry(magnet: Magnet, points: Floats, others: Floats | None = None) -> Fi
         for block in magnet.blocks[::magnet.array.blocks_per_ring]:
             axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
                                      high - low, fill=False, color="#777777", lw=0.6))
-    for one, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
-                                      (others, "x", PRIOR, "held out")):
-        if one is None:
+    for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
+                                            (others, "x", PRIOR, "held out")):
+        if positions is None:
             continue
-        x, y, z = 1e3 * one.T
+        x, y, z = 1e3 * positions.T
         left.plot(x, y, marker, ms=3, color=colour, label=name)
         for axis in right:
             axis.plot(z, np.hypot(x, y), marker, ms=3, color=colour)
     for axis in right:
-        axis.set_ylim(0, None)  # not before: it would end the scaling to what is drawn
+        axis.set_ylim(0, None)  # last, because setting a limit ends the automatic scaling
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2,
                   markerscale=3)
     return figure

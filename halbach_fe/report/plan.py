@@ -17,11 +17,11 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_cross_section, save, write_page
 
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
-    """What a script wants to know of a plan; information in nats, lengths in A/m."""
+    """Return the content of plan.json: information in nats, standard deviations in A/m."""
     return {
         "points": len(plan.points), "candidates": len(plan.candidates),
         "information": float(plan.gain[-1]),
@@ -45,52 +45,63 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
     summary = plan_summary(plan)
     write_text(folder / "plan.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        "plan_positions.png": (_positions(magnet, plan), "Candidates, chosen positions coloured by "
-                               "their order, and the study's own positions as rings"),
-        "plan_information.png": (_information(plan), "Expected information against the number of "
-                                 "points, for the plan and for as many of the study's positions"),
-        "plan_blocks.png": (_blocks(magnet, plan),
-                            "Standard deviation of the blocks' magnetizations"
-                            " after the measurement over that before, by slot, for the plan and "
-                            "for as many of the study's positions"),
+        "plan_positions.png": (
+            _positions_figure(magnet, plan), "Candidate positions, chosen positions coloured by "
+            "the order of choice, and the study's own positions as rings"),
+        "plan_information.png": (
+            _expected_information_figure(plan), "Expected information against the number of "
+            "points, for the plan and for evenly spread positions of the study"),
+        "plan_blocks.png": (
+            _block_sd_figure(magnet, plan), "Posterior over prior standard deviation of the "
+            "blocks' magnetizations by slot, for the plan and for equally many positions of the "
+            "study"),
     }, folder)
     write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
                summary=summary)
 
 
 def _rms(values: Floats) -> float:
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _positions(magnet: Magnet, plan: MeasurementPlan) -> Figure:
+def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
+    """Draw all positions in the cross-section, and by z and angle if not in a single plane."""
     flat = np.ptp(plan.candidates[:, 2]) == 0
     figure = Figure(figsize=(6.4, 5.2) if flat else (10, 5.2), layout="constrained")
     left, *others = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
-    draw_magnet(left, magnet)
-    shown = _show(left, plan, lambda points: 1e3 * points[:, :2])
+    draw_cross_section(left, magnet)
+    shown = _draw_points(left, plan, lambda points: 1e3 * points[:, :2])
     reach = 1.15e3 * float(np.hypot(*np.vstack([plan.candidates, plan.baseline])[:, :2].T).max())
     left.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x in mm",
              ylabel="y in mm")
     for axis in others:
-        shown = _show(axis, plan, lambda points: np.column_stack(
+        shown = _draw_points(axis, plan, lambda points: np.column_stack(
             [points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
         axis.set(xlabel="z in m", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
     return figure
 
 
-def _show(axis: Axes, plan: MeasurementPlan, place: Callable[[Floats], Floats]) -> PathCollection:
-    """Candidates, chosen and the study's points where ``place`` puts them."""
+def _draw_points(
+    axis: Axes, plan: MeasurementPlan, place: Callable[[Floats], Floats]
+) -> PathCollection:
+    """Draw candidates, chosen positions and the study's positions.
+
+    ``place`` maps positions (n, 3) in m to the coordinates (n, 2) of the figure.
+    """
     axis.plot(*place(plan.candidates).T, ".", color="#cccccc", ms=2, label="candidates")
     x, y = place(plan.points).T
     shown = axis.scatter(x, y, 28, np.arange(1, len(x) + 1), cmap="viridis", label="chosen",
                          zorder=3)
-    axis.plot(*place(plan.baseline).T, "o", mfc="none", color=PRIOR, ms=7, mew=0.8, label="study")
+    axis.plot(*place(plan.baseline).T, "o", mfc="none", color=PRIOR, ms=7, mew=0.8,
+              label="positions of the study")
     axis.legend(loc="upper right", fontsize="small")
     return shown
 
 
-def _information(plan: MeasurementPlan) -> Figure:
+def _expected_information_figure(plan: MeasurementPlan) -> Figure:
+    """Draw the expected information against the number of points."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), plan.gain, color=POSTERIOR, label="plan")
@@ -103,7 +114,8 @@ def _information(plan: MeasurementPlan) -> Figure:
     return figure
 
 
-def _blocks(magnet: Magnet, plan: MeasurementPlan) -> Figure:
+def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
+    """Draw the ratio of posterior to prior standard deviations, by slot."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     slots = np.array([block.slot for block in magnet.blocks])
@@ -117,7 +129,7 @@ def _blocks(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
                                     ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
         axis.bar(places + shift, by_slot(sd) / before, 0.4, color=colour, label=name)
-    axis.set(xlabel="slot", ylabel="sd after / sd before", ylim=(0, 1))
+    axis.set(xlabel="slot", ylabel="posterior sd / prior sd", ylim=(0, 1))
     axis.set_xticks(places[::max(1, len(places) // 16)])
     axis.legend()
     return figure

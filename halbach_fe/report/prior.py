@@ -1,4 +1,4 @@
-"""Figure, table and page of a prior from measured blocks."""
+"""Figure, table and page of a prior from measurements of single blocks."""
 
 from __future__ import annotations
 
@@ -18,27 +18,31 @@ from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPri
 from halbach_fe.report.page import MEASURED, PUBLISHED, save, write_page
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
-"""From relative deviations to percent along the magnetization and degrees across it."""
+"""Factors that convert relative deviations to percent (along the magnetization) and to degrees
+(across it)."""
 
 NOTHING = "–"
 SIMULATIONS = 1000
+"""Number of simulated normal samples from which the band of the figure is taken."""
 
 
 def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
-    """Rows of the table of types, as text: mean ± sd, and the adjusted p-values."""
+    """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values."""
     return [
-        {"type": one.label, "n": str(len(one.deviations)),
+        {"type": samples.label, "n": str(len(samples.deviations)),
          **{f"{name} in {unit}": f"{mean:+.2f} ± {sd}" for name, unit, mean, sd in zip(
-             DIRECTIONS, ("%", "°", "°"), _mean(one),
-             [NOTHING if np.isnan(sd) else f"{sd:.2f}" for sd in _sd(one)], strict=False)},
+             DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
+             [NOTHING if np.isnan(sd) else f"{sd:.2f}" for sd in _sd_of_type(samples)],
+             strict=False)},
          **{f"p {name}": NOTHING if np.isnan(p) else f"{p:.2g}"
-            for name, p in zip(DIRECTIONS, one.p, strict=False)}}
-        for one in prior.types]
+            for name, p in zip(DIRECTIONS, samples.p, strict=False)}}
+        for samples in prior.types]
 
 
 def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
-    """What a script wants to know of a prior; percent along the nominal magnetization, degrees
-    across it.
+    """Return the content of prior.json.
+
+    Deviations are in percent along the nominal magnetization and in degrees across it.
     """
     return {
         "study": magnet.name, "blocks": prior.count, "placed": prior.placed,
@@ -47,12 +51,13 @@ def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
         "rms_shift_A_per_m": float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))),
         "common_mode_sd": magnet.study.prior.common_mode_sd,
         "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
-        "not_normal": [one.label for one in prior.types if not one.normal],
+        "not_normal": [samples.label for samples in prior.types if not samples.normal],
         "types": [
-            {"type": one.label, "n": len(one.deviations),
-             "mean_percent_deg": _mean(one).tolist(), "sd_percent_deg": _listed(_sd(one)),
-             "anderson_darling_p": _listed(one.p), "shrinkage": one.intensity}
-            for one in prior.types],
+            {"type": samples.label, "n": len(samples.deviations),
+             "mean_percent_deg": _mean_of_type(samples).tolist(),
+             "sd_percent_deg": _json_list(_sd_of_type(samples)),
+             "anderson_darling_p": _json_list(samples.p), "shrinkage": samples.intensity}
+            for samples in prior.types],
     }
 
 
@@ -70,37 +75,44 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
     summary = prior_summary(magnet, prior)
     write_text(folder / "prior.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({"prior_qq.png": (
-        _quantiles(prior), "Standardized deviations of all blocks from the mean of their type "
-        "against normal quantiles; each point of normal samples of the same numbers lies between "
-        "the dashed lines 95 times in 100")}, folder)
+        _standardized_deviations_figure(prior), "Quantiles of the standardized deviations of all "
+        "blocks from the mean of their type against normal quantiles. The dashed lines are the "
+        "95 % band of each quantile for normally distributed samples of the same sizes")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
                summary=summary, rows=type_table(prior), level=NOT_NORMAL)
 
 
-def _mean(one: TypeSamples) -> Floats:
-    return np.asarray(one.deviations.mean(axis=0) * UNITS[:one.deviations.shape[1]])
+def _mean_of_type(samples: TypeSamples) -> Floats:
+    """Return mean deviations in percent and degrees."""
+    deviations = samples.deviations
+    return np.asarray(deviations.mean(axis=0) * UNITS[:deviations.shape[1]])
 
 
-def _sd(one: TypeSamples) -> Floats:
-    """NaN for a single block."""
-    if len(one.deviations) < 2:
-        return np.full(one.deviations.shape[1], np.nan)
-    return np.asarray(one.deviations.std(axis=0, ddof=1) * UNITS[:one.deviations.shape[1]])
+def _sd_of_type(samples: TypeSamples) -> Floats:
+    """Return sample standard deviations in percent and degrees; NaN for a single block."""
+    deviations = samples.deviations
+    if len(deviations) < 2:
+        return np.full(deviations.shape[1], np.nan)
+    return np.asarray(deviations.std(axis=0, ddof=1) * UNITS[:deviations.shape[1]])
 
 
-def _listed(values: Floats) -> list[float | None]:
+def _json_list(values: Floats) -> list[float | None]:
+    """Return a list with None in place of NaN, which JSON cannot express."""
     return [None if np.isnan(value) else float(value) for value in values]
 
 
 def _standardized(samples: Floats) -> Floats:
-    """Samples (n, ...) of one type, less their mean, over their sd; 0 if they are all the same."""
+    """Return samples (n, ...) minus their mean, divided by their sd; 0 if all are equal."""
     spread = samples.std(axis=0, ddof=1)
     return np.asarray((samples - samples.mean(axis=0)) / np.where(spread > 0, spread, 1.0))
 
 
-def _quantiles(prior: MeasuredPrior) -> Figure:
-    """Types standardized with their own mean and sd, which the band takes into account."""
-    groups = [one.deviations for one in prior.types if len(one.deviations) > 2]
+def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
+    """Draw the quantiles of all blocks, each standardized with the mean and sd of its type.
+
+    The simulated samples of the band are standardized in the same way.
+    """
+    groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
     figure = Figure(figsize=(10, 3.9), layout="constrained")
     axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
     if not groups:

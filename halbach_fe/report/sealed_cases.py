@@ -1,4 +1,8 @@
-"""What came of sealed cases: what was hidden and what was named, stated probabilities, the gap."""
+"""Page on the diagnosis of sealed cases: effects that were hidden in simulated campaigns.
+
+It compares the hidden effects with the identified ones, stated probabilities with frequencies, and
+the fit of held-out readings before and after.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,8 @@ from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
 from halbach_fe.study.model import Study
 
 Confusion = Mapping[tuple[str, tuple[str, ...]], int]
-"""Cases by what was hidden alone, and the names that were given to something found."""
+"""Number of cases by the effect that was hidden alone, and by the names of an identified effect and
+its alternatives."""
 
 
 def write_sealed_cases(
@@ -24,33 +29,43 @@ def write_sealed_cases(
 
     Parameters
     ----------
+    study : Study
     results : sequence of mapping
-        Of each case: hidden, named, chi2_before, chi2_after.
+        Result of each case, with the keys case, named, unknown, chi2_before and chi2_after.
+    rates : mapping
+        Success rates by name.
     reliability : sequence of mapping
-        Probability stated, and how often it happened, in bins: stated, happened, statements.
+        Bins of stated probabilities: mean stated probability (stated), frequency of the effects
+        (happened), and number of statements (statements).
+    confusion : mapping
+        See `Confusion`.
+    folder : Path
     """
     drawn = {
-        "confusion.png": (_confusion(confusion), "What was named of what was hidden alone; effects "
-                          "that are named together cannot be told apart by that map"),
-        "reliability.png": (_reliability(reliability), "How often effects were there whose "
-                            "probability was stated; bars are 95 % of what chance allows"),
-        "gap.png": (_gap(results), "Chi² per held-out reading of every case, before and after; the "
-                    "band is 0.9 to 1.1")}
+        "confusion.png": (
+            _confusion(confusion), "Number of cases by the effect that was hidden alone and by the "
+            "effect that was identified. Effects that a map cannot distinguish count as one"),
+        "reliability.png": (
+            _reliability(reliability), "How often effects were present, against the probability "
+            "that was stated; bars are binomial 95 % intervals"),
+        "gap.png": (
+            _gap(results), "Chi² per held-out reading of every case, before and after the "
+            "diagnosis; the band is 0.9 to 1.1")}
     write_page(folder / "sealed_cases.html", "sealed_cases.html.j2", save(drawn, folder),
                study=study, cases=len(results),
                rates=[{"figure": name.replace("_", " "), "value": f"{value:.3g}"}
                       for name, value in rates.items()],
-               rows=[{"case": one["case"], "named": ", ".join(
-                   " or ".join(names) for names in one["named"]) or "nothing",
-                   "unknown": one["unknown"] or "", "chi² before": f"{one['chi2_before']:.3g}",
-                   "after": f"{one['chi2_after']:.3g}"} for one in results])
+               rows=[{"case": case["case"], "identified": ", ".join(
+                   " or ".join(names) for names in case["named"]) or "nothing",
+                   "unknown": case["unknown"] or "", "chi² before": f"{case['chi2_before']:.3g}",
+                   "after": f"{case['chi2_after']:.3g}"} for case in results])
 
 
 def _confusion(confusion: Confusion) -> Figure:
-    """A square for each hidden effect and each first name given to it."""
+    """Draw the number of cases for each hidden effect and each name that was given to it."""
     if not confusion:
         return Figure()
-    hidden = sorted({one for one, _ in confusion})
+    hidden = sorted({truth for truth, _ in confusion})
     called = [next((name for name in names if name == truth or name[:-2] == truth), names[0])
               for truth, names in confusion]
     bases = [name[:-2] if name[:-2] in hidden else name for name in called]
@@ -66,14 +81,14 @@ def _confusion(confusion: Confusion) -> Figure:
     for row, column in np.argwhere(counts):
         axis.text(column, row, f"{counts[row, column]:.0f}", ha="center", va="center", fontsize=7,
                   color="white" if counts[row, column] > counts.max() / 2 else "black")
-    axis.set(xlabel="named", ylabel="hidden")
+    axis.set(xlabel="identified", ylabel="hidden")
     axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
     axis.set_yticks(range(len(hidden)), hidden, fontsize=7)
     return figure
 
 
 def _reliability(rows: Sequence[Mapping[str, float]]) -> Figure:
-    """Stated probability against frequency, with what a binomial allows."""
+    """Draw stated probability against frequency, with the binomial 95 % interval."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axis = figure.subplots()
     stated = np.array([row["stated"] for row in rows])
@@ -87,19 +102,19 @@ def _reliability(rows: Sequence[Mapping[str, float]]) -> Figure:
     for row in rows:
         axis.annotate(f"{row['statements']:.0f}", (row["stated"], row["happened"]),
                       textcoords="offset points", xytext=(6, -10), fontsize=8)
-    axis.set(xlabel="probability stated", ylabel="how often it was so", xlim=(-0.03, 1.06),
+    axis.set(xlabel="probability stated", ylabel="frequency", xlim=(-0.03, 1.06),
              ylim=(-0.06, 1.06))
     return figure
 
 
 def _gap(results: Sequence[Mapping[str, Any]]) -> Figure:
-    """Held-out chi2 of all cases, sorted by what it was before."""
+    """Draw chi-squared of held-out readings before and after, with cases sorted by the former."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
-    ordered = sorted(results, key=lambda one: one["chi2_before"])
+    ordered = sorted(results, key=lambda case: case["chi2_before"])
     axis.axhspan(0.9, 1.1, color=PUBLISHED, alpha=0.4, lw=0)
-    axis.semilogy([one["chi2_before"] for one in ordered], ".", color=PRIOR, label="before")
-    axis.semilogy([one["chi2_after"] for one in ordered], ".", color=POSTERIOR, label="after")
+    axis.semilogy([case["chi2_before"] for case in ordered], ".", color=PRIOR, label="before")
+    axis.semilogy([case["chi2_after"] for case in ordered], ".", color=POSTERIOR, label="after")
     axis.set(xlabel="case", ylabel="chi² per held-out reading")
     axis.legend()
     return figure

@@ -16,30 +16,40 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.page import IRON, POSTERIOR, PRIOR, PUBLISHED, draw_magnet, save, write_page
+from halbach_fe.report.page import (
+    IRON,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    draw_cross_section,
+    save,
+    write_page,
+)
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What a sensitivity study found.
+    """Results of a sensitivity study.
 
     Attributes
     ----------
     block : int
-        Slot whose derivative the map shows, from 1.
+        Slot, counted from 1, of the block with respect to whose magnetization the map of the
+        derivative is taken.
     x, y : ndarray, shape (n,), in m
-        Axes of the map.
+        Coordinates of the map's columns and rows.
     size : ndarray, shape (n, n), in T m/A
-        |B'| by y and x; NaN outside the mesh.
+        Magnitude of the derivative |B'| by y and x; NaN outside the mesh.
     angle : ndarray, shape (m,), in rad
-        Of the readings on the circle.
+        Angles of the readings on the circle.
     along, across : ndarray, shape (m, blocks), in T
-        |B'| at each reading for 1 % more magnetization of each block, and for a turn of 1 degree.
+        Magnitude of the change of B at each reading if a block has 1 % more magnetization, and if
+        its magnetization is turned by 1 degree.
     printed_form : float
-        Largest relative error on the circle of the derivative by the formula that the paper
-        prints, whose iron is that of the derivative's own field.
+        Largest relative error on the circle of the derivative if it is computed with the formula
+        as printed in the paper, which takes the iron's reluctivity at the field of the derivative.
     information : mapping
-        Numbers of points and expected information in nats, by name.
+        Numbers of points, and expected information in nats for each, by name of the plan.
     """
 
     block: int
@@ -74,36 +84,42 @@ def write_sensitivity(
         "largest_one_degree_T": float(found.across.max()), "plans": plans}
     write_text(folder / "sensitivity.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        "derivative.png": (_map(magnet, found), f"Size of the derivative of B along the nominal "
-                           f"magnetization of block {found.block}, in T per A/m, logarithmic"),
-        "readings.png": (_readings(found), "Change of B at every reading of the circle for every "
-                         "block: 1 % more magnetization, and a turn by 1 degree"),
-        "information.png": (_information(found), "Expected information about all magnetizations "
-                            "against the number of points"),
+        "derivative.png": (
+            _derivative_figure(magnet, found), "Magnitude of the derivative of B with respect to "
+            f"the magnetization of block {found.block} along its nominal direction, in T per A/m, "
+            "logarithmic scale"),
+        "readings.png": (
+            _sensitivity_of_readings_figure(found), "Change of B at every reading of the circle "
+            "for every block: for 1 % more magnetization, and for a turn by 1 degree"),
+        "information.png": (
+            _information_of_plans_figure(found), "Expected information about all magnetizations "
+            "against the number of points"),
     }, folder)
     write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=magnet.study,
                found=found, plans=plans)
 
 
-def _map(magnet: Magnet, found: Sensitivity) -> Figure:
+def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
+    """Draw the map of the derivative's magnitude, with the blocks."""
     figure = Figure(figsize=(7.4, 6), layout="constrained")
     axis = figure.subplots()
     largest = float(np.nanmax(found.size))
     shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, found.size, shading="nearest",
                             norm=LogNorm(largest * 1e-5, largest), cmap="cividis", rasterized=True)
-    draw_magnet(axis, magnet)
+    draw_cross_section(axis, magnet)
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
     figure.colorbar(shown, label="|B'| in T m/A", extend="min")
     return figure
 
 
-def _readings(found: Sensitivity) -> Figure:
+def _sensitivity_of_readings_figure(found: Sensitivity) -> Figure:
+    """Draw the change of B by reading and block, for both kinds of change."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     degrees = np.degrees(found.angle)
     blocks = np.arange(1, found.along.shape[1] + 1)
     for axis, values, name in zip(axes, (found.along, found.across),
-                                  ("1 % more magnetization", "1 degree turned"), strict=True):
+                                  ("1 % more magnetization", "turned by 1 degree"), strict=True):
         shown = axis.pcolormesh(blocks, degrees, 1e3 * values, shading="nearest", cmap="cividis")
         axis.set(xlabel="slot", title=name)
         figure.colorbar(shown, label="|change of B| in mT", ax=axis)
@@ -111,12 +127,13 @@ def _readings(found: Sensitivity) -> Figure:
     return figure
 
 
-def _information(found: Sensitivity) -> Figure:
+def _information_of_plans_figure(found: Sensitivity) -> Figure:
+    """Draw the expected information of all plans against the number of points."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axis = figure.subplots()
     colours = (PRIOR, POSTERIOR, PUBLISHED, IRON)
     for (name, (counts, gain)), colour in zip(found.information.items(), colours, strict=False):
-        # plans may tell hardly more than what they are compared with
+        # dashed and in front, because curves of other plans may lie almost on the first
         axis.plot(counts, gain, color=colour, label=name,
                   ls="--" if colour == PRIOR else "-", zorder=3 if colour == PRIOR else 2)
     axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))

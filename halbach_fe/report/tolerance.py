@@ -1,4 +1,4 @@
-"""Figures, table and page of the multipoles that tolerances of the blocks make."""
+"""Figures, table and page of the multipoles that result from the tolerances of the blocks."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from halbach_fe.response.multipoles import plain
 
 
 def tolerance_summary(found: Tolerance) -> dict[str, object]:
-    """What a script wants to know of drawn magnets."""
+    """Return the content of tolerance.json."""
     shares = found.shares
     return {
         "study": found.study.name, "reference": reference_summary(found.model, found.limit),
         "draws": len(found.sizes), "closed_form": plain(found.known, found.model.unit),
-        "main_quantiles": _named(np.quantile(found.main, QUANTILES)),
-        "sizes": [{"n": order, "quantiles_units": _named(column),
+        "main_quantiles": _by_quantile(np.quantile(found.main, QUANTILES)),
+        "sizes": [{"n": order, "quantiles_units": _by_quantile(column),
                    "share_within_limit": None if shares is None else float(shares[i])}
                   for i, (order, column) in enumerate(zip(
                       found.model.orders, found.quantiles.T, strict=True))],
@@ -31,12 +31,13 @@ def tolerance_summary(found: Tolerance) -> dict[str, object]:
     }
 
 
-def _named(values: Floats) -> dict[str, float]:
+def _by_quantile(values: Floats) -> dict[str, float]:
+    """Return values by the name of their quantile."""
     return dict(zip(map(str, QUANTILES), values.tolist(), strict=True))
 
 
 def quantile_table(found: Tolerance) -> list[dict[str, str]]:
-    """Rows of text, one per order."""
+    """Return the rows of the table of multipoles, as text, one for each order n."""
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
@@ -55,17 +56,20 @@ def write_tolerance(found: Tolerance, folder: Path) -> None:
     summary = tolerance_summary(found)
     write_text(folder / "tolerance.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
-        "tolerance_sizes.png": (_quantiles(found), "Unwanted multipoles |c_n| of the drawn magnets:"
-                                " median, and bars to the 5 % and 95 % quantiles"),
-        "tolerance_largest.png": (_largest(found), "Share of the drawn magnets whose largest "
-                                  "unwanted multipole is below a limit"),
+        "tolerance_sizes.png": (
+            _size_quantiles_figure(found), "Unwanted multipoles |c_n| of the simulated magnets: "
+            "median, with bars from the 5 % to the 95 % quantile"),
+        "tolerance_largest.png": (
+            _largest_multipole_figure(found), "Share of the simulated magnets whose largest "
+            "unwanted multipole is below a limit"),
     }, folder)
     write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
                study=found.study, summary=summary, reference=reference_text(found.model),
                rows=quantile_table(found))
 
 
-def _quantiles(found: Tolerance) -> Figure:
+def _size_quantiles_figure(found: Tolerance) -> Figure:
+    """Draw median and quantiles of |c_n| by order."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
     place = np.arange(len(found.model.orders))
@@ -80,7 +84,8 @@ def _quantiles(found: Tolerance) -> Figure:
     return figure
 
 
-def _largest(found: Tolerance) -> Figure:
+def _largest_multipole_figure(found: Tolerance) -> Figure:
+    """Draw the distribution function of the largest |c_n|."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
     largest = np.sort(found.sizes.max(axis=1))

@@ -1,4 +1,4 @@
-"""Figures, tables and page of how exact a study's field is."""
+"""Figures, table and page of the verification of a study's computed field."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
-    axes_along,
-    geometry,
-    places,
+    axis_of_points,
+    geometry_figure,
     save,
+    stacked_axes,
     write_page,
 )
-from halbach_fe.report.view import Points, of_nominal
+from halbach_fe.report.view import ViewPoints, view_of_nominal_magnet
 from halbach_fe.response.discretization_error import REFINEMENT
 from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, Verification
 
@@ -34,53 +34,55 @@ MARKERS = ("^", "o", ".", "s", "x")
 
 
 def difference_table(found: Verification) -> list[dict[str, str]]:
-    """Rows of text: the differences, and the error that they amount to."""
+    """Return rows of text: the change of the field for each change of the model, and the error."""
     def row(what: str, pointwise: float, fourier: float | None) -> dict[str, str]:
         return {"change": what, "pointwise": f"{pointwise:.1e}",
                 "Fourier": "" if fourier is None else f"{fourier:.1e}"}
 
-    rows = [row(one.what, one.pointwise, one.fourier)
-            | {name: f"{value:.1e}" for name, value in one.by_region.items()}
-            for one in found.differences]
+    rows = [row(difference.what, difference.pointwise, difference.fourier)
+            | {name: f"{value:.1e}" for name, value in difference.by_region.items()}
+            for difference in found.differences]
     rows.append(row(f"estimated error (order {found.order:.1f})", found.error_pointwise,
                     found.error_fourier) | dict.fromkeys(found.differences[0].by_region, ""))
     return rows
 
 
-def verdict(magnet: Magnet, found: Verification) -> str:
-    """How exact the field is, relative to what, in words."""
+def verification_verdict(magnet: Magnet, found: Verification) -> str:
+    """Return sentences that state the field's estimated error and compare it with the noise."""
     error = found.error_pointwise * found.main_field_T
     if not error:
-        return ("Nothing is left to finite elements: the field is the exact one of the blocks in "
+        return ("No finite elements are needed: the field is the exact one of the blocks in "
                 "vacuum.")
-    text = (f"At the study's positions B is off by about {error:.1e} T at most, "
-            f"{found.error_pointwise:.1e} of the largest field there "
+    text = (f"At the study's positions the estimated error of B is {error:.1e} T at most, "
+            f"{found.error_pointwise:.1e} of the largest field at these positions "
             f"({found.main_field_T:.4g} T).")
     if magnet.study.noise is not None and magnet.study.noise.regions:
         sigma = min(region.sigma_T for region in magnet.study.noise.regions)
         fourier = magnet.study.observation.quantity == "fourier_coefficients"
         own = found.error_fourier if fourier else found.error_pointwise
         if own is not None:
-            text += (f" For a {'Fourier coefficient' if fourier else 'reading'} that is "
-                     f"{own * found.main_field_T / sigma:.2g} of the smallest noise in the study "
-                     f"({sigma:.1e} T).")
+            text += (f" The error of a {'Fourier coefficient' if fourier else 'reading'} is "
+                     f"{own * found.main_field_T / sigma:.2g} of the smallest noise sd in the "
+                     f"study ({sigma:.1e} T).")
     if found.order <= FLATTEST:
-        text += (" Finer elements do not change it less than coarser ones did: the estimate is a "
-                 "rough one, and the mesh should be finer.")
+        text += (" The last refinement does not change the field less than the one before: the "
+                 "estimate is rough, and the mesh should be finer.")
     return text
 
 
-def basis(found: Verification) -> str:
-    """What the estimate rests on, in words."""
+def error_basis(found: Verification) -> str:
+    """Return sentences that state how the error is estimated."""
     if found.differences[-1].what == EXACT:
-        return "The error is the difference to the exact field of the blocks in vacuum."
+        return "The error is the difference from the exact field of the blocks in vacuum."
     limit = {FLATTEST: " at most", STEEPEST: " at least"}.get(found.order, "")
-    text = ("The estimated error is what all further refinements would change, if each changes "
-            f"less by the same factor as the last two did (order {found.order:.1f}{limit} in the "
-            "element size), and what a boundary farther away changes.")
+    text = ("The estimated error is the total change that all further refinements would make, plus "
+            "the change that a boundary farther away makes. It assumes that the changes by "
+            "successive refinements decrease by the same factor as the last two do (order "
+            f"{found.order:.1f}{limit} in the element size).")
     if len(found.differences) > 3:
-        text += (" The dual formulation errs in the opposite direction, as far as energies go; its "
-                 "difference is the error bar of readings, and not part of the estimate.")
+        text += (" The error of the dual formulation has the opposite sign, as far as energies are "
+                 "concerned. The difference between the two formulations is the solver's error bar "
+                 "of the readings, and not part of the estimate.")
     return text
 
 
@@ -92,48 +94,50 @@ def write_verification(
                json.dumps(found.plain(), indent=1, allow_nan=False) + "\n")
     columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
     with atomic(folder / "verification.csv") as temporary:
-        write_csv(columns | {f"{one.what} in T": change for one, change in zip(
+        write_csv(columns | {f"{difference.what} in T": change for difference, change in zip(
             found.differences, found.changes, strict=True)}, {"study": magnet.name}, temporary)
     figures = {}
     if found.changes[:2].any():
-        figures["verification_convergence.png"] = _convergence(found), (
-            "Error against element size, both logarithmic: what the next finer mesh changes, the "
-            "slope between the two, the estimated error of the study's own mesh, and for "
-            "comparison what a farther boundary and another formulation change")
-        figures["verification_along.png"] = _along(found), (
+        figures["verification_convergence.png"] = _convergence_figure(found), (
+            "Relative change of the field against element size, both logarithmic: change by the "
+            "next finer mesh with the slope between the two, estimated error of the study's own "
+            "mesh, and for comparison the changes by a boundary farther away and by another "
+            "formulation")
+        figures["verification_along.png"] = _change_figure(found), (
             "Change of B at every position of the study, for each change of the model")
-    figures["verification_geometry.png"] = geometry(magnet, found.points), (
-        "The blocks of a ring with their magnetization, the iron if there is any, and the study's "
-        "positions")
+    figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (
+        "The blocks of the first ring with their easy axes, the iron ring if the study has one, "
+        "and the study's positions")
     change = found.changes[1]
     write_page(
         folder / "verification.html", "verification.html.j2", save(figures, folder),
         study=magnet.study,
-        provenance=provenance, found=found, rows=difference_table(found), basis=basis(found),
-        verdict=verdict(magnet, found), refinement=REFINEMENT, flattest=FLATTEST,
-        view=of_nominal(magnet, Points(
-            found.points, change, "positions", "changed by a<br>finer mesh, in T",
+        provenance=provenance, found=found, rows=difference_table(found), basis=error_basis(found),
+        verdict=verification_verdict(magnet, found), refinement=REFINEMENT, flattest=FLATTEST,
+        view=view_of_nominal_magnet(magnet, ViewPoints(
+            found.points, change, "positions", "change by a<br>finer mesh in T",
             "a finer mesh changes B by %{customdata:.1e} T",
             (float(change.min()), float(change.max())))))
 
 
-def _convergence(found: Verification) -> Figure:
-    """What the next finer mesh changes, over the largest field, by element size."""
+def _convergence_figure(found: Verification) -> Figure:
+    """Draw the change by the next finer mesh, relative to the largest field, by element size."""
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
     sizes = size * np.array([REFINEMENT, 1.0])
-    steps = np.array([one.pointwise for one in found.differences[:2]])
+    steps = np.array([difference.pointwise for difference in found.differences[:2]])
     line = size * np.array([REFINEMENT, 1 / REFINEMENT])
-    axis.plot(sizes, steps, "o", color=POSTERIOR, label="changed by the next finer mesh")
+    axis.plot(sizes, steps, "o", color=POSTERIOR, label="change by the next finer mesh")
     axis.plot(line, steps[1] * (line / size)**found.order, "-", color=POSTERIOR, lw=0.8,
               label=f"order {found.order:.1f}")
     axis.plot(size, found.error_pointwise, "*", ms=12, color=PRIOR,
               label="estimated error of the study's mesh")
-    for one, style, colour in zip(found.differences[2:], ("--", ":", "-."),
-                                  (PUBLISHED, SECOND, MEASURED), strict=False):
-        if one.pointwise > 0:
-            axis.axhline(one.pointwise, ls=style, color=colour, label=one.what.replace("_", " "))
+    for difference, style, colour in zip(found.differences[2:], ("--", ":", "-."),
+                                         (PUBLISHED, SECOND, MEASURED), strict=False):
+        if difference.pointwise > 0:
+            axis.axhline(difference.pointwise, ls=style, color=colour,
+                         label=difference.what.replace("_", " "))
     axis.set(xscale="log", yscale="log", xlabel="element size at the magnet in mm",
              ylabel="change of B over the largest field")
     axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT]))
@@ -144,14 +148,15 @@ def _convergence(found: Verification) -> Figure:
     return figure
 
 
-def _along(found: Verification) -> Figure:
-    figure, (axis,) = axes_along(1)
-    place, label = places(found.points)
-    for one, change, colour, marker in zip(found.differences, found.changes, COLOURS, MARKERS,
-                                           strict=False):
+def _change_figure(found: Verification) -> Figure:
+    """Draw the change of B at every position, for each change of the model."""
+    figure, (axis,) = stacked_axes(1)
+    place, label = axis_of_points(found.points)
+    for difference, change, colour, marker in zip(
+            found.differences, found.changes, COLOURS, MARKERS, strict=False):
         seen = change > 0
         axis.semilogy(place[seen], change[seen], marker, ms=4, color=colour,
-                      label=one.what.replace("_", " "))
+                      label=difference.what.replace("_", " "))
     axis.set(xlabel=label, ylabel="|change of B| in T")
     figure.legend(loc="outside upper center", ncols=2, fontsize="small")
     return figure

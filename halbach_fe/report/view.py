@@ -1,4 +1,4 @@
-"""A view of the magnet in three dimensions, to turn and point at, inside a page."""
+"""The interactive three-dimensional view of a magnet (Plotly) that pages embed."""
 
 from __future__ import annotations
 
@@ -22,41 +22,45 @@ from halbach_fe.report.page import IRON, MEASURED
 
 ARC_POINTS = 5
 SIGNED, UNSIGNED = "RdBu_r", "Cividis"
-"""Scales that every kind of colour vision can read."""
+"""Colour scales of signed and of unsigned numbers, readable with any colour vision."""
 
 ARROW, HEAD = 0.7, 0.35
-"""Length of an arrow over the thickness of a block, and of its head over its own."""
+"""Length of an arrow relative to the radial thickness of a block; length of the arrow's head
+relative to the arrow."""
 
 FLAT = 0.2
-"""Height of a cross-section over its radius."""
+"""Drawn height of a two-dimensional magnet relative to its outer radius."""
 
 MOST_POINTS = 10_000
-"""Of a map; more would make the page slow."""
+"""Largest number of points of a field map that are drawn; more would make the page slow."""
 
 MOST_BLOCKS = 2000
-"""Of an array; of more, those of neighbouring rings are drawn as one."""
+"""Largest number of blocks that are drawn one by one. In a larger array neighbouring rings are
+merged."""
 
 LARGE = 4.0
-"""Residuals over their standard deviations from which the colour is the same."""
+"""Upper end of the colour scale of standardized residuals."""
 
-FROM_AHEAD, FROM_ASIDE = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z": 1.2}
+CAMERA_2D, CAMERA_3D = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z": 1.2}
 
 IDENTITY = "magnet-view"
+"""HTML id of the view."""
 
 
 @dataclass(frozen=True)
 class Colours:
-    """A number of each block, as its colour.
+    """Numbers that are shown as the colours of the blocks.
 
     Attributes
     ----------
     values : ndarray, shape (blocks,)
+        The number of each block.
     title : str
-        Of the scale.
+        Title of the colour scale.
     words : sequence of str
-        What is said of each block.
+        Text that appears when the pointer is over a block, one for each block.
     limits : tuple of float, or None
-        Of the scale; None for a scale of signed numbers, even about 0.
+        Ends of an unsigned colour scale. If None, the scale is signed and symmetric about 0.
     """
 
     values: Floats
@@ -66,15 +70,15 @@ class Colours:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What a page knows of the blocks.
+class BlockValues:
+    """Values of the blocks that a view shows.
 
     Attributes
     ----------
     magnetization : ndarray, shape (blocks, D), in A/m
-        Drawn as arrows.
+        Magnetization vectors, drawn as arrows.
     colours : Colours or None
-        None before a measurement.
+        Colours of the blocks. If None, all blocks are grey (before a measurement).
     """
 
     magnetization: Floats
@@ -82,19 +86,22 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Points:
-    """Points of a map, coloured by a number of each.
+class ViewPoints:
+    """Points of a field map, coloured by the magnitude of a value at each point.
 
     Attributes
     ----------
     positions : ndarray, shape (n, 3), in m
     values : ndarray, shape (n,)
-    name, title : str
-        Of the points, and of the scale of colours.
+        May be signed; the colour shows the magnitude.
+    name : str
+        Name of the points in the legend.
+    title : str
+        Title of the colour scale.
     words : str
-        What is said of a point, with %{customdata} for its value.
+        Text that appears when the pointer is over a point; %{customdata} stands for its value.
     limits : tuple of float
-        Of the scale; of magnitudes, where values have a sign.
+        Ends of the colour scale, which are magnitudes.
     """
 
     positions: Floats
@@ -105,48 +112,61 @@ class Points:
     limits: tuple[float, float]
 
 
-def residuals(positions: Floats, standardized: Floats) -> Points:
-    """Measured points: positions (n, 3) in m and residuals (n,) over their standard deviations."""
-    return Points(positions, standardized, "measured points", "largest residual<br>over its sd",
-                  "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
+def residual_points(positions: Floats, standardized: Floats) -> ViewPoints:
+    """Return measured points that are coloured by their residuals.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3), in m
+    standardized : ndarray, shape (n,)
+        Residuals divided by their standard deviations.
+    """
+    return ViewPoints(positions, standardized, "measured points",
+                      "largest standardized<br>residual in sd",
+                      "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
 
 
-def field_points(positions: Floats, flux_density: Floats) -> Points:
-    """Points (n, 3) in m of a computed field B (n, 3) in T, coloured by its magnitude."""
-    size = np.linalg.norm(flux_density, axis=1)
-    return Points(positions, size, "points", "|B| in T", "|B| = %{customdata:.5g} T",
-                  (float(size.min()), float(size.max())))
+def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
+    """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
+    magnitude = np.linalg.norm(flux_density, axis=1)
+    return ViewPoints(positions, magnitude, "points", "|B| in T", "|B| = %{customdata:.5g} T",
+                      (float(magnitude.min()), float(magnitude.max())))
 
 
-def of_nominal(magnet: Magnet, points: Points) -> Markup:
-    """The view of a nominal magnet, and points of a map."""
-    known = Known(np.array([block.magnetization[:magnet.dimension] for block in magnet.blocks]))
+def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
+    """Return the view of a nominal magnet and the points of a map, `MOST_POINTS` at most."""
+    magnetization = np.array([block.magnetization[:magnet.dimension] for block in magnet.blocks])
     count = len(points.positions)
-    few = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
-    return magnet_view(magnet, known, replace(
-        points, positions=points.positions[few], values=points.values[few]))
+    drawn = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    return magnet_view(magnet, BlockValues(magnetization), replace(
+        points, positions=points.positions[drawn], values=points.values[drawn]))
 
 
-def of_update(update: InferenceResult) -> Markup:
-    """The view of an update: the posterior, and what it leaves of each reading."""
-    size = update.study.dimension
-    nominal = update.response.nominal.reshape(-1, size)
+def view_of_inference(result: InferenceResult) -> Markup:
+    """Return the view of an inference result: posterior magnetizations and residuals."""
+    size = result.study.dimension
+    nominal = result.response.nominal.reshape(-1, size)
     easy = nominal / np.linalg.norm(nominal, axis=1)[:, None]
     length = np.einsum("ij,ij->i", nominal, easy)
-    mean = update.posterior.mean.reshape(-1, size)
+    mean = result.posterior.mean.reshape(-1, size)
     number = np.arange(len(easy) + 1)
     along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
     change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
-    sd = 100 * update.posterior.sd_of(along) / length
-    known = Known(mean, Colours(change, "posterior change<br>along the easy axis in %", [
-        f"{one:+.2f} ± {error:.2f} % along the easy axis"
-        for one, error in zip(change, sd, strict=True)]))
-    scores = update.standardized(update.prediction_posterior)
-    return magnet_view(update.magnet, known, _by_point(update.observation.positions, scores))
+    sd = 100 * result.posterior.sd_of(along) / length
+    values = BlockValues(mean, Colours(change, "posterior change<br>along the easy axis in %", [
+        f"{percent:+.2f} ± {error:.2f} % along the easy axis"
+        for percent, error in zip(change, sd, strict=True)]))
+    scores = result.standardized(result.prediction_posterior)
+    return magnet_view(
+        result.magnet, values, _worst_residuals(result.observation.positions, scores))
 
 
-def _by_point(positions: Floats, scores: Floats) -> Points:
-    """Of all readings at a point the one that is farthest off; of too many points these first."""
+def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
+    """Return each measured point with the largest standardized residual of its readings.
+
+    If there are more than `MOST_POINTS` points, half of the points drawn are those with the
+    largest residuals; the other half is spread evenly.
+    """
     points, inverse = np.unique(positions.round(9), axis=0, return_inverse=True)
     order = np.argsort(np.abs(scores))
     worst = np.zeros(len(points))
@@ -156,97 +176,119 @@ def _by_point(positions: Floats, scores: Floats) -> Points:
         evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
         chosen = np.union1d(kept, evenly)
         points, worst = points[chosen], worst[chosen]
-    return residuals(points, worst)
+    return residual_points(points, worst)
 
 
-def magnet_view(magnet: Magnet, known: Known, points: Points | None = None) -> Markup:
-    """A part of a page, with all that it needs."""
-    blocks, known = _few(magnet, known)
-    figure = go.Figure([_blocks(magnet, blocks, known), *_arrows(magnet, blocks, known)])
+def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None = None) -> Markup:
+    """Return the view as HTML that includes all its scripts, to be placed in a page."""
+    blocks, values = _merge_rings(magnet, values)
+    figure = go.Figure([_blocks_trace(magnet, blocks, values),
+                        *_arrow_traces(magnet, blocks, values)])
     if magnet.iron_ring is not None:
-        figure.add_trace(_iron(magnet))
+        figure.add_trace(_iron_trace(magnet))
     if points is not None:
-        figure.add_trace(_markers(points))
+        figure.add_trace(_points_trace(points))
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
         scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
                "yaxis": {"title": {"text": "y in m"}}, "zaxis": {"title": {"text": "z in m"}},
-               "camera": {"eye": FROM_AHEAD if magnet.dimension == 2 else FROM_ASIDE,
+               "camera": {"eye": CAMERA_2D if magnet.dimension == 2 else CAMERA_3D,
                           "up": {"x": 0, "y": 1, "z": 0}}})
     return Markup(plotly.io.to_html(
         figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY,
         config={"displaylogo": False, "responsive": True}))
 
 
-def _rings_in_one(magnet: Magnet) -> int:
-    """How many rings are drawn as one."""
+def _rings_per_prism(magnet: Magnet) -> int:
+    """Return the number of neighbouring rings that are merged for drawing."""
     return math.ceil(magnet.array.rings * magnet.array.blocks_per_ring / MOST_BLOCKS)
 
 
-def _few(magnet: Magnet, known: Known) -> tuple[Sequence[MagnetBlock], Known]:
-    """The blocks to draw, and what is known of them: of too many, one for each slot of several
-    rings, with their mean magnetization and the number of that which has the largest.
+def _merge_rings(
+    magnet: Magnet, values: BlockValues
+) -> tuple[Sequence[MagnetBlock], BlockValues]:
+    """Return the blocks to draw and their values, with neighbouring rings merged if necessary.
+
+    In an array of more than `MOST_BLOCKS` blocks, the blocks of several neighbouring rings in the
+    same slot are drawn as a single block. It has their mean magnetization, and the colour and text
+    of the block whose value is largest in magnitude.
     """
     blocks, slots = magnet.blocks, magnet.array.blocks_per_ring
-    step = _rings_in_one(magnet)
+    step = _rings_per_prism(magnet)
     if step == 1:
-        return blocks, known
+        return blocks, values
     groups = [range(first + slot, min(first + step * slots, len(blocks)), slots)
               for first in range(0, len(blocks), step * slots) for slot in range(slots)]
-    colours = known.colours
+    colours = values.colours
     if colours is not None:
-        size = np.abs(colours.values)
-        worst = [group[int(np.argmax(size[group]))] for group in groups]
+        magnitude = np.abs(colours.values)
+        worst = [group[int(np.argmax(magnitude[group]))] for group in groups]
         colours = replace(colours, values=colours.values[worst], words=[
-            f"most in ring {blocks[one].ring}: {colours.words[one]}" for one in worst])
+            f"largest in ring {blocks[number].ring}: {colours.words[number]}" for number in worst])
+    magnetization = np.array([values.magnetization[group].mean(axis=0) for group in groups])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
-            Known(np.array([known.magnetization[group].mean(axis=0) for group in groups]), colours))
+            BlockValues(magnetization, colours))
 
 
-def _blocks(magnet: Magnet, blocks: Sequence[MagnetBlock], known: Known) -> go.Mesh3d:
-    """All blocks as one surface, each with vertices of its own, which carry its words."""
+def _blocks_trace(
+    magnet: Magnet, blocks: Sequence[MagnetBlock], values: BlockValues
+) -> go.Mesh3d:
+    """Return all blocks as a single surface mesh.
+
+    No two blocks share vertices, because the text of a block is attached to its vertices.
+    """
     vertices, triangles, owner = [], [], []
     first = 0
     for number, block in enumerate(blocks):
-        corners, faces = prism(block, _height(magnet))
+        corners, faces = prism(block, _prism_height(magnet))
         vertices.append(corners)
         triangles.append(faces + first)
         owner += [number] * len(corners)
         first += len(corners)
     points, faces = np.vstack(vertices), np.vstack(triangles)
-    more = _rings_in_one(magnet) - 1
-    words = [_words(block, min(more, magnet.array.rings - block.ring), known, number)
+    more = _rings_per_prism(magnet) - 1
+    texts = [_hover_text(block, min(more, magnet.array.rings - block.ring), values, number)
              for number, block in enumerate(blocks)]
     look: dict[str, object] = {"color": "#BBBBBB"}
-    if known.colours is not None:
-        values = known.colours.values
-        limit = float(np.abs(values).max()) or 1.0
-        low, high = known.colours.limits or (-limit, limit)
-        look = {"intensity": values[np.array(owner)[faces[:, 0]]], "intensitymode": "cell",
-                "colorscale": UNSIGNED if known.colours.limits else SIGNED, "cmin": low,
+    if (colours := values.colours) is not None:
+        limit = float(np.abs(colours.values).max()) or 1.0
+        low, high = colours.limits or (-limit, limit)
+        look = {"intensity": colours.values[np.array(owner)[faces[:, 0]]],
+                "intensitymode": "cell",
+                "colorscale": UNSIGNED if colours.limits else SIGNED, "cmin": low,
                 "cmax": high, "colorbar": {
-                    "title": {"text": known.colours.title}, "len": 0.45, "y": 0.7}}
+                    "title": {"text": colours.title}, "len": 0.45, "y": 0.7}}
     return go.Mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=faces[:, 0], j=faces[:, 1],
-        k=faces[:, 2], text=[words[one] for one in owner], hoverinfo="text", flatshading=True,
+        k=faces[:, 2], text=[texts[number] for number in owner], hoverinfo="text", flatshading=True,
         name="blocks", showlegend=True, lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
 
 
-def _words(block: MagnetBlock, more: int, known: Known, number: int) -> str:
-    """Of a block that stands for those of so many more rings."""
-    moment = known.magnetization[number]
+def _hover_text(block: MagnetBlock, more: int, values: BlockValues, number: int) -> str:
+    """Return the text of a block; ``more`` is the number of further rings merged into it."""
+    magnetization = values.magnetization[number]
     rings = f"rings {block.ring} to {block.ring + more}" if more else f"ring {block.ring}"
     lines = [f"{rings}, slot {block.slot}",
-             "M = (" + ", ".join(f"{1e-3 * one:.1f}" for one in moment) + ") kA/m"]
-    if known.colours is not None:
-        lines.append(known.colours.words[number])
+             "M = (" + ", ".join(f"{1e-3 * part:.1f}" for part in magnetization) + ") kA/m"]
+    if values.colours is not None:
+        lines.append(values.colours.words[number])
     return "<br>".join(lines)
 
 
 def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
-    """Corners (n, 3) in m of a block's surface and triangles (m, 3) of it.
+    """Triangulate the surface of a block.
 
-    ``height`` is that of a block of infinite length.
+    Parameters
+    ----------
+    block : MagnetBlock
+    height : float
+        Drawn height in m of a block of infinite length.
+
+    Returns
+    -------
+    corners : ndarray, shape (n, 3), in m
+    triangles : ndarray of int, shape (m, 3)
+        Numbers of the corners of each triangle.
     """
     flat = np.vstack([edge.at(np.linspace(0, 1, ARC_POINTS)[:-1] if edge.arc else np.zeros(1))[0]
                       for edge in block.outline])
@@ -260,25 +302,27 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
                        np.column_stack([ring, ahead + count, ring + count])])
     corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
-    corners = (corners - block.middle) @ rotation_matrix(block.turn).T + block.middle + block.shift
+    corners = ((corners - block.middle) @ rotation_matrix(block.rotation_rad).T
+               + block.middle + block.displacement_m)
     return corners, np.vstack([face, face + count, sides])
 
 
-def _height(magnet: Magnet) -> float:
+def _prism_height(magnet: Magnet) -> float:
+    """Return the drawn height in m of blocks of infinite length."""
     return FLAT * magnet.array.outer_radius_m
 
 
-def _arrows(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], known: Known
+def _arrow_traces(
+    magnet: Magnet, blocks: Sequence[MagnetBlock], values: BlockValues
 ) -> list[go.Scatter3d | go.Cone]:
-    """Directions of magnetization, on the upper faces of the blocks."""
-    middles = np.array([[*(block.middle + block.shift)[:2],
-                         prism(block, _height(magnet))[0][:, 2].max()] for block in blocks])
+    """Return arrows of the magnetization on the upper faces of the blocks."""
+    middles = np.array([[*(block.middle + block.displacement_m)[:2],
+                         prism(block, _prism_height(magnet))[0][:, 2].max()] for block in blocks])
     vectors = np.zeros((len(blocks), 3))
-    vectors[:, :known.magnetization.shape[1]] = known.magnetization
+    vectors[:, :values.magnetization.shape[1]] = values.magnetization
     vectors *= (ARROW * (magnet.array.outer_radius_m - magnet.array.inner_radius_m)
                 / np.linalg.norm(vectors, axis=1).max())
-    gap = np.full_like(middles, np.nan)  # no line from one arrow to the next
+    gap = np.full_like(middles, np.nan)  # NaN separates the lines of consecutive arrows
     x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
     shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
                           name="magnetization", legendgroup="arrows", hoverinfo="skip")
@@ -289,12 +333,13 @@ def _arrows(
     return [shafts, heads]
 
 
-def _iron(magnet: Magnet) -> go.Surface:
+def _iron_trace(magnet: Magnet) -> go.Surface:
+    """Return the surface of the iron ring."""
     ring = magnet.iron_ring
     assert ring is not None
     blocks = magnet.blocks
     length = ring.length_m or (blocks[-1].z_max - blocks[0].z_min)
-    half = (length if np.isfinite(length) else _height(magnet)) / 2
+    half = (length if np.isfinite(length) else _prism_height(magnet)) / 2
     angle = np.linspace(0, 2 * np.pi, 97)
     radius = np.array([ring.inner_radius_m, ring.outer_radius_m, ring.outer_radius_m,
                        ring.inner_radius_m, ring.inner_radius_m])[:, None]
@@ -305,7 +350,8 @@ def _iron(magnet: Magnet) -> go.Surface:
         hoverinfo="name")
 
 
-def _markers(points: Points) -> go.Scatter3d:
+def _points_trace(points: ViewPoints) -> go.Scatter3d:
+    """Return the points of the map as markers."""
     x, y, z = points.positions.T
     low, high = points.limits
     return go.Scatter3d(

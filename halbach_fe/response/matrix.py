@@ -40,7 +40,7 @@ from halbach_fe.solver.field import (
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import unit_fields
-from halbach_fe.stats.linear_gaussian import parts_of
+from halbach_fe.stats.linear_gaussian import row_slices
 from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import FIELD_KEYS
@@ -94,7 +94,7 @@ class StoredMatrix:
                               "an output folder of its own.") from None
 
     def __matmul__(self, vector: Floats) -> Floats:
-        return np.concatenate([self[part] @ vector for part in parts_of(*self.shape)])
+        return np.concatenate([self[part] @ vector for part in row_slices(*self.shape)])
 
 
 def _npy_header(shape: tuple[int, int]) -> bytes:
@@ -161,7 +161,7 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
 
     def rows() -> Iterator[Floats]:
         # as many at once as memory takes: they share integrals
-        for some in parts_of(len(observation), dimension * len(blocks), len(observation)):
+        for some in row_slices(len(observation), dimension * len(blocks), len(observation)):
             matrix, total[some], magnitude[some] = _rows(magnet, observation, parts, some)
             yield matrix
 

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import fourier_analysis
 from halbach_fe.measurement.positions import points_from
@@ -53,11 +54,12 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Verification:
+class Verification(ShownInNotebook):
     """What `verify` found.
 
     Attributes
     ----------
+    magnet : Magnet
     route : str
     differences : tuple of Difference
         Coarser to study, study to finer, nearer to farther boundary, the dual route if any, and
@@ -78,6 +80,7 @@ class Verification:
         |change of B| at every point.
     """
 
+    magnet: Magnet
     route: str
     differences: tuple[Difference, ...]
     order: float
@@ -91,16 +94,26 @@ class Verification:
 
     def plain(self) -> dict[str, object]:
         """For scripts, without what is given by point."""
-        return {key: value for key, value in asdict(self).items()
-                if not isinstance(value, np.ndarray)}
+        by_point = ("magnet", "points", "field", "changes")
+        return {name: getattr(self, name) for name in self.__dataclass_fields__
+                if name not in by_point} | {
+            "differences": [asdict(one) for one in self.differences]}
 
 
 def verify(
     magnet: Magnet, session: Session, say: Callable[[str], None] = lambda _: None
 ) -> Verification:
-    """Solve the study on three meshes, with a farther boundary, and by the dual route if any.
+    """Estimate the error of the solved field of the nominal magnet.
 
-    ``say`` is told what is solved next.
+    The field is solved on a coarser, the study's own and a finer mesh, with the boundary farther
+    away, and by the dual formulation where there is one. ``say`` receives a line before each solve.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> hf.verify(magnet, hf.Session.open("results")).error_pointwise < 1e-3
+    True
     """
     points = points_from(magnet.study.observation.positions)
     route = choose_route(magnet, points)
@@ -131,7 +144,7 @@ def verify(
         fourier = (None if steps[1].fourier is None or steps[2].fourier is None
                    else series * steps[1].fourier + steps[2].fourier)
     return Verification(
-        route=route, differences=tuple(steps), order=order, error_pointwise=error,
+        magnet=magnet, route=route, differences=tuple(steps), order=order, error_pointwise=error,
         error_fourier=fourier, main_field_T=compare.scale,
         element_size_m=(meridian_size(magnet) if route == "azimuthal_modes"
                         else magnet.study.mesh.block_size_m),

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import Observation, fourier_analysis, observe, together
+from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
@@ -246,7 +246,7 @@ def multipole_models(
         wanted.append((orders, _radius(magnet, one), one.z_m))
         observations.append(_observation(magnet, wanted[-1][1], max(*orders, main), one.z_m))
     bare = magnet.with_(instrument=Instrument())
-    model = response_matrix(bare, reduce(together, observations), session)
+    model = response_matrix(bare, reduce(concatenate, observations), session)
     found, first = [], 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
         part = slice(first, first + len(observation))

@@ -265,7 +265,7 @@ def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estim
     try:
         problems = field_of_blocks(magnet, points, jobs)
     except PointsOutsideError as error:
-        raise MeasurementError(str(error).replace("`observation.positions`", "map")) from None
+        raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
     if axisymmetric_stand_in(magnet, choose_route(magnet, points), points) is None:
         problems += error_bars(magnet, observation, jobs)
     if magnet.is_nonlinear:  # is the iron linear enough?

@@ -82,7 +82,7 @@ class Cluster:
         """
         given = {path.name: path.read_bytes() for path in folder.iterdir()}
         try:
-            future = self.client.submit(_answer, getdp, job, given, str(folder), pure=False)
+            future = self.client.submit(_answer, getdp, job, given, pure=False)
             try:
                 while not future.done():
                     if cancel is not None and cancel.is_set():
@@ -102,7 +102,8 @@ class Cluster:
             for line in answer.lines:
                 on_line(line)
         if answer.failure:
-            raise GetDPError(answer.failure)
+            log = folder / runner.LOG_NAME
+            raise GetDPError(answer.failure, log if log.is_file() else None)
         return answer.lines
 
 
@@ -146,8 +147,8 @@ def _failed(address: str, error: Exception) -> SchedulerError:
                           f"{type(error).__name__}: {error} Look into their logs.")
 
 
-def _answer(getdp: GetDP, job: Job, given: dict[str, bytes], home: str) -> Answer:
-    """Run a job in a folder of this worker; ``home`` is the one that messages should name."""
+def _answer(getdp: GetDP, job: Job, given: dict[str, bytes]) -> Answer:
+    """Run a job in a folder of this worker."""
     import distributed
 
     here = runner.find_getdp()
@@ -177,7 +178,7 @@ def _answer(getdp: GetDP, job: Job, given: dict[str, bytes], home: str) -> Answe
         try:
             lines = runner.run(here, job, folder, cancel=cancel)
         except GetDPError as error:
-            failure = str(error).replace(name, home)
+            failure = error.sentence
         finally:
             done.set()
         written = {path.name: path.read_bytes() for path in folder.iterdir()

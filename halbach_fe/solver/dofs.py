@@ -73,7 +73,8 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
         return Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
                         _entities(text, "ElementsXFacets", faces))
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise GetDPError(f"GetDP's list of unknowns {path} cannot be read ({error}).") from None
+        raise GetDPError(
+            f"GetDP's list of unknowns {path.name} cannot be read ({error}).") from None
 
 
 def _section(text: str, name: str, skip: int) -> list[str]:
@@ -102,18 +103,18 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
     try:
         raw = np.memmap(path, np.uint8, "r")
     except (OSError, ValueError) as error:
-        raise GetDPError(f"GetDP's solutions {path} cannot be read ({error}).") from None
+        raise GetDPError(f"GetDP's solutions {path.name} cannot be read ({error}).") from None
     total = before + solves
     if len(raw) != total * size:
-        raise GetDPError(f"GetDP's file {path} holds {len(raw)} bytes in place of {total} "
+        raise GetDPError(f"GetDP's file {path.name} holds {len(raw)} bytes in place of {total} "
                          f"solutions of {unknowns} unknowns; a full disk looks like this.")
     heads = raw.reshape(total, size)[:, :8].copy().view(">i4")
     if not (heads == [_VECTOR, unknowns]).all():
-        raise GetDPError(f"GetDP's file {path} does not hold {total} PETSc vectors.")
+        raise GetDPError(f"GetDP's file {path.name} does not hold {total} PETSc vectors.")
     solutions = np.ndarray((solves, unknowns), ">f8", raw, offset=8 + before * size,
                            strides=(size, 8))
     if not all(np.isfinite(solution).all() for solution in solutions):
-        raise GetDPError(f"GetDP's file {path} holds values that are not finite.")
+        raise GetDPError(f"GetDP's file {path.name} holds values that are not finite.")
     return solutions
 
 
@@ -131,12 +132,12 @@ def read_saved(path: Path, unknowns: int, count: int) -> Floats:
         solutions = np.array([np.array(part.partition("$End")[0].split("\n")[2:-1], float)
                               for part in parts])
     except (OSError, ValueError) as error:
-        raise GetDPError(f"GetDP's solutions {path} cannot be read ({error}).") from None
+        raise GetDPError(f"GetDP's solutions {path.name} cannot be read ({error}).") from None
     if solutions.shape != (count, unknowns):
-        raise GetDPError(f"GetDP's file {path} holds solutions {solutions.shape} in place of "
+        raise GetDPError(f"GetDP's file {path.name} holds solutions {solutions.shape} in place of "
                          f"{count} of {unknowns} unknowns; a full disk looks like this.")
     if not np.isfinite(solutions).all():
-        raise GetDPError(f"GetDP's file {path} holds values that are not finite.")
+        raise GetDPError(f"GetDP's file {path.name} holds values that are not finite.")
     return solutions
 
 
@@ -156,8 +157,8 @@ def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
         if (lengths < 0).any() or (columns < 0).any() or (columns >= unknowns).any():
             raise ValueError("entries outside the matrix")  # scipy would follow them
     except (OSError, ValueError) as error:
-        raise GetDPError(f"GetDP's matrix {path} cannot be read ({error}).") from None
+        raise GetDPError(f"GetDP's matrix {path.name} cannot be read ({error}).") from None
     if not np.isfinite(values).all():
-        raise GetDPError(f"GetDP's matrix {path} holds values that are not finite.")
+        raise GetDPError(f"GetDP's matrix {path.name} holds values that are not finite.")
     return sparse.csr_array((values, columns, np.append(0, np.cumsum(lengths))),
                             shape=(unknowns, unknowns))

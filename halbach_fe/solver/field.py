@@ -146,7 +146,7 @@ def finite_element_part(
         return _about(near, magnet, points, session)
     placed = uses_symmetry(magnet)
     symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
-    places, index = symmetry.spread(points)
+    places, index = symmetry.source_points(points)
     if magnet.is_nonlinear:
         nominal, fields = solve_tangent(magnet, places, symmetry.sources, session,
                                         formulation_of(magnet, route))
@@ -157,7 +157,7 @@ def finite_element_part(
     here = index[symmetry.sources[0]]
 
     def block(number: int, some: Ints | slice) -> Floats:
-        placement = symmetry.placements[number]
+        placement = symmetry.images[number]
         first = 1 + size * symmetry.sources.index(placement.source)
         seen = np.moveaxis(fields[first:first + size, index[number][some]], 0, 2)
         return placement.from_source(seen)
@@ -271,20 +271,22 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
     return asked
 
 
-def check_points(magnet: Magnet, points: Floats) -> None:
+def check_points(
+    magnet: Magnet, points: Floats, key: str = "observation.positions"
+) -> None:
     """Refuse points inside magnet or iron, where the field is not what a probe can read; warn of
     points so near to the boundary that it shapes their field.
     """
     if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
-            f"Input `observation.positions` of study {magnet.name} must lie in one plane, since it "
+            f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
             f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
             "one circle, or a 3D study.")
     inside = magnet.contains(points)
     if inside.any():
         x, y, z = points[np.argmax(inside)]
         raise StudyError(
-            f"Input `observation.positions` of study {magnet.name} must lie in air; instead "
+            f"Input `{key}` of study {magnet.name} must lie in air; instead "
             f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
             f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
     mesh = MESHES[choose_route(magnet, points)]

@@ -459,5 +459,5 @@ def _failure(what: str, folder: Path) -> GetDPError:
     if shutil.disk_usage(folder).free < 10_000_000:
         hint = " The disk is full: free some space."
     log = folder / LOG_NAME
-    return GetDPError(f"GetDP did not give a result that can be trusted: {what}.{hint}"
-                      + (f" Its log is {log}." if log.is_file() else ""))
+    return GetDPError(f"GetDP did not give a result that can be trusted: {what}.{hint}",
+                      log if log.is_file() else None)

@@ -85,9 +85,9 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
             break
     if len(missing):
         where = ", ".join(f"{x:g}" for x in points[missing[0]])
-        raise PointsOutsideError(f"Input points of the mesh must lie in its "
-                                 f"{'elements' if anywhere else 'air'}; instead {len(missing)} lie "
-                                 f"in none of its elements, the first at ({where}) m.")
+        raise PointsOutsideError(mesh.regions.study, (
+            f"in its {'elements' if anywhere else 'air'}; instead {len(missing)} points lie in "
+            f"none of its elements, the first at ({where}) m."))
     rows = np.concatenate([row for row, _, _ in found])
     share = 1 / np.bincount(rows, minlength=len(points))[rows]
     mean = sparse.csr_array((share, (rows, np.arange(len(rows)))), shape=(len(points), len(rows)))
@@ -324,5 +324,5 @@ def compare_printed(ours: Floats, printed: Path, places: Floats) -> None:
     if not difference <= PRINTED_TOLERANCE * np.abs(theirs).max():
         raise GetDPError(
             f"GetDP's solution, evaluated here, is {difference:.1e} from what GetDP prints of it "
-            f"in {printed}: the unknowns of this GetDP are numbered in another way than expected. "
+            f"in {printed.name}: this GetDP numbers its unknowns in another way than expected. "
             "Use GetDP 3.2.")

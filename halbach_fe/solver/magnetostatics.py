@@ -45,7 +45,8 @@ NEWTON_TOLERANCE = 1e-10
 """Residual of Newton's method relative to the right-hand side: the last step, quadratic, ends far
 below; rounding leaves 1e-14 or so."""
 
-PROBLEM_INCLUDES = ("sources.pro", "solve_sources.pro", "solve_newton.pro")
+PROBLEM_INCLUDES = ("problem_data.pro", "sources.pro", "vector_potential.pro", "solve_sources.pro",
+                    "solve_newton.pro")
 
 
 def solve_sources(
@@ -264,9 +265,9 @@ def _source_task(
 
     return Task(
         name=f"getdp-{variant_name(vacuum)}{suffix}",
-        stage=lambda folder: fill_run_folder(case.magnet, case.mesh, places, folder,
-                                             case.formulation,
-                                   case.blocks, sources, vacuum, case.time_limit_s),
+        stage=lambda folder: fill_run_folder(
+            case.magnet, case.mesh, places, folder, case.formulation, RunRequest(
+                case.blocks, sources, vacuum, time_limit_s=case.time_limit_s)),
         read=read, solves=count)
 
 
@@ -279,8 +280,9 @@ def _newton_task(
     probes, places = probes_of(case.mesh, case.located)
 
     def fill(folder: Path) -> Job:
-        job = fill_run_folder(case.magnet, case.mesh, places, folder, case.formulation, case.blocks,
-                    (0, max(columns - 1, 0)), vacuum, case.time_limit_s, samples)
+        job = fill_run_folder(
+            case.magnet, case.mesh, places, folder, case.formulation, RunRequest(
+                case.blocks, (0, max(columns - 1, 0)), vacuum, samples, case.time_limit_s))
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
         unknowns = case.formulation.unknowns(case.mesh.inner)
         if not gateaux and unknowns > case.formulation.factorized_for_newton:
@@ -323,17 +325,41 @@ def _fields(
     return np.stack([apply_operator(operator, solutions) for operator in operators], axis=2)
 
 
+@dataclass(frozen=True)
+class RunRequest:
+    """What one run of GetDP shall solve for.
+
+    Attributes
+    ----------
+    blocks : sequence of int
+        Numbers, from 0, of the blocks that are sources of their own.
+    sources : tuple of int
+        First and last source: 0 is the whole array, then come the axes of ``blocks``.
+    vacuum : bool
+        Whether all materials are replaced by vacuum.
+    samples : ndarray, shape (k, blocks, 3), in A/m, or None
+        Magnetizations of the whole array; by default the nominal one.
+    time_limit_s : float
+    """
+
+    blocks: Sequence[int] = ()
+    sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE)
+    vacuum: bool = False
+    samples: Floats | None = None
+    time_limit_s: float = 3600.0
+
+
 def fill_run_folder(
     magnet: Magnet, mesh: VerifiedMesh, places: Floats, folder: Path, formulation: Formulation,
-    blocks: Sequence[int] = (), sources: tuple[int, int] = (NOMINAL_SOURCE, NOMINAL_SOURCE),
-    vacuum: bool = False, time_limit_s: float = 3600.0, samples: Floats | None = None,
+    request: RunRequest | None = None,
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there.
 
-    ``places`` (n, 3) in m are where GetDP prints the first source's field; ``sources`` are the
-    first and last to solve for, 0 being the whole array, the others the axes of ``blocks``.
-    ``samples`` (k, blocks, 3) in A/m are magnetizations of the whole array; default the nominal.
+    GetDP prints the first source's field at the ``places`` (n, 3) in m. Without a request it
+    solves for the nominal array.
     """
+    request = request or RunRequest()
+    blocks, sources, samples = request.blocks, request.sources, request.samples
     for name in (formulation.problem, *PROBLEM_INCLUDES):
         text = resources.files(pro).joinpath(name).read_bytes()
         (folder / name).write_bytes(text)
@@ -349,12 +375,12 @@ def fill_run_folder(
     direct = unknowns <= formulation.factorized
     return Job(
         problem=formulation.problem, mesh=MESH_NAME, resolution="Magnetostatics",
-        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]}
+        numbers={"VACUUM": request.vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1]}
         | dict(formulation.numbers),
         outputs=(FLUX_DENSITY_FILE,), solutions=SOLUTIONS_FILE,
         unknowns=unknowns, solves=sources[1] - sources[0] + 1,
         options=runner.DIRECT_SOLVER if direct else runner.CONJUGATE_GRADIENTS,
-        time_limit_s=time_limit_s)
+        time_limit_s=request.time_limit_s)
 
 
 def check_inside(name: str, radius_m: float, half_length_m: float, points: Floats) -> None:
@@ -363,8 +389,6 @@ def check_inside(name: str, radius_m: float, half_length_m: float, points: Float
     outside = (radius > radius_m) | (np.abs(points[:, 2]) > half_length_m)
     if outside.any():
         x, y, z = points[np.argmax(outside)]
-        raise PointsOutsideError(
-            f"Input `observation.positions` of study {name} must lie within the meshed region "
+        raise PointsOutsideError(name, (
             f"(radius {radius_m:g} m, half length {half_length_m:g} m); instead {outside.sum()} "
-            f"points lie outside, the first at ({x:g}, {y:g}, {z:g}) m. Check the units of the "
-            "points, or enlarge `open_boundary`.")
+            f"points lie outside, the first at ({x:g}, {y:g}, {z:g}) m."))

@@ -86,13 +86,13 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
 
 def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
     """The error, with the residuals if Newton's method is what failed."""
-    if "Newton's method did not converge" not in str(error) or not history:
+    if "Newton's method did not converge" not in error.sentence or not history:
         return error
     residuals = tuple(history[-1])
     return NotConvergedError(
-        f"{error} Relative residuals of sample {len(history)}: "
+        f"{error.sentence} Relative residuals of sample {len(history)}: "
         f"{', '.join(f'{residual:.1e}' for residual in residuals)}. Refine the mesh in the iron, "
-        "or smooth its H(B) curve.", residuals)
+        "or smooth its H(B) curve.", residuals, error.log)
 
 
 class _Counter:
@@ -157,7 +157,8 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
             raise
         kept = parent / f"{name}-failed"
         _replace(folder, kept)
-        error.args = (str(error).replace(str(folder), str(kept)),)
+        if error.log is not None:
+            error.log = kept / error.log.name
         raise
     except OSError as error:
         raise OutputError(f"Cannot write into {parent}: {error.strerror}.") from None

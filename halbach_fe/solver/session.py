@@ -1,14 +1,19 @@
-"""What every solve needs besides the study: GetDP, folders, cache, progress."""
+"""What every solve needs besides the magnet: GetDP, folders, cache, progress."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.getdp import GetDP, Run
-from halbach_fe.solver.getdp_cache import Cache
+from halbach_fe.solver.getdp import GetDP, Run, find_getdp
+from halbach_fe.solver.getdp_cache import Cache, default_cache
+
+DEFAULT_JOBS = 2
+"""Runs of GetDP at a time, if the machine has as many cores: most problems are two runs, with the
+materials as they are and with vacuum in their place."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of solves done and the number of all."""
@@ -16,25 +21,27 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Session:
-    """What a solve needs besides the study.
+    """How and where GetDP runs; `Session.open` makes one with the usual settings.
 
     Attributes
     ----------
     getdp : GetDP
+        The executable and what is known of its build.
     folder : Path
-        Where run folders are made; the finished ones are kept as ``getdp-real`` and
-        ``getdp-vacuum``, to be run by hand.
+        Run folders are made here; those of finished runs are kept (``getdp-real``,
+        ``getdp-vacuum``) and can be run by hand.
     jobs : int
-        GetDP processes at a time.
+        Runs of GetDP at a time.
     time_limit_s : float
-        For each of them.
+        Longest time of a single run.
     progress : callable, optional
+        Called with the number of finished solves and the number of all.
     cache : Cache, optional
-        Keeps what GetDP answered, for the next time that the same is asked.
+        Answers of GetDP that are kept; the same question is not solved again.
     run : callable
-        What runs GetDP: here, or elsewhere (`halbach_fe.solver.dask_cluster`).
+        Runs a job on this machine, or elsewhere (`halbach_fe.solver.dask_cluster`).
     processes : int
-        MPI processes of every run, for a solve that is too large for one.
+        MPI processes that share each run, for a solve that is too large for one process.
     """
 
     getdp: GetDP
@@ -45,3 +52,39 @@ class Session:
     cache: Cache | None = None
     run: Run = runner.run
     processes: int = 1
+
+    @classmethod
+    def open(
+        cls, folder: str | Path, jobs: int | None = None, getdp: str | None = None,
+        progress: Progress | None = None,
+    ) -> Session:
+        """Return a session with the usual settings: GetDP of this machine, and its cache.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Folder for meshes, runs and results; made when needed.
+        jobs : int, optional
+            Runs of GetDP at a time; two by default, or one on a machine of one core.
+        getdp : str, optional
+            GetDP executable; by default that of $HALBACH_FE_GETDP, then of PATH.
+        progress : callable, optional
+            See `Session`.
+
+        Raises
+        ------
+        GetDPNotFoundError
+            If there is no GetDP.
+
+        Examples
+        --------
+        >>> Session.open("results").jobs in (1, 2)
+        True
+        """
+        return cls(find_getdp(getdp), Path(folder),
+                   jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
+                   cache=default_cache(None))
+
+    def within(self, name: str) -> Session:
+        """Return the same session in a folder of its own, inside this one's."""
+        return replace(self, folder=self.folder / name)

@@ -118,7 +118,7 @@ def _fields_of_some(
             signs = frame.local(seen_by[number])[1]
             total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
         if not block.in_place:
-            turn = rotation_matrix(block.turn)
+            turn = rotation_matrix(block.rotation_rad)
             total = turn @ total @ turn.T
         yield total
 

@@ -1,1 +1,1 @@
-"""Statistics on plain arrays: Gaussian updates, noise, sampling and its convergence."""
+"""Statistics on plain arrays: Gaussian updates, noise covariances, sampling and convergence."""

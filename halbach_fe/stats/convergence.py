@@ -1,7 +1,7 @@
-"""Whether chains have converged: rank-normalized split R-hat, effective samples, Monte Carlo error.
+"""Convergence of Markov chains: R-hat, effective sample size and Monte Carlo error.
 
-A. Vehtari, A. Gelman, D. Simpson, B. Carpenter, P.-C. Buerkner, Bayesian Anal. 16 (2021) 667; by
-ArviZ.
+R-hat is rank-normalized and split. The definitions are those of A. Vehtari, A. Gelman, D. Simpson,
+B. Carpenter, P.-C. Buerkner, Bayesian Anal. 16 (2021) 667; ArviZ computes them.
 """
 
 from __future__ import annotations
@@ -17,27 +17,29 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import SamplingError
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # ArviZ announces its next version
+    warnings.simplefilter("ignore")  # ArviZ warns on import of its next version
     import arviz
 
 MAX_R_HAT = 1.01
 MIN_EFFECTIVE = 400.0
-"""What the paper above asks for before R-hat and the quantiles can be trusted."""
+"""Limits that the paper cited above recommends: the largest R-hat, and the smallest effective
+sample size with which R-hat and the quantiles can be trusted."""
 
 
 @dataclass(frozen=True)
 class ConvergenceDiagnostics:
-    """Of every parameter, arrays of shape (m,).
+    """Convergence diagnostics of each of m parameters.
 
     Attributes
     ----------
-    r_hat : ndarray
-    bulk, tail : ndarray
-        Effective samples for the mean and for the 5 and 95 % quantiles.
-    mcse : ndarray
+    r_hat : ndarray, shape (m,)
+        Rank-normalized split R-hat.
+    bulk, tail : ndarray, shape (m,)
+        Effective sample sizes for the mean, and for the 5 and 95 % quantiles.
+    mcse : ndarray, shape (m,)
         Monte Carlo standard error of the mean, in the parameter's unit.
     chains, samples : int
-        Chains, and samples of all of them.
+        Number of chains, and of the samples of all chains together.
     """
 
     r_hat: Floats
@@ -49,7 +51,7 @@ class ConvergenceDiagnostics:
 
 
 def assess_convergence(samples: Floats) -> ConvergenceDiagnostics:
-    """Diagnostics of samples (chains, draws, m)."""
+    """Return the diagnostics of samples (chains, draws, m)."""
     data = xr.Dataset({"x": (("chain", "draw", "parameter"), samples)})
 
     def figure(found: xr.Dataset) -> Floats:
@@ -63,17 +65,28 @@ def assess_convergence(samples: Floats) -> ConvergenceDiagnostics:
 def require_convergence(
     found: ConvergenceDiagnostics, names: Sequence[str], effective: float = MIN_EFFECTIVE
 ) -> None:
-    """Refuse chains that are too short.
+    """Check that the chains are long enough and agree with each other.
+
+    Parameters
+    ----------
+    found : ConvergenceDiagnostics
+    names : sequence of str
+        Names of the parameters, for the error message.
+    effective : float
+        Smallest effective sample size that is accepted.
 
     Raises
     ------
     SamplingError
-        With the worst parameter, its autocorrelation time, and how many samples would do.
+        If the chains are too short or disagree. The message names the worst
+        parameter and, for chains that are too short, its autocorrelation time and the number of
+        draws that would suffice.
     """
-    if not all(np.isfinite(one).all() for one in (found.r_hat, found.bulk, found.tail)):
+    if not all(np.isfinite(values).all() for values in (found.r_hat, found.bulk, found.tail)):
         raise SamplingError(
-            f"The chains cannot be judged: {found.samples // found.chains} draws each are too few, "
-            "or one does not move at all. Take some hundreds.")
+            f"The convergence of the chains cannot be judged: {found.samples // found.chains} "
+            "draws per chain are too few, or a chain never accepted a proposal. Take several "
+            "hundred draws per chain.")
     smallest = np.minimum(found.bulk, found.tail)
     worst = int(np.argmin(smallest))
     if smallest[worst] < effective:
@@ -81,11 +94,11 @@ def require_convergence(
         raise SamplingError(
             f"The chains are too short: {names[worst]} has {smallest[worst]:.0f} effective samples "
             f"of {found.samples} (autocorrelation time {time:.0f}), where {effective:.0f} are "
-            f"needed. Take some {time * effective / found.chains:.0f} draws of each chain, and a "
-            "tenth more that is discarded.")
+            f"needed. Take about {time * effective / found.chains:.0f} draws per chain, and a "
+            "tenth more as burn-in.")
     apart = int(np.argmax(found.r_hat))
     if found.r_hat[apart] > MAX_R_HAT:
         raise SamplingError(
             f"The chains do not agree on {names[apart]}: its R-hat is {found.r_hat[apart]:.3f}, "
-            f"where {MAX_R_HAT} is allowed. Take more draws; if that does not help, the posterior "
-            "has several modes.")
+            f"where at most {MAX_R_HAT} is allowed. Take more draws; if that does not help, the "
+            "posterior probably has several modes.")

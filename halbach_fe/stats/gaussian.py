@@ -1,4 +1,7 @@
-"""Normal distributions of the block magnetizations, by a root of their covariance; the prior."""
+"""Normal distributions of the block magnetizations and square roots of their covariances.
+
+A root of a covariance C, also called a covariance factor, is any matrix L (m, k) with C = L L'.
+"""
 
 from __future__ import annotations
 
@@ -16,74 +19,79 @@ Numbers = TypeVar("Numbers", NDArray[np.float64], NDArray[np.complex128])
 
 
 @dataclass(frozen=True)
-class Root:
-    """A root L = outer (I - V diag(1 - left) V') of a covariance, never multiplied out.
+class CovarianceFactor:
+    """A root L = outer (I - V diag(1 - remaining) V') of a covariance, stored by its parts.
 
-    The outer root of a prior is sparse: what every block has for itself, and a few columns that
-    all share. Readings, of which there may be far fewer than parameters, leave ``left`` of the
-    standard deviation along each of some orthonormal directions V, and all of it across them.
+    For a prior L is its outer root, which is sparse: small diagonal blocks for the independent
+    deviations of the magnet's blocks, and a few dense columns for the deviations that blocks share.
+    A posterior keeps the outer root of its prior. Along each orthonormal direction V the readings
+    reduce the standard deviation to the fraction ``remaining``; in all orthogonal directions it is
+    unchanged. There may be far fewer readings, and so directions, than parameters.
 
     Attributes
     ----------
     outer : ndarray or sparse array, shape (m, k)
     directions : ndarray, shape (k, r)
-        V.
-    left : ndarray, shape (r,)
+        V, with orthonormal columns; r = 0 for a prior.
+    remaining : ndarray, shape (r,)
+        Fraction of the standard deviation that remains along each direction.
     """
 
     outer: Floats | sparse.csr_array
     directions: Floats
-    left: Floats
+    remaining: Floats
 
-    __array_ufunc__ = None  # numpy leaves `array @ root` to this class
+    __array_ufunc__ = None  # numpy leaves `array @ factor` to __rmatmul__
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns (m, k)."""
+        """Numbers of rows and columns (m, k)."""
         rows, columns = self.outer.shape
         return int(rows), int(columns)
 
     def __matmul__(self, values: Floats) -> Floats:
-        """L times values (k,) or (k, n)."""
-        taken = ((1 - self.left) * (values.T @ self.directions)).T
-        return np.asarray(self.outer @ (values - self.directions @ taken))
+        """Return L times values (k,) or (k, n)."""
+        removed = ((1 - self.remaining) * (values.T @ self.directions)).T
+        return np.asarray(self.outer @ (values - self.directions @ removed))
 
     def __rmatmul__(self, matrix: Numbers) -> Numbers:
-        """A matrix (n, m) times L."""
-        if np.iscomplexobj(matrix):  # without complex copies of the directions
+        """Return a matrix (n, m) times L."""
+        if np.iscomplexobj(matrix):  # avoids complex copies of the directions
             return (matrix.real @ self) + 1j * (matrix.imag @ self)
         return self._contracted(matrix @ self.outer)
 
     def variances(self, matrix: Floats | sparse.csr_array | None = None) -> Floats:
-        """Sums of squares of the rows of a matrix (n, m) times L, (n,); without one those of L.
+        """Return the variances (n,) of the products of a matrix (n, m) with the parameters.
 
-        Those of a sparse matrix, or of L itself, to 1e-15 of what they were by the outer root.
+        They are the sums of squares of the rows of the matrix times L. Without a matrix they are
+        the variances (m,) of the parameters themselves. If the matrix is sparse, or there is none,
+        the rounding error is 1e-15 of the variance by the outer root alone.
         """
-        seen = self.outer if matrix is None else matrix @ self.outer
-        along = np.asarray(seen @ self.directions)
-        rows, columns = self.directions.shape
-        if columns == rows:
-            across: Floats | float = 0.0
-        elif isinstance(seen, np.ndarray):
-            across = _squares(seen - along @ self.directions.T)
-        else:  # as many as parameters: the difference would be an array of all pairs of them
-            across = np.maximum(0, _squares(seen) - _squares(along))
-        return np.asarray(across + _squares(along * self.left))
+        rows = self.outer if matrix is None else matrix @ self.outer
+        along = np.asarray(rows @ self.directions)
+        coordinates, directions = self.directions.shape
+        if directions == coordinates:
+            orthogonal: Floats | float = 0.0
+        elif isinstance(rows, np.ndarray):
+            orthogonal = _row_square_sums(rows - along @ self.directions.T)
+        else:  # avoids the difference, a dense array of all pairs of parameters
+            orthogonal = np.maximum(0, _row_square_sums(rows) - _row_square_sums(along))
+        return np.asarray(orthogonal + _row_square_sums(along * self.remaining))
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Floats:
-        """L as an array."""
+        """Return L as a dense array."""
         outer = self.outer if isinstance(self.outer, np.ndarray) else self.outer.toarray()
         return np.asarray(self._contracted(outer), dtype)
 
     def _contracted(self, rows: Numbers) -> Numbers:
-        """Rows (n, k) times I - V diag(1 - left) V'."""
-        if not self.left.size:
+        """Return rows (n, k) times I - V diag(1 - remaining) V'."""
+        if not self.remaining.size:
             return rows
-        return rows - ((rows @ self.directions) * (1 - self.left)) @ self.directions.T
+        return rows - ((rows @ self.directions) * (1 - self.remaining)) @ self.directions.T
 
 
-def _squares(rows: Floats | sparse.csr_array) -> Floats:
-    """Sums of squares (n,) of rows (n, k)."""
+def _row_square_sums(rows: Floats | sparse.csr_array) -> Floats:
+    """Return the sums of squares (n,) of rows (n, k)."""
     if isinstance(rows, np.ndarray):
         return np.einsum("ij,ij->i", rows, rows)
     return np.asarray(rows.power(2).sum(axis=1)).ravel()
@@ -91,35 +99,37 @@ def _squares(rows: Floats | sparse.csr_array) -> Floats:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A normal distribution, by its mean and a square root of its covariance.
+    """A normal distribution, given by its mean and a root of its covariance.
 
     Attributes
     ----------
     mean : ndarray, shape (m,)
-    root : ndarray or Root, shape (m, k)
-        Covariance = root @ root.T; any k. ``matrix @ root`` and ``root @ values`` are those of
-        either, and so is ``np.asarray(root)``.
+    root : ndarray or CovarianceFactor, shape (m, k)
+        Covariance = root @ root.T, with any k. For both types ``matrix @ root`` and
+        ``root @ values`` are arrays, and ``np.asarray(root)`` is the root as a dense array.
     """
 
     mean: Floats
-    root: Floats | Root
+    root: Floats | CovarianceFactor
 
     @property
     def covariance(self) -> Floats:
-        """Shape (m, m)."""
+        """Covariance matrix, shape (m, m)."""
         root = np.asarray(self.root)
         return root @ root.T
 
     @property
     def sd(self) -> Floats:
         """Marginal standard deviations, shape (m,)."""
-        return np.sqrt(self.root.variances() if isinstance(self.root, Root)
-                       else _squares(self.root))
+        return np.sqrt(self.root.variances() if isinstance(self.root, CovarianceFactor)
+                       else _row_square_sums(self.root))
 
     def sd_of(self, matrix: Floats | sparse.csr_array) -> Floats:
-        """Standard deviations (n,) of the products of a matrix (n, m) with the parameters."""
-        return np.sqrt(self.root.variances(matrix) if isinstance(self.root, Root)
-                       else _squares(matrix @ self.root))
+        """Return the standard deviations (n,) of the products of a matrix (n, m) with the
+        parameters.
+        """
+        return np.sqrt(self.root.variances(matrix) if isinstance(self.root, CovarianceFactor)
+                       else _row_square_sums(matrix @ self.root))
 
     def sample(self, count: int, generator: np.random.Generator) -> Floats:
         """Draw ``count`` samples, shape (count, m)."""
@@ -131,78 +141,97 @@ def nominal_prior(
     nominal: Floats, dimension: int, magnitude_sd: float, direction_sd_deg: float,
     common_mode_sd: float = 0.0,
 ) -> Gaussian:
-    """Independent deviations of every block along and across its easy axis, and a common mode.
+    """Return a prior about the nominal magnetizations.
+
+    Every block deviates independently in magnitude (along its easy axis) and in direction (across
+    the axis); in addition the magnitudes of all blocks share one relative deviation, the common
+    mode.
 
     Parameters
     ----------
     nominal : ndarray, shape (blocks * dimension,), in A/m
         Nominal magnetizations, block by block.
-    magnitude_sd, common_mode_sd : float
-        Fractions of the nominal magnetization, independent by block and shared by all.
+    dimension : int
+        Number of components of a magnetization, 2 or 3.
+    magnitude_sd : float
+        Standard deviation of each block's own magnitude, as a fraction of the nominal one.
     direction_sd_deg : float
-        Of each direction across the easy axis; a small angle, so the deviation is M times it.
+        Standard deviation of the angle about each axis across the easy axis, in degrees. The angle
+        is assumed small, so that the deviation is the magnetization times the angle in rad.
+    common_mode_sd : float
+        Standard deviation of the common mode, as a fraction of the nominal magnetization.
     """
     roots = np.zeros((nominal.size // dimension, dimension, dimension))
     for root, vector in zip(roots, nominal.reshape(-1, dimension), strict=True):
         magnitude = float(np.linalg.norm(vector))
         if magnitude == 0:
-            continue  # a block that is missing is known not to be there
+            continue  # a place without a block has no magnetization, and no uncertainty
         axis = (vector / magnitude)[:, None]
         across = linalg.null_space(axis.T)
         root[:] = magnitude * np.hstack(
             [magnitude_sd * axis, np.radians(direction_sd_deg) * across])
-    own = by_block(roots)
-    return Gaussian(nominal, beside(own, common_mode_sd * nominal[:, None])
-                    if common_mode_sd > 0 else own)
+    independent = block_diagonal_root(roots)
+    return Gaussian(nominal, stacked_root(independent, common_mode_sd * nominal[:, None])
+                    if common_mode_sd > 0 else independent)
 
 
-def by_block(roots: Floats) -> Root:
-    """Root of what every block has for itself, roots (blocks, d, k) of its covariance."""
+def block_diagonal_root(roots: Floats) -> CovarianceFactor:
+    """Return the block-diagonal root of independent blocks with roots (blocks, d, k)."""
     number = np.arange(len(roots) + 1)
-    return _sparse(sparse.bsr_array((roots, number[:-1], number)))
+    return _sparse_root(sparse.bsr_array((roots, number[:-1], number)))
 
 
-def beside(*roots: Floats | sparse.csr_array | Root) -> Root:
-    """Sparse root (m, k) of the sum of the covariances that several roots are of."""
-    return _sparse(sparse.hstack([entries(one) for one in roots]))
+def stacked_root(*roots: Floats | sparse.csr_array | CovarianceFactor) -> CovarianceFactor:
+    """Return a sparse root of the sum of covariances, whose roots (m, k_i) it holds side by side.
+
+    With [L_1 L_2 ...] as the root the covariance is L_1 L_1' + L_2 L_2' + ...
+    """
+    return _sparse_root(sparse.hstack([root_matrix(root) for root in roots]))
 
 
-def entries(root: Floats | sparse.csr_array | Root) -> Floats | sparse.csr_array:
-    """A root as one matrix, sparse if it is that of a prior."""
-    if not isinstance(root, Root):
+def root_matrix(root: Floats | sparse.csr_array | CovarianceFactor) -> Floats | sparse.csr_array:
+    """Return a root as a single matrix, which for a prior is its sparse outer root."""
+    if not isinstance(root, CovarianceFactor):
         return root
-    return np.asarray(root) if root.left.size else root.outer
+    return np.asarray(root) if root.remaining.size else root.outer
 
 
-def mounted(root: Floats | Root, turns: Floats, sources: Ints) -> Root:
-    """Root of the magnetizations of blocks that come from other places, each turned.
+def remounted_root(
+    root: Floats | CovarianceFactor, turns: Floats, sources: Ints
+) -> CovarianceFactor:
+    """Return the root after blocks were moved to other places and turned.
 
     Parameters
     ----------
+    root : ndarray or CovarianceFactor, shape (blocks * d, k)
+        Root of the magnetizations before the move.
     turns : ndarray, shape (blocks, d, d)
+        For each place, the rotation matrix of the block that is mounted there.
     sources : ndarray of int, shape (blocks,)
-        Of each place, whose block is there now.
+        For each place, the place from which its block comes.
     """
     moved = sparse.bsr_array((turns, sources, np.arange(len(turns) + 1)))
-    return _sparse(moved @ beside(root).outer)
+    return _sparse_root(moved @ stacked_root(root).outer)
 
 
-def _sparse(outer: sparse.sparray) -> Root:
-    return Root(sparse.csr_array(outer), np.zeros((outer.shape[1], 0)), np.zeros(0))
+def _sparse_root(outer: sparse.sparray) -> CovarianceFactor:
+    """Return a sparse matrix as a root that no readings have reduced."""
+    return CovarianceFactor(sparse.csr_array(outer), np.zeros((outer.shape[1], 0)), np.zeros(0))
 
 
-def rotated(vectors: Floats, sd: float) -> Floats:
-    """What turns of blocks do to their magnetizations: roots (n, d, axes) of the covariance.
+def rotation_roots(vectors: Floats, sd: float) -> Floats:
+    """Return roots (n, d, axes) of the covariances that small random rotations give vectors.
 
     Parameters
     ----------
     vectors : ndarray, shape (n, d), in A/m
-        In a cross-section (d = 2) blocks turn about z only.
+        Magnetizations of blocks. In a cross-section (d = 2) blocks rotate about z only, else about
+        x, y and z.
     sd : float
-        Of the turn about each axis, in rad.
+        Standard deviation of the rotation about each axis, in rad.
     """
-    whole = np.zeros((len(vectors), 3))
-    whole[:, :vectors.shape[1]] = vectors
+    vectors_3d = np.zeros((len(vectors), 3))
+    vectors_3d[:, :vectors.shape[1]] = vectors
     axes = np.eye(3)[2:] if vectors.shape[1] == 2 else np.eye(3)
-    changes = np.cross(axes, whole[:, None])  # (n, axes, 3)
+    changes = np.cross(axes, vectors_3d[:, None])  # (n, axes, 3)
     return np.asarray(sd * changes[:, :, :vectors.shape[1]].swapaxes(1, 2))

@@ -1,19 +1,21 @@
 """The posterior of a linear model with Gaussian prior and noise, in closed form.
 
-With p = mu_0 + L z, z ~ N(0, I), and the readings whitened, ``y = W z + e``, e ~ N(0, I), the
-posterior follows from the singular values of W = U s V': along each direction of V the readings
-leave ``1/sqrt(1 + s^2)`` of the prior's standard deviation, across them all of it (C. M. Bishop,
-Pattern Recognition and Machine Learning, eq. 2.117, in whitened coordinates). No covariance is
-inverted, C_0 may be singular, and of many parameters only as many directions are kept as there are
-readings.
+The parameters are p = mu_0 + L z with z ~ N(0, I), where L is a square root of the prior's
+covariance. The whitened readings are ``y = W z + e`` with e ~ N(0, I). The posterior follows from
+the singular value decomposition W = U s V': along each direction of V (a column of V) the
+posterior standard deviation is ``1/sqrt(1 + s^2)`` of the prior's, and in all orthogonal
+directions it equals the prior's (C. M. Bishop, Pattern Recognition and Machine Learning,
+eq. 2.117, in whitened coordinates). No covariance is inverted, the prior covariance C_0 may be
+singular, and at most as many directions are stored as there are readings.
 
-W itself need not fit into memory: it is made a part at a time. Of more readings than parameters the
-one product W'W is summed, and its eigenvectors are V. Where readings are so exact that rounding of
-the product would matter, and of fewer readings than parameters, rows are kept instead, as a square
-root of the information (G. J. Bierman, Factorization Methods for Discrete Sequential Estimation,
-1977): no more than there are parameters, by QR. Where that is still too much, as with tens of
-thousands of parameters, those combinations of readings are left out that say hardly anything, see
-`NEGLIGIBLE`.
+W need not fit into memory: its rows are computed in blocks. With more readings than parameters,
+the Gram matrix W'W is accumulated, and V are its eigenvectors. Rows are kept instead of W'W in two
+cases: with fewer readings than parameters, and with readings so exact that the rounding errors of
+W'W would change the posterior. QR decompositions then compress the rows to a square root of the
+information matrix with no more rows than parameters (G. J. Bierman, Factorization Methods for
+Discrete Sequential Estimation, 1977). If even this root is too large, as with tens of thousands of
+parameters, those combinations of readings are discarded that carry almost no information about
+the parameters; see `NEGLIGIBLE`.
 """
 
 from __future__ import annotations
@@ -27,31 +29,35 @@ import scipy.linalg as linalg
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.stats.gaussian import Gaussian, Root, beside, entries
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.noise import NoiseCovariance
 
 READINGS_AT_ONCE = 8192
-"""Rows whitened at a time: memory does not grow with the readings."""
+"""Largest number of rows that are whitened at a time, so that memory does not grow with the number
+of readings."""
 
 NUMBERS_AT_ONCE = 2**24
-"""In one part of a matrix, 128 MB: of many parameters fewer rows are taken at a time."""
+"""Largest number of entries of one block of rows (128 MB). With many parameters a block therefore
+has fewer than `READINGS_AT_ONCE` rows."""
 
 WORST_CONDITION = 1e10
-"""Of the precision of z, I + W'W, for the product: its rounding then moves the posterior by some
-1e-6 of its sd."""
+"""Largest condition number of the precision of z, I + W'W, for which the Gram matrix W'W is used.
+At this limit the rounding of W'W moves the posterior by about 1e-6 of its standard deviation."""
 
 NUMBERS_HELD = 2**26
-"""In W'W, or in the square root of the information before it is compressed, 512 MB. No more rows
-are needed than there are parameters, so that nothing is left out below 8000 of them."""
+"""Largest number of entries (512 MB) of W'W, or of the rows that are collected before they are
+compressed. At most as many rows as parameters are needed, so that with fewer than 8000 parameters
+no information is discarded."""
 
 NEGLIGIBLE = 1e-4
-"""Singular values of W that may be left out: an unknown combination of readings is then known to
-1e-4 of its noise by the prior alone, and the posterior's variance changes by 1e-8 of itself. What
-many parts leave out adds up, and is stated."""
+"""Singular values of W up to which a combination of readings may be discarded. The prior alone
+predicts such a combination to 1e-4 of its noise, and discarding one changes the posterior variance
+by 1e-8 of itself. The changes add up over all blocks; `LinearPosterior.discarded_information`
+reports their sum."""
 
 
 class Rows(Protocol):
-    """A matrix (n, m) of which rows can be had: an array, or a file."""
+    """A matrix (n, m) whose rows can be read by index: an array, or a matrix stored in a file."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, rows: Ints, /) -> Floats: ...
@@ -59,56 +65,56 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class LinearPosterior:
-    """What readings say of the parameters of a linear model.
+    """The posterior of the parameters of a linear model.
 
     Attributes
     ----------
     distribution : Gaussian
-        With a root of as many columns as the prior's.
+        Posterior distribution. Its root has as many columns as the prior's.
     log_evidence : float
-        Logarithm of the probability density of the readings under prior and noise.
-    learnt : float
-        Effective number of parameters that the readings determine, the trace of I - S^-1, S being
-        the precision of z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
-    conflict : float
-        How far the readings lie from what prior and noise foretell: mean of chi-squared,
-        ``r' (Sigma + H C_0 H')^-1 r / n``, 1 if all is well, with a standard deviation of
-        sqrt(2/n).
-    left_out : float
-        Bound of what was left out: of the change of the variance of any combination of parameters,
-        relative to that variance.
+        Log evidence: logarithm of the probability density of the readings under prior and noise.
+    parameters_learnt : float
+        Effective number of parameters that the readings determine: the trace of I - S^-1, where S
+        is the posterior precision of z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
+    prior_conflict : float
+        Chi-squared per reading, ``r' (Sigma + H C_0 H')^-1 r / n``, of the residuals r of the
+        prior's prediction. If prior, model and noise are right, its expectation is 1 and its
+        standard deviation sqrt(2/n).
+    discarded_information : float
+        Upper bound of the relative change of the posterior variance of any combination of
+        parameters because negligible combinations of readings were discarded; 0 if none were.
     """
 
     distribution: Gaussian
     log_evidence: float
-    learnt: float
-    conflict: float
-    left_out: float
+    parameters_learnt: float
+    prior_conflict: float
+    discarded_information: float
 
 
 @dataclass(frozen=True)
 class Information:
-    """Readings y = W z + e with e ~ N(0, I), by their singular values.
+    """The information of readings y = W z + e, e ~ N(0, I), about z, where W = U diag(s) V'.
 
     Attributes
     ----------
     directions : ndarray, shape (k, r)
         V.
     values : ndarray, shape (r,)
-        s.
-    pulled : ndarray, shape (r,)
+        Singular values s.
+    projected : ndarray, shape (r,)
         V' W' y.
     chi2 : float
         y' (I + W W')^-1 y.
-    left_out : float
-        Sum of squares of the singular values that were left out.
+    discarded : float
+        Sum of the squares of the singular values that were discarded as negligible.
     """
 
     directions: Floats
     values: Floats
-    pulled: Floats
+    projected: Floats
     chi2: float
-    left_out: float = 0.0
+    discarded: float = 0.0
 
 
 def update(
@@ -119,121 +125,137 @@ def update(
 
     Parameters
     ----------
-    matrix : ndarray, or what gives rows of it, shape (n, m)
-        H.
+    matrix : ndarray or Rows, shape (n, m)
+        H. With ``rows``, a matrix that also has rows of other readings.
     readings : ndarray, shape (n,)
         q.
-    noise : Noise
-        Of the n readings.
+    noise : NoiseCovariance
+        Noise of the n readings.
     prior : Gaussian
-        Of the m parameters.
+        Prior of the m parameters p.
     rows : ndarray of int, shape (n,), optional
-        Of a longer matrix, which belong to the readings.
+        Rows of ``matrix`` that belong to the n readings. Default: all rows, in their order.
     """
-    def both(some: Ints) -> Floats:
-        own = matrix[some if rows is None else rows[some]]
-        return np.column_stack([own, readings[some] - own @ prior.mean])
+    def response_and_residual(indices: Ints) -> Floats:
+        response = matrix[indices if rows is None else rows[indices]]
+        return np.column_stack([response, readings[indices] - response @ prior.mean])
 
     columns = len(prior.mean) + 1
-    found = inform(lambda: whitened_parts(both, noise, columns), (len(readings), columns),
-                   prior.root)
+    found = information_of(lambda: whitened_row_blocks(response_and_residual, noise, columns),
+                           (len(readings), columns), prior.root)
     values = found.values
-    left = 1 / np.sqrt(1 + values**2)
-    shift = found.directions @ (found.pulled / (1 + values**2))
-    log_size = float(-np.log(left).sum() + noise.log_size
-                     + len(readings) / 2 * np.log(2 * np.pi))
+    remaining = 1 / np.sqrt(1 + values**2)
+    shift = found.directions @ (found.projected / (1 + values**2))
+    log_normalization = float(-np.log(remaining).sum() + noise.log_sqrt_determinant
+                              + len(readings) / 2 * np.log(2 * np.pi))
     return LinearPosterior(
-        Gaussian(prior.mean + prior.root @ shift, Root(
-            entries(prior.root), found.directions, left)),
-        -found.chi2 / 2 - log_size, float(np.sum(values**2 / (1 + values**2))),
-        found.chi2 / len(readings), found.left_out)
+        Gaussian(prior.mean + prior.root @ shift, CovarianceFactor(
+            root_matrix(prior.root), found.directions, remaining)),
+        -found.chi2 / 2 - log_normalization, float(np.sum(values**2 / (1 + values**2))),
+        found.chi2 / len(readings), found.discarded)
 
 
 def posterior(matrix: Floats, readings: Floats, noise: NoiseCovariance,
               prior: Gaussian) -> Gaussian:
-    """The distribution that `update` finds."""
+    """Return only the posterior distribution of `update`."""
     return update(matrix, readings, noise, prior).distribution
 
 
 def contraction(prior: Gaussian, after: Gaussian, size: int) -> Floats:
-    """By block of ``size`` parameters, (m / size,): 1 - trace(C_1) / trace(C_0); 0 is nothing
-    learnt, 1 everything.
+    """Return the posterior contraction 1 - trace(C_1) / trace(C_0) of each block, (m / size,).
+
+    C_0 and C_1 are the prior and posterior covariances of the ``size`` consecutive parameters of a
+    block. The contraction is 0 if the readings carry no information about the block, and 1 if they
+    determine it completely.
     """
-    before, now = ((one.sd**2).reshape(-1, size).sum(axis=1) for one in (prior, after))
+    before, now = ((distribution.sd**2).reshape(-1, size).sum(axis=1)
+                   for distribution in (prior, after))
     return np.asarray(1 - now / before)
 
 
-def whitened_parts(
+def whitened_row_blocks(
     rows: Callable[[Ints], Floats], noise: NoiseCovariance, columns: int
 ) -> Iterator[Floats]:
-    """The whitened rows of a matrix, a part (c, k) at a time.
+    """Yield the whitened rows of a matrix in blocks (c, k).
 
-    Each part is of whole whitened readings, and takes the rows that go into them, wherever those
-    are: so readings whose noise is correlated may lie in different parts.
+    A whitened reading is a combination of all readings whose noise is correlated with it. Each
+    block asks for all rows that its whitened readings combine, wherever these rows are; correlated
+    readings may therefore belong to different blocks.
 
     Parameters
     ----------
     rows : callable
-        Indices (c,) to these rows (c, k) of the matrix.
+        Returns the rows (c, k) of the matrix with given indices (c,).
+    noise : NoiseCovariance
+        Noise of all readings.
     columns : int
-        k.
+        Number of columns k of the matrix.
     """
-    for part in parts_of(len(noise), columns):
-        weights = noise.whitening[part]
+    for block in row_slices(len(noise), columns):
+        weights = noise.whitening[block]
         needed, place = np.unique(weights.indices, return_inverse=True)
         shape = weights.shape[0], len(needed)
         yield np.asarray(sparse.csr_array((weights.data, place, weights.indptr), shape=shape)
                          @ rows(needed))
 
 
-def parts_of(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
-    """Slices of the rows of a matrix (count, columns), a part at a time, of at most so many rows
-    (default: `READINGS_AT_ONCE`).
+def row_slices(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
+    """Return slices that divide the rows of a matrix (count, columns) into blocks.
+
+    A block has at most ``most`` rows (default: `READINGS_AT_ONCE`) and, unless it is a single row,
+    at most `NUMBERS_AT_ONCE` entries.
     """
     step = min(most or READINGS_AT_ONCE, max(1, NUMBERS_AT_ONCE // max(1, columns)))
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
-def inform(
-    parts: Callable[[], Iterable[Floats]], shape: tuple[int, int], root: Floats | Root
+def information_of(
+    blocks: Callable[[], Iterable[Floats]], shape: tuple[int, int],
+    root: Floats | CovarianceFactor
 ) -> Information:
-    """What whitened readings tell.
+    """Return the information of whitened readings y = A L z + e about z.
 
     Parameters
     ----------
-    parts : callable
-        Gives the rows of [A y], parts (c, m + 1), one after the other.
+    blocks : callable
+        Returns the rows of [A y] in consecutive blocks (c, m + 1). It is called a second time if
+        the Gram matrix turns out to be too badly conditioned.
     shape : tuple of int
-        Of all rows, (n, m + 1).
-    root : ndarray or Root, shape (m, k)
-        W is A times it.
+        Number of rows in all blocks together, and of columns: (n, m + 1).
+    root : ndarray or CovarianceFactor, shape (m, k)
+        L; the response to the whitened parameters is W = A L.
     """
     rows, columns = shape
     if rows > columns and columns**2 <= NUMBERS_HELD:
-        found = _by_product(parts(), columns, root)
+        found = _information_by_product(blocks(), columns, root)
         if found.values.max(initial=0) ** 2 < WORST_CONDITION:
             return found
-    return _by_rows(np.column_stack([part[:, :-1] @ root, part[:, -1]]) for part in parts())
+    return _information_by_rows(
+        np.column_stack([block[:, :-1] @ root, block[:, -1]]) for block in blocks())
 
 
-def _by_product(parts: Iterable[Floats], columns: int, root: Floats | Root) -> Information:
+def _information_by_product(
+    blocks: Iterable[Floats], columns: int, root: Floats | CovarianceFactor
+) -> Information:
+    """Return the information from the eigenvectors of the Gram matrix W'W."""
     product = np.zeros((columns, columns))
-    for part in parts:
-        product += part.T @ part
+    for block in blocks:
+        product += block.T @ block
     squares, directions = linalg.eigh((product[:-1, :-1] @ root).T @ root)
-    squares, pulled = np.maximum(squares, 0), directions.T @ (product[-1, :-1] @ root)
-    return Information(directions, np.sqrt(squares), pulled,
-                       float(product[-1, -1] - np.sum(pulled**2 / (1 + squares))))
+    squares, projected = np.maximum(squares, 0), directions.T @ (product[-1, :-1] @ root)
+    return Information(directions, np.sqrt(squares), projected,
+                       float(product[-1, -1] - np.sum(projected**2 / (1 + squares))))
 
 
-def _by_rows(parts: Iterable[Floats]) -> Information:
+def _information_by_rows(blocks: Iterable[Floats]) -> Information:
+    """Return the information from the rows [W y], compressed whenever they need too much memory."""
     waiting: list[Floats] = []
-    rows, rest, left_out = 0, 0.0, 0.0
+    rows, chi2_outside, discarded = 0, 0.0, 0.0
     limit = 0
-    for part in parts:
-        waiting.append(part)
-        rows += len(part)
-        columns = part.shape[1]
+    for block in blocks:
+        waiting.append(block)
+        rows += len(block)
+        columns = block.shape[1]
         enough = max(columns, READINGS_AT_ONCE)
         limit = max(limit, min(enough, max(1, NUMBERS_HELD // columns)))
         if rows <= limit:
@@ -242,67 +264,82 @@ def _by_rows(parts: Iterable[Floats]) -> Information:
         if enough * columns <= NUMBERS_HELD:
             held = np.asarray(np.linalg.qr(held, mode="r"))
         else:
-            held, less = _compressed(held)
-            rest, left_out = rest + less[0], left_out + less[1]
+            held, removed = _without_negligible(held)
+            chi2_outside, discarded = chi2_outside + removed[0], discarded + removed[1]
             limit = max(limit, 2 * len(held))
         waiting, rows = [held], len(held)
     held = np.vstack(waiting)
     u, values, directions = linalg.svd(held[:, :-1], full_matrices=False, check_finite=False)
-    seen = u.T @ held[:, -1]
-    rest += float(np.sum((held[:, -1] - u @ seen) ** 2))
-    return Information(directions.T, values, values * seen,
-                       rest + float(np.sum(seen**2 / (1 + values**2))), left_out)
+    within = u.T @ held[:, -1]  # y along the columns of U; the remainder has W = 0
+    chi2_outside += float(np.sum((held[:, -1] - u @ within) ** 2))
+    return Information(directions.T, values, values * within,
+                       chi2_outside + float(np.sum(within**2 / (1 + values**2))), discarded)
 
 
-def _compressed(held: Floats) -> tuple[Floats, tuple[float, float]]:
-    """Rows [W y] without the combinations that say nothing of z; and of these the sum of squares of
-    y, and of the singular values of W.
+def _without_negligible(held: Floats) -> tuple[Floats, tuple[float, float]]:
+    """Remove the combinations of rows [W y] with negligible singular values of W.
+
+    Returns
+    -------
+    kept : ndarray, shape (c, k + 1)
+        The remaining combinations.
+    removed : tuple of float
+        Of the removed combinations: the sum of squares of y, and an upper bound of the sum of the
+        squared singular values of W.
     """
     squares, vectors = linalg.eigh(held[:, :-1] @ held[:, :-1].T)
     kept = squares > NEGLIGIBLE**2
     gone = vectors[:, ~kept].T @ held[:, -1]
-    rounding = np.finfo(float).eps * squares.max(initial=0)  # small ones are known to that
+    rounding = np.finfo(float).eps * squares.max(initial=0)  # error of the small eigenvalues
     return vectors[:, kept].T @ held, (float(gone @ gone), float(
         np.maximum(squares[~kept], rounding).sum()))
 
 
 def predict(matrix: Rows, parameters: Gaussian) -> tuple[Floats, Floats]:
-    """Mean and standard deviation (n,) of the noise-free readings H p."""
+    """Return mean and standard deviation (n,) of the noise-free readings H p."""
     mean, sd = np.empty(len(matrix)), np.empty(len(matrix))
-    for part in parts_of(len(matrix), len(parameters.mean)):
-        rows = matrix[np.arange(part.start, part.stop)]
-        mean[part], sd[part] = rows @ parameters.mean, parameters.sd_of(rows)
+    for block in row_slices(len(matrix), len(parameters.mean)):
+        rows = matrix[np.arange(block.start, block.stop)]
+        mean[block], sd[block] = rows @ parameters.mean, parameters.sd_of(rows)
     return mean, sd
 
 
 def whitened(
     residual: Floats, noise: NoiseCovariance, root: Callable[[Ints], Floats], columns: int
 ) -> Floats:
-    """Residuals of a prediction, whitened by its covariance and the noise's, (n,): independent and
-    standard normal if all is well.
+    """Return residuals (n,), whitened by the covariance of noise and prediction together.
 
-    Of all roots of the inverse of ``Sigma + R R'`` it is, after W, the symmetric one,
-    ``(I + A A')^-1/2`` with A = W R: the nearest to the residual that each reading has by itself.
-    By the singular values of A it takes the time of one update, however many the readings.
+    If the model is right, the whitened residuals are independent and standard normal.
+
+    A covariance ``Sigma + R R'`` can be whitened by any root of its inverse. Here the residuals are
+    first whitened by the noise (W), and then by the symmetric root ``(I + A A')^-1/2`` with
+    A = W R. The symmetric root changes each noise-whitened residual least, so that a whitened
+    residual can still be attributed to its reading. It is applied by the singular values of A,
+    which costs as much as one update, whatever the number of readings.
 
     Parameters
     ----------
     residual : ndarray, shape (n,)
-        Measured less predicted. Of readings that the model has not seen; those that it was fitted
-        to lie nearer.
-    noise : Noise
+        Measured minus predicted readings. The readings must not have been used in the fit, since
+        residuals of training readings are smaller than this covariance says.
+    noise : NoiseCovariance
+        Noise of the n readings.
     root : callable
-        Indices (c,) to these rows (c, columns) of R, a root of the covariance of the prediction.
+        Returns the rows (c, columns) with given indices (c,) of R, a root of the covariance of the
+        prediction.
     columns : int
+        Number of columns of R.
     """
-    own = noise.whiten(residual)
+    by_noise = noise.whiten(residual)
     if not columns:
-        return own
-    found = inform(lambda: (np.column_stack([part, own[place]]) for place, part in zip(
-        parts_of(len(own), columns), whitened_parts(root, noise, columns), strict=True)),
-        (len(own), columns + 1), beside(sparse.eye_array(columns, format="csr")))
+        return by_noise
+    found = information_of(lambda: (
+        np.column_stack([block, by_noise[place]]) for place, block in zip(
+            row_slices(len(by_noise), columns), whitened_row_blocks(root, noise, columns),
+            strict=True)),
+        (len(by_noise), columns + 1), stacked_root(sparse.eye_array(columns, format="csr")))
     size = np.sqrt(1 + found.values**2)
-    # 1/size - 1, over squares
-    toward = found.directions @ (found.pulled / (size * (1 + size)))
-    return own - np.concatenate([
-        part @ toward for part in whitened_parts(root, noise, columns)])
+    # projected * (1 - 1/size) / values^2, in a form that is finite for singular values of 0
+    toward = found.directions @ (found.projected / (size * (1 + size)))
+    return by_noise - np.concatenate([
+        block @ toward for block in whitened_row_blocks(root, noise, columns)])

@@ -1,8 +1,9 @@
-"""Noise of readings: normal with mean 0, independent from reading to reading or correlated in some.
+"""The noise covariance of readings: normal with mean 0, independent or correlated in small groups.
 
-The readings of one point, or of one circle, may be correlated, those of different ones are not. So
-the covariance Sigma is sparse: in blocks, each with a Cholesky factor of its own, and whitening by
-``W = L^-1``, for which ``W Sigma W' = I``, costs next to nothing.
+Readings of the same point, or of the same circle, may be correlated; readings of different points
+or circles are not. The covariance Sigma is therefore sparse: up to the order of the readings it is
+block-diagonal, and each block has its own Cholesky factor. Whitening by ``W = L^-1``, so that
+``W Sigma W' = I``, is cheap.
 """
 
 from __future__ import annotations
@@ -22,44 +23,47 @@ from halbach_fe.core.errors import MeasurementError, must_be
 Rows = slice | Ints | NDArray[np.bool_]
 
 ASYMMETRY = 1e-9
-"""Of the two sd's: how far a covariance may be from symmetric. Products of sparse matrices are
-within 1e-15."""
+"""Largest asymmetry of a covariance, relative to the product of the two standard deviations.
+Rounding in products of sparse matrices gives 1e-15."""
 
 SINGULAR = 1e-12
-"""Of its variance: what those before it must leave a reading. Rounding leaves 1e-15 of a singular
-matrix; a probe's noise is never 1e-6 of what the readings of a point have in common."""
+"""Smallest conditional variance of a reading, given the readings before it in its block, relative
+to its variance. For a singular covariance rounding leaves about 1e-15. The independent noise of a
+probe is always more than 1e-6 of the standard deviation that the readings of a point share."""
 
 
 @dataclass(frozen=True)
 class NoiseCovariance:
-    """A normal distribution with mean 0.
+    """Normally distributed noise of readings, with mean 0 and a sparse covariance.
 
     Attributes
     ----------
     covariance : sparse array, shape (n, n), in T^2
+        Sigma.
 
     Raises
     ------
     MeasurementError
-        If it is not symmetric, or not positive definite.
+        If the covariance is not finite, not symmetric, or not positive definite.
     """
 
     covariance: sparse.csr_array
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.covariance.data).all():
-            raise _refused("of finite numbers", "an infinite or missing one")
+            raise _covariance_error("of finite numbers", "an infinite or missing one")
         if not (self.covariance.diagonal() > 0).all():
-            raise _refused("of positive variances", f"{self.covariance.diagonal().min():g} T^2")
+            raise _covariance_error("of positive variances",
+                                    f"{self.covariance.diagonal().min():g} T^2")
         if self.independent:
             return
-        odd = abs(self.covariance - self.covariance.T).tocoo()
-        rows, columns = odd.coords
-        if (odd.data > ASYMMETRY * self.sd[rows] * self.sd[columns]).any():
-            worst = int(np.argmax(odd.data / (self.sd[rows] * self.sd[columns])))
-            raise _refused("symmetric", f"two values for readings {rows[worst] + 1} and "
-                           f"{columns[worst] + 1}")
-        self._factors  # noqa: B018, refuses what has none
+        asymmetry = abs(self.covariance - self.covariance.T).tocoo()
+        rows, columns = asymmetry.coords
+        if (asymmetry.data > ASYMMETRY * self.sd[rows] * self.sd[columns]).any():
+            worst = int(np.argmax(asymmetry.data / (self.sd[rows] * self.sd[columns])))
+            raise _covariance_error("symmetric", "two different values for readings "
+                                    f"{rows[worst] + 1} and {columns[worst] + 1}")
+        self._factors  # noqa: B018, raises if the covariance has no Cholesky factor
 
     def __len__(self) -> int:
         return self.covariance.shape[0]
@@ -71,12 +75,12 @@ class NoiseCovariance:
 
     @cached_property
     def independent(self) -> bool:
-        """Whether no reading is correlated with another."""
+        """Whether the noise of no two readings is correlated."""
         return bool(self.covariance.nnz == len(self))
 
     @cached_property
     def _factors(self) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """L, with L L' = Sigma, and its inverse."""
+        """The lower triangular factor L, with L L' = Sigma, and its inverse, both sparse."""
         if self.independent:
             return sparse.diags_array(self.sd).tocsr(), sparse.diags_array(1 / self.sd).tocsr()
         parts = []
@@ -84,12 +88,12 @@ class NoiseCovariance:
             scale = self.sd[index]
             try:
                 lower = np.linalg.cholesky(blocks / (scale[:, :, None] * scale[:, None, :]))
-                left = np.einsum("kii->ki", lower) ** 2
+                conditional_variance = np.einsum("kii->ki", lower) ** 2
             except np.linalg.LinAlgError:
-                left = np.zeros(1)
-            if left.min() < SINGULAR:
-                raise _refused("positive definite", "a singular or indefinite one, as of a "
-                               "reading that is the sum of others")
+                conditional_variance = np.zeros(1)
+            if conditional_variance.min() < SINGULAR:
+                raise _covariance_error("positive definite", "a singular or indefinite matrix, as "
+                                        "if the noise of a reading were the sum of others")
             parts.append((index, scale[:, :, None] * lower,
                           np.linalg.inv(lower) / scale[:, None, :]))
         rows = np.concatenate([np.repeat(index, index.shape[1], axis=1).ravel()
@@ -98,7 +102,7 @@ class NoiseCovariance:
 
         def joined(which: int) -> sparse.csr_array:
             values = np.concatenate([part[which].ravel() for part in parts])
-            used = values != 0  # of triangles
+            used = values != 0  # the other triangle is zero
             return sparse.csr_array((values[used], (rows[used], columns[used])),
                                     shape=self.covariance.shape)
 
@@ -106,64 +110,77 @@ class NoiseCovariance:
 
     @property
     def whitening(self) -> sparse.csr_array:
-        """W, sparse."""
+        """The whitening matrix W = L^-1, sparse, shape (n, n)."""
         return self._factors[1]
 
     @property
-    def log_size(self) -> float:
-        """Logarithm of the root of the determinant."""
+    def log_sqrt_determinant(self) -> float:
+        """Logarithm of the square root of the determinant of Sigma."""
         return float(np.log(self._factors[0].diagonal()).sum())
 
     @property
-    def finest(self) -> float:
-        """What all readings may be off by, in T, for none of them whitened to be off by more than
-        1; of independent ones the smallest standard deviation.
+    def uniform_error_scale(self) -> float:
+        """Largest e in T such that errors of at most e of every reading change no whitened reading
+        by more than 1. For independent noise, e is the smallest standard deviation.
         """
         return float(1 / abs(self._factors[1]).sum(axis=1).max())
 
     def whiten(self, values: Floats, rows: Rows = slice(None)) -> Floats:
-        """W times values (n,) or (n, k), or some rows of that."""
+        """Return W times values (n,) or (n, k), or only the given rows of this product."""
         if not self.independent:
             return np.asarray(self._factors[1][rows] @ values)
         sd = self.sd[rows]
         return np.asarray(values[rows] / (sd if values.ndim == 1 else sd[:, None]))
 
     def sample(self, generator: np.random.Generator) -> Floats:
-        """Draw the noise of all readings once, (n,) in T."""
+        """Draw one sample of the noise of all readings, (n,) in T."""
         return np.asarray(self._factors[0] @ generator.standard_normal(len(self)))
 
-    def part(self, rows: Rows) -> NoiseCovariance:
-        """The noise of some readings."""
+    def subset(self, rows: Rows) -> NoiseCovariance:
+        """Return the (marginal) noise of some of the readings."""
         return NoiseCovariance(self.covariance[rows][:, rows])
 
-    def given(self, rows: Rows, seen: Rows) -> tuple[sparse.csr_array, NoiseCovariance]:
-        """Matrix R (rows, seen) that foretells the noise of some readings from that of others, and
-        the noise of the first that remains: what R does not foretell is independent of the seen.
+    def conditional(self, rows: Rows, seen: Rows) -> tuple[sparse.csr_array, NoiseCovariance]:
+        """Condition the noise of some readings on the noise of others.
+
+        Parameters
+        ----------
+        rows, seen : slice or ndarray
+            The readings whose noise is predicted, and the disjoint readings whose noise is known.
+
+        Returns
+        -------
+        regression : sparse array, shape (rows, seen)
+            R. The conditional mean of the noise of ``rows`` is R times the noise of ``seen``.
+        noise : NoiseCovariance
+            Conditional covariance, which does not depend on the noise of ``seen``.
         """
         cross = self.covariance[rows][:, seen]
         if not cross.nnz:
-            return cross, self.part(rows)
-        white = self.part(seen)._factors[1]
+            return cross, self.subset(rows)
+        white = self.subset(seen)._factors[1]
         half = cross @ white.T
         return half @ white, NoiseCovariance(self.covariance[rows][:, rows] - half @ half.T)
 
-    def beside(self, other: NoiseCovariance) -> NoiseCovariance:
-        """The noise of these readings and others, which are independent of them."""
+    def stacked_with(self, other: NoiseCovariance) -> NoiseCovariance:
+        """Return the noise of these readings followed by others, which are independent of them."""
         return NoiseCovariance(
             sparse.csr_array(sparse.block_diag([self.covariance, other.covariance])))
 
-    def plus(self, sd: Floats) -> NoiseCovariance:
-        """Add independent errors with standard deviations (n,) in T, which may be 0."""
+    def with_independent_errors(self, sd: Floats) -> NoiseCovariance:
+        """Return the noise with independent errors added, of standard deviations (n,) in T that may
+        be 0.
+        """
         return NoiseCovariance(sparse.csr_array(self.covariance + sparse.diags_array(sd**2)))
 
 
-def independent(sd: Floats) -> NoiseCovariance:
-    """Noise of independent readings with standard deviations (n,) in T.
+def independent_noise(sd: Floats) -> NoiseCovariance:
+    """Return the noise of independent readings with standard deviations (n,) in T.
 
     Raises
     ------
     MeasurementError
-        If one is not positive.
+        If a standard deviation is not a positive, finite number.
     """
     if not (np.isfinite(sd) & (sd > 0)).all():
         number = int(np.argmin(np.isfinite(sd) & (sd > 0)))
@@ -172,19 +189,22 @@ def independent(sd: Floats) -> NoiseCovariance:
     return NoiseCovariance(sparse.csr_array(sparse.diags_array(np.asarray(sd, float) ** 2)))
 
 
-def _refused(expected: str, received: str) -> MeasurementError:
+def _covariance_error(expected: str, received: str) -> MeasurementError:
+    """Return the error that says how a covariance must be, and what was received."""
     return MeasurementError(must_be("covariance", "the noise", expected, received))
 
 
 def _blocks(covariance: sparse.csr_array) -> Iterator[tuple[Ints, Floats]]:
-    """Indices (k, b) of all sets of b readings that are correlated, and their covariances (k, b,
-    b); by size.
+    """Yield the diagonal blocks of a covariance, those of equal size b together.
+
+    Each item holds the indices (k, b) of the readings of k groups, which are correlated within a
+    group but not between groups, and the covariances (k, b, b) of the groups.
     """
     _, label = connected_components(covariance, directed=False)
     sizes = np.bincount(label)
     order = np.argsort(label, kind="stable")
     first = np.cumsum(sizes) - sizes
-    place = np.empty(len(label), int)  # within its set
+    place = np.empty(len(label), int)  # of each reading within its group
     place[order] = np.arange(len(label)) - first[label[order]]
     entries = covariance.tocoo()
     rows, columns = entries.coords

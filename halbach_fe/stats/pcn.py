@@ -1,15 +1,17 @@
-"""Samples of the posterior of a non-linear model.
+"""Markov chain Monte Carlo sampling of the posterior of a non-linear model.
 
-The chain lives in coordinates xi in which a Gaussian reference is white, p = m + R xi: the prior,
-which gives the preconditioned Crank-Nicolson algorithm (S. L. Cotter et al., Statist. Sci. 28
-(2013) 424), centred on the prior's mean; or Laplace's approximation at the mode, which gives its
-generalized form (D. Rudolf, B. Sprungk, Found. Comput. Math. 18 (2018) 309), with step 1 an
-independence sampler. The proposal ``xi' = sqrt(1 - s^2) xi + s eta`` leaves the reference
-invariant, so that only target over reference decides whether it is accepted.
+Proposals are made in coordinates xi in which a Gaussian reference measure is standard normal,
+p = m + R xi. With the prior as the reference this is the preconditioned Crank-Nicolson algorithm
+(S. L. Cotter et al., Statist. Sci. 28 (2013) 424), centred on the prior's mean. With Laplace's
+approximation at the mode it is the generalized algorithm of D. Rudolf, B. Sprungk (Found. Comput.
+Math. 18 (2018) 309); a step of 1 makes it an independence sampler. The proposal
+``xi' = sqrt(1 - s^2) xi + s eta`` leaves the reference invariant, so that the acceptance
+probability depends only on the ratio of the posterior and reference densities.
 
-With a surrogate a proposal is screened by the cheap model first, and only what passes is solved
-for; the second decision corrects the first, and the target stays the exact one (J. A. Christen,
-C. Fox, J. Comput. Graph. Statist. 14 (2005) 795).
+With a surrogate, a proposal must first be accepted by a cheap model, and only accepted proposals
+are passed to the exact model (delayed acceptance). The second acceptance step corrects the error
+of the first, so that the chain samples the exact posterior (J. A. Christen, C. Fox, J. Comput.
+Graph. Statist. 14 (2005) 795).
 """
 
 from __future__ import annotations
@@ -26,24 +28,31 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.noise import NoiseCovariance
 
 Model = Callable[[Floats], Floats]
-"""Parameters (m,) to readings (n,)."""
+"""Maps parameters (m,) to readings (n,)."""
 
 MAX_GAUSS_NEWTON = 30
+"""Largest number of Gauss-Newton steps to the mode."""
+
 MODE_TOLERANCE = 1e-3
-"""Of a posterior standard deviation: how far the mode may be off."""
+"""Length of a Gauss-Newton step, in posterior standard deviations, below which the mode counts as
+found."""
 
 
 @dataclass
 class Posterior:
-    """The posterior of a model, up to a constant; counts the model's solves.
+    """The unnormalized posterior of a model, which the chain samples.
 
     Attributes
     ----------
     model : callable
-        Parameters (m,) to readings (n,) in T.
-    readings : ndarray, shape (n,)
-    noise : Noise
+        Maps parameters (m,) to readings (n,) in T.
+    readings : ndarray, shape (n,), in T
+    noise : NoiseCovariance
+        Noise of the n readings.
     prior : Gaussian
+        Prior of the m parameters.
+    solves : int
+        Number of evaluations of the log likelihood so far; each solves the model once.
     """
 
     model: Model
@@ -53,7 +62,7 @@ class Posterior:
     solves: int = field(default=0, init=False)
 
     def log_likelihood(self, parameters: Floats) -> float:
-        """Without the constant."""
+        """Return the log likelihood of parameters (m,), up to a constant."""
         self.solves += 1
         residual = self.noise.whiten(self.model(parameters) - self.readings)
         return -float(residual @ residual) / 2
@@ -61,29 +70,32 @@ class Posterior:
 
 @dataclass(frozen=True)
 class ReferenceMeasure:
-    """A Gaussian in the prior's own coordinates z, p = mu_0 + L z: z = centre + root xi.
+    """A Gaussian reference measure in the prior's whitened coordinates z, p = mu_0 + L z.
+
+    ``z = centre + root xi`` is distributed like the reference if xi is standard normal.
 
     Attributes
     ----------
     centre : ndarray, shape (k,)
     root, inverse : ndarray, shape (k, k)
+        Square root of the covariance of z, and the inverse of this root.
     """
 
     centre: Floats
     root: Floats
     inverse: Floats
 
-    def place(self, xi: Floats) -> Floats:
-        """z of xi."""
+    def to_z(self, xi: Floats) -> Floats:
+        """Return z (k,) of the reference coordinates xi (k,)."""
         return self.centre + self.root @ xi
 
-    def white(self, z: Floats) -> Floats:
-        """xi of z."""
+    def to_xi(self, z: Floats) -> Floats:
+        """Return the reference coordinates xi (k,) of z (k,)."""
         return self.inverse @ (z - self.centre)
 
 
 def prior_reference(prior: Gaussian) -> ReferenceMeasure:
-    """The prior itself."""
+    """Return the prior as the reference measure."""
     size = prior.root.shape[1]
     return ReferenceMeasure(np.zeros(size), np.eye(size), np.eye(size))
 
@@ -91,28 +103,33 @@ def prior_reference(prior: Gaussian) -> ReferenceMeasure:
 def laplace(
     posterior: Posterior, jacobian: Callable[[Floats], Floats]
 ) -> tuple[ReferenceMeasure, Floats]:
-    """Laplace's approximation: the mode by Gauss-Newton with halved steps, and the curvature there.
+    """Return Laplace's approximation of the posterior as a reference measure.
+
+    The mode is found by Gauss-Newton steps, which are halved until the posterior density increases;
+    the covariance is the inverse of the Gauss-Newton Hessian at the mode.
 
     Parameters
     ----------
+    posterior : Posterior
     jacobian : callable
-        Parameters (m,) to dq/dp (n, m).
+        Maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
 
     Returns
     -------
-    reference : Reference
+    reference : ReferenceMeasure
     mode : ndarray, shape (m,)
+        Parameters at the mode.
 
     Raises
     ------
     SamplingError
-        If the mode is not found.
+        If the mode is not found in `MAX_GAUSS_NEWTON` steps.
     """
     prior = posterior.prior
     z = np.zeros(prior.root.shape[1])
 
-    def objective(place: Floats) -> float:
-        return float(place @ place) / 2 - posterior.log_likelihood(prior.mean + prior.root @ place)
+    def objective(at: Floats) -> float:
+        return float(at @ at) / 2 - posterior.log_likelihood(prior.mean + prior.root @ at)
 
     value = objective(z)
     for _ in range(MAX_GAUSS_NEWTON):
@@ -135,13 +152,14 @@ def laplace(
 
 @dataclass(frozen=True)
 class Proposal:
-    """A proposal that leaves its reference invariant, ``xi' = sqrt(1 - s^2) xi + s eta``.
+    """A proposal that leaves its reference measure invariant, ``xi' = sqrt(1 - s^2) xi + s eta``.
 
     Attributes
     ----------
-    reference : Reference
+    reference : ReferenceMeasure
+        Measure in whose coordinates xi the step is taken.
     step : float
-        s in (0, 1].
+        Step size s in (0, 1].
     """
 
     reference: ReferenceMeasure
@@ -150,16 +168,16 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Chain:
-    """A chain of samples.
+    """A Markov chain of samples.
 
     Attributes
     ----------
     samples : ndarray, shape (steps, m)
-        Parameters.
+        Parameters after each step.
     accepted : float
-        Fraction of the proposals.
+        Fraction of the proposals that were accepted.
     last : ndarray, shape (k,)
-        z where it ended, to go on from.
+        Whitened coordinates z of the last sample, from which the chain can be continued.
     """
 
     samples: Floats
@@ -168,54 +186,59 @@ class Chain:
 
 
 def sample(
-    posterior: Posterior, moves: Sequence[Proposal], count: int, generator: np.random.Generator,
+    posterior: Posterior, proposals: Sequence[Proposal], count: int, generator: np.random.Generator,
     start: Floats, surrogate: Posterior | None = None, first: int = 0,
 ) -> Chain:
-    """Run a chain that takes its moves in turn; each leaves the posterior invariant.
+    """Run a Markov chain that uses the proposals in turn; each leaves the posterior invariant.
 
-    Laplace's approximation moves fast where the posterior is nearly normal, but its tails may be
-    too light; a move of the prior among them, whose weights are bounded, reaches everywhere.
+    Proposals from Laplace's approximation mix fast where the posterior is nearly normal, but the
+    approximation may have lighter tails than the posterior. Proposals from the prior should be
+    among them: their acceptance weights are bounded, so that the chain reaches the tails too.
 
     Parameters
     ----------
+    posterior : Posterior
+        Distribution to sample.
+    proposals : sequence of Proposal
     count : int
-        Steps, of which each gives a sample.
+        Number of steps; each gives a sample.
+    generator : numpy.random.Generator
     start : ndarray, shape (k,)
-        z to start from.
+        Whitened coordinates z at which the chain starts.
     surrogate : Posterior, optional
-        Of a cheap model, which screens.
+        Posterior of a cheap model, which screens the proposals.
     first : int
-        Number of the first step, by which the moves are taken in turn.
+        Number of the first step; step i uses the proposal ``i % len(proposals)``.
     """
     prior = posterior.prior
 
-    def place(z: Floats) -> Floats:
+    def parameters_at(z: Floats) -> Floats:
         return np.asarray(prior.mean + prior.root @ z)
 
     z = start
-    value = posterior.log_likelihood(place(z))
-    cheap = surrogate.log_likelihood(place(z)) if surrogate else 0.0
+    value = posterior.log_likelihood(parameters_at(z))
+    cheap = surrogate.log_likelihood(parameters_at(z)) if surrogate else 0.0
     samples = np.empty((count, len(prior.mean)))
     accepted = 0
     for number in range(count):
-        move = moves[(first + number) % len(moves)]
-        xi = move.reference.white(z)
-        xi_there = (np.sqrt(1 - move.step**2) * xi
-                    + move.step * generator.standard_normal(len(xi)))
-        there = move.reference.place(xi_there)
-        # log of prior over reference, there less here
-        weight = float(z @ z - there @ there - xi @ xi + xi_there @ xi_there) / 2
-        gain, cheap_there = weight, 0.0
+        proposal = proposals[(first + number) % len(proposals)]
+        xi = proposal.reference.to_xi(z)
+        xi_new = (np.sqrt(1 - proposal.step**2) * xi
+                  + proposal.step * generator.standard_normal(len(xi)))
+        z_new = proposal.reference.to_z(xi_new)
+        # log of the ratio of prior and reference densities: proposed minus current value
+        weight = float(z @ z - z_new @ z_new - xi @ xi + xi_new @ xi_new) / 2
+        gain, cheap_new = weight, 0.0
         passed = True
         if surrogate is not None:
-            cheap_there = surrogate.log_likelihood(place(there))
-            screen = weight + cheap_there - cheap
+            cheap_new = surrogate.log_likelihood(parameters_at(z_new))
+            screen = weight + cheap_new - cheap
             passed = np.log(generator.uniform()) < screen
-            gain = cheap - cheap_there  # what the first decision took for granted
+            gain = cheap - cheap_new  # undoes the surrogate's part of the first acceptance step
         if passed:
-            value_there = posterior.log_likelihood(place(there))
-            if np.log(generator.uniform()) < gain + value_there - value:
-                z, value, cheap = there, value_there, cheap_there
+            value_new = posterior.log_likelihood(parameters_at(z_new))
+            if np.log(generator.uniform()) < gain + value_new - value:
+                z, value, cheap = z_new, value_new, cheap_new
                 accepted += 1
-        samples[number] = place(z)
+        samples[number] = parameters_at(z)
     return Chain(samples, accepted / max(count, 1), z)

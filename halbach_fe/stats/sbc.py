@@ -1,9 +1,9 @@
-"""Simulation-based calibration, which shows whether posteriors are as sure as they may be.
+"""Simulation-based calibration, which tests whether posterior distributions have the right width.
 
-With a truth drawn from the prior and readings from the truth, the rank of the truth among
-independent draws of the posterior is uniform, whatever the model (S. Talts et al.,
-arXiv:1804.06788). A posterior that is too sure, or a chain that has not moved, piles ranks up at
-the ends.
+If true parameters are drawn from the prior and readings are simulated from them, the rank of the
+true value among independent draws from the posterior is uniformly distributed, whatever the model
+(S. Talts et al., arXiv:1804.06788). If the posterior is too narrow, or a chain has not moved, the
+lowest and highest ranks are too frequent.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.noise import NoiseCovariance
 
 Sampler = Callable[[Floats, np.random.Generator], Floats]
-"""Readings (n,) to draws of the posterior (draws, m), nearly independent."""
+"""Maps readings (n,) to nearly independent draws (draws, m) from the posterior."""
 
 BINS = 10
+"""Number of bins of the histogram of the ranks."""
 
 
 def ranks(
@@ -28,7 +29,31 @@ def ranks(
     repeats: int, generator: np.random.Generator,
     say: Callable[[int], None] = lambda number: None,
 ) -> tuple[Ints, int]:
-    """Ranks (repeats, m) of the truth among draws, and the number of draws."""
+    """Simulate ``repeats`` inferences and rank the true parameters among posterior draws.
+
+    Parameters
+    ----------
+    prior : Gaussian
+        Distribution of the true parameters (m,).
+    model : callable
+        Maps parameters (m,) to noise-free readings (n,).
+    noise : NoiseCovariance
+        Noise that is added to the readings.
+    sampler : callable
+        The inference under test, see `Sampler`.
+    repeats : int
+        Number of simulated inferences.
+    generator : numpy.random.Generator
+    say : callable
+        Reports progress; called with the number of completed inferences.
+
+    Returns
+    -------
+    ranks : ndarray of int, shape (repeats, m)
+        Number of draws below the true value.
+    draws : int
+        Number of draws of each posterior.
+    """
     found = []
     draws = np.empty((0, 0))
     for number in range(repeats):
@@ -41,11 +66,22 @@ def ranks(
 
 
 def uniformity(found: Ints, draws: int) -> tuple[Floats, float]:
-    """p-values (m,) that the ranks of each parameter are uniform, by chi-squared over `BINS` bins,
-    and one for all of them.
+    """Test that ranks are uniformly distributed.
 
-    Parameters are correlated in the posterior, but their ranks hardly are; Bonferroni's correction
-    for the smallest p-value holds in any case.
+    Parameters
+    ----------
+    found : ndarray of int, shape (repeats, m)
+        Ranks, from `ranks`.
+    draws : int
+        Number of draws of each posterior.
+
+    Returns
+    -------
+    values : ndarray, shape (m,)
+        p-value of each parameter, by a chi-squared test over `BINS` bins.
+    combined : float
+        p-value of all parameters together: the smallest p-value with Bonferroni's correction,
+        which is valid even if the ranks of different parameters are correlated.
     """
     edges = np.linspace(0, draws + 1, BINS + 1)
     expected = np.diff(np.ceil(edges)) / (draws + 1) * len(found)

@@ -1,4 +1,4 @@
-"""What samples of blocks tell about the others: mean, covariance, and whether they look normal."""
+"""Covariances and tests of normality from small samples of measured blocks."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import numpy as np
 import scipy.special as special
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.stats.gaussian import Gaussian, beside, by_block
+from halbach_fe.stats.gaussian import Gaussian, block_diagonal_root, stacked_root
 
 MIN_TESTED = 8
-"""Samples below which the approximation of Anderson and Darling's p-value does not hold."""
+"""Smallest sample size for which the approximation of the Anderson-Darling p-value is valid."""
 
 
 def shrunk_covariance(samples: Floats) -> tuple[Floats, float]:
-    """Covariance of few samples, drawn towards a multiple of the identity.
+    """Return the covariance of few samples, shrunk towards a multiple of the identity.
 
-    O. Ledoit, M. Wolf, J. Multivariate Anal. 88 (2004) 365, with the samples' own mean taken off
-    and the result times n/(n - 1).
+    The estimator is that of O. Ledoit, M. Wolf, J. Multivariate Anal. 88 (2004) 365, about the
+    sample mean and multiplied by n/(n - 1).
 
     Parameters
     ----------
@@ -25,9 +25,9 @@ def shrunk_covariance(samples: Floats) -> tuple[Floats, float]:
     Returns
     -------
     covariance : ndarray, shape (d, d)
-        Positive definite for any n > 1, unless all samples are the same.
+        Positive definite for any n > 1, unless all samples are equal.
     intensity : float
-        Weight of the identity, 0 to 1.
+        Shrinkage intensity: weight of the multiple of the identity, 0 to 1.
     """
     count, size = samples.shape
     centred = samples - samples.mean(axis=0)
@@ -41,24 +41,27 @@ def shrunk_covariance(samples: Floats) -> tuple[Floats, float]:
 
 
 def predictive_covariance(samples: Floats) -> tuple[Floats, float]:
-    """Covariance to expect of a new sample about the true mean, for lack of the true covariance.
+    """Return the covariance of a new sample about the true mean, including its own uncertainty.
 
-    Of n > d + 2 samples it is the sample covariance times (n - 1)/(n - 3), the second moment of
-    Student's t: errors over these sd's have an rms of 1, whatever the true covariance. Of fewer it
-    is Ledoit and Wolf's, times k/(k - 2) with k = (n - 1)(1 + intensity (d - 1)) the degrees of
-    freedom that the variances rest on; the rms is then 1 on average over the components, but
-    between 0.4 and 1.5 for single ones if their true sd's differ by a factor of five (simulated).
+    The true covariance is unknown, so that the estimated covariance is widened. For n > d + 2
+    samples the result is the sample covariance times (n - 1)/(n - 3), the second moment of
+    Student's t distribution: deviations divided by these standard deviations have an rms of 1,
+    whatever the true covariance. For fewer samples the result is the shrunk covariance times
+    k/(k - 2), where k = (n - 1)(1 + intensity (d - 1)) is the number of degrees of freedom of the
+    estimated variances. The rms is then 1 on average over the components; in simulations it was
+    between 0.4 and 1.5 for single components whose true standard deviations differed by a factor of
+    five.
 
     Parameters
     ----------
     samples : ndarray, shape (n, d)
-        At least 3.
+        At least three samples.
 
     Returns
     -------
     covariance : ndarray, shape (d, d)
     intensity : float
-        Ledoit and Wolf's, 0 where the sample covariance is used.
+        Shrinkage intensity, see `shrunk_covariance`; 0 if the sample covariance is used.
     """
     count, size = samples.shape
     if count > size + 2:
@@ -66,48 +69,55 @@ def predictive_covariance(samples: Floats) -> tuple[Floats, float]:
     else:
         covariance, intensity = shrunk_covariance(samples)
     freedom = (count - 1) * (1 + intensity * (size - 1))
-    # 3 samples that shrink hardly: 2 degrees of freedom, whose t has no variance
+    # three samples with hardly any shrinkage have 2 degrees of freedom: t has no finite variance
     return covariance * freedom / max(freedom - 2, 0.5), intensity
 
 
 def measured_prior(
     mean: Floats, own: Floats, shared: Floats, mounting_sd: float, common_mode_sd: float
 ) -> Gaussian:
-    """Normal distribution of all magnetizations, of what varies from block to block and what not.
+    """Return the prior of all magnetizations from the measured blocks.
+
+    The covariance is the sum of the blocks' independent deviations, of deviations that several
+    blocks share, of random rotations at mounting, and of a common relative deviation.
 
     Parameters
     ----------
     mean : ndarray, shape (blocks, d), in A/m
     own : ndarray, shape (blocks, d, d), in A^2/m^2
-        Covariance of what each block has for itself, positive definite.
+        Covariance of the independent deviation of each block, positive definite.
     shared : ndarray, shape (blocks, d, s), in A/m
-        Columns that several blocks have in common; s may be 0.
+        Root of the covariance of deviations that several blocks share; s may be 0.
     mounting_sd : float
-        In rad, of the turn t of every block about each axis when it is mounted: t x M has the
-        covariance ``mounting_sd^2 (|M|^2 - M M^T)``.
+        Standard deviation in rad of the rotation t about each axis at the mounting of a block. The
+        change t x M of its magnetization M has the covariance ``mounting_sd^2 (|M|^2 - M M^T)``.
     common_mode_sd : float
-        Fraction of the magnetization shared by all, of the coil's calibration.
+        Standard deviation of the relative error of the calibration of the Helmholtz coil, which all
+        blocks share.
     """
     outer = np.einsum("bi,bj->bij", mean, mean)
     across = np.sum(mean**2, axis=1)[:, None, None] * np.eye(mean.shape[1]) - outer
     roots = np.linalg.cholesky(own + mounting_sd**2 * across)
-    return Gaussian(mean.ravel(), beside(
-        by_block(roots), shared.reshape(mean.size, -1), common_mode_sd * mean.reshape(-1, 1)))
+    return Gaussian(mean.ravel(), stacked_root(
+        block_diagonal_root(roots), shared.reshape(mean.size, -1),
+        common_mode_sd * mean.reshape(-1, 1)))
 
 
 def anderson_darling(samples: Floats) -> tuple[float, float]:
-    """Test normality of samples (n,) whose mean and variance are not known.
+    """Test whether samples (n,) are normally distributed, with unknown mean and variance.
+
+    `scipy.stats.anderson` gives p-values between 0.01 and 0.15 only, which is too narrow a range
+    for the correction by `holm`.
 
     Returns
     -------
     statistic : float
-        A^2 (1 + 0.75/n + 2.25/n^2).
+        Anderson-Darling statistic, A^2 (1 + 0.75/n + 2.25/n^2).
     p : float
-        Approximation of M. A. Stephens in R. B. D'Agostino, M. A. Stephens (eds.),
-        Goodness-of-Fit Techniques (1986), table 4.9. NaN for fewer than `MIN_TESTED` samples, or
-        samples that are all the same.
+        p-value, by the approximation of M. A. Stephens in R. B. D'Agostino, M. A. Stephens (eds.),
+        Goodness-of-Fit Techniques (1986), table 4.9.
 
-    (scipy.stats.anderson tells the p-value between 0.01 and 0.15 only, too little for Holm.)
+    Both are NaN for fewer than `MIN_TESTED` samples, and if all samples are equal.
     """
     count = len(samples)
     if count < MIN_TESTED or np.ptp(samples) == 0:
@@ -117,7 +127,7 @@ def anderson_darling(samples: Floats) -> tuple[float, float]:
     a2 = -count - np.mean(odd * (special.log_ndtr(z) + special.log_ndtr(-z[::-1])))
     a = float(a2 * (1 + 0.75 / count + 2.25 / count**2))
     if a >= 0.6:
-        # the parabola turns up again at 153; far below the smallest p that matters
+        # the fitted parabola rises again beyond 153; at 100 p is already far below any use
         return a, float(np.exp(1.2937 - 5.709 * min(a, 100) + 0.0186 * min(a, 100) ** 2))
     if a > 0.34:
         return a, float(np.exp(0.9177 - 4.279 * a - 1.38 * a**2))
@@ -127,10 +137,10 @@ def anderson_darling(samples: Floats) -> tuple[float, float]:
 
 
 def holm(p: Floats) -> Floats:
-    """p-values (n,) adjusted for their number; NaN are no tests.
+    """Adjust p-values (n,) for multiple testing by Holm's method; NaN stays NaN and is not counted.
 
-    S. Holm, Scand. J. Statist. 6 (1979) 65: the chance that any true hypothesis has an adjusted
-    value below alpha is at most alpha.
+    The probability that any true hypothesis has an adjusted p-value below alpha is at most alpha
+    (S. Holm, Scand. J. Statist. 6 (1979) 65).
     """
     adjusted = np.full(p.shape, np.nan)
     tests = np.flatnonzero(~np.isnan(p))

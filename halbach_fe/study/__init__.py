@@ -1,1 +1,1 @@
-"""The study file: a magnet, its measurement and what is known beforehand, as one TOML document."""
+"""The study file: one TOML document of a magnet, its measurement and the prior knowledge of it."""

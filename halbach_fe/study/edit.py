@@ -1,7 +1,8 @@
-"""Changes of a study written into the user's own file, whose comments and order stay.
+"""Editing of a user's study file in place, so that its comments and the order of its keys stay.
 
-What differs between the study of the file and another one is set key by key, each with a note; keys
-that go become comments. Numbers are written in full: the file reads back to exactly that study.
+Every key whose value differs between the study in the file and the wanted study is set, with a note
+beside it that says why; a key that is removed stays as a comment. Numbers are written with all
+digits: the edited file reads back to exactly the wanted study.
 """
 
 from __future__ import annotations
@@ -20,29 +21,32 @@ from halbach_fe.study.inference import ExcludedReading
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 
-LOST = ("Written anew: the study's own file cannot be changed key by key, so that its comments are "
-        "there only.")
+REWRITTEN_NOTE = ("Rewritten in full: the original study file could not be changed key by key. Its "
+                  "comments are in the original only.")
+"""First line of a file that could not be edited in place."""
 
 Keys = MutableMapping[str, Any]
 
 
 def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
-    """A study file changed step by step.
+    """Return the text of a study file after a series of changes.
 
-    A file whose layout defeats that (tables that come in several pieces) is written anew.
+    If the layout of the file prevents an edit in place (tables that are split into several pieces,
+    for example), the whole file is rewritten from the study, and a comment at its top says so.
 
     Parameters
     ----------
     text : str
-        Of the file.
+        Content of the study file.
     steps : iterable of (Study, str)
-        Studies, each with what its difference from the one before is for. Where the file names an
-        H(B) table, a study holds its numbers, and so will the file.
+        The successive studies, each with a note that says why it differs from the study before.
+        Where the file refers to a file of an H(B) curve, the studies hold the numbers of that
+        curve, and so does the returned text.
 
     Raises
     ------
     StudyError
-        If a study is none that a file could hold.
+        If a study is not valid.
     """
     notes = []
     for study, note in steps:
@@ -59,21 +63,21 @@ def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
         except (TOMLKitError, tomllib.TOMLDecodeError, StudyError):
             whole = False
         if not whole:
-            text = _anew(study, [LOST, *notes])
-        elif note not in text:  # tables in several pieces have no room for it
+            text = _rewritten(study, [REWRITTEN_NOTE, *notes])
+        elif note not in text:  # a table in several pieces has no line to put the note on
             text = f"# {note}\n{text}"
     return text
 
 
 def _change(table: Keys, before: BaseModel, after: BaseModel, note: str) -> None:
-    """Set in a table what differs between two models of it."""
+    """Set those keys of a table that differ between two models, and leave the others alone."""
     there = set(table)
     for name in type(after).model_fields:
         old, new = getattr(before, name), getattr(after, name)
         if old == new:
             continue
         if new is None:
-            _retire(table, name)
+            _comment_out(table, name)
         elif isinstance(new, BaseModel) and type(old) is type(new):
             if name not in table:
                 table[name] = tomlkit.inline_table() if _in_line(table) else tomlkit.table()
@@ -92,9 +96,13 @@ def _change(table: Keys, before: BaseModel, after: BaseModel, note: str) -> None
 def _change_list(
     table: Keys, name: str, before: tuple[BaseModel, ...], after: tuple[BaseModel, ...], note: str
 ) -> None:
-    """Set what differs between two lists of tables, the second not shorter than the first."""
+    """Set the keys that differ between two lists of tables, and append the new tables.
+
+    ``after`` is at least as long as ``before``.
+    """
     if name not in table:
-        in_rows = _in_line(table) or isinstance(after[0], ExcludedReading)  # many, and short
+        # excluded readings are many and short: one inline list reads better than many tables
+        in_rows = _in_line(table) or isinstance(after[0], ExcludedReading)
         table[name] = [] if in_rows else tomlkit.aot()
     there = table[name]
     for number, (old, new) in enumerate(zip(before, after, strict=False)):
@@ -102,14 +110,14 @@ def _change_list(
     for new in after[len(before):]:
         if isinstance(there, AoT):
             there.append(_table(new, note))
-            there[-1].trivia.indent = ""  # of two empty lines one is enough
+            there[-1].trivia.indent = ""  # tomlkit would add a second empty line
         else:
             there.append(_plain(new))
     _note_beside(there, note)
 
 
 def _set(table: Keys, name: str, value: object, note: str) -> None:
-    """Set a key, with a note beside it where there is room for one."""
+    """Set a key, with a note beside it if it stands on a line of its own."""
     if isinstance(value, BaseModel) and not _in_line(table):
         table[name] = _table(value, note)
         return
@@ -118,7 +126,7 @@ def _set(table: Keys, name: str, value: object, note: str) -> None:
 
 
 def _move_up(table: Keys, old: set[str]) -> None:
-    """Put new keys right behind the old ones, before comments that belong to what follows."""
+    """Move new keys right after the old ones, before comments that belong to the next table."""
     if not isinstance(table, Table) or not old:
         return
     body = table.value.body
@@ -130,8 +138,8 @@ def _move_up(table: Keys, old: set[str]) -> None:
     body[:] = [*rest[:last + 1], *(body[number] for number in moved), *rest[last + 1:]]
 
 
-def _retire(table: Keys, name: str) -> None:
-    """Take a key away; its line stays as a comment, where a comment may stand."""
+def _comment_out(table: Keys, name: str) -> None:
+    """Remove a key; its line stays as a comment, except in inline tables, which have no lines."""
     if not isinstance(table, Table):
         table.pop(name)
         return
@@ -143,12 +151,12 @@ def _retire(table: Keys, name: str) -> None:
 
 
 def _in_line(item: object) -> bool:
-    """Whether it stands on one line, and has no room for notes in it."""
+    """Whether an item stands on one line, so that notes cannot stand inside it."""
     return isinstance(item, InlineTable | Array)
 
 
 def _table(model: BaseModel, note: str) -> Table:
-    """A table of its own, what is in it in line."""
+    """Return a model as a table with a header of its own; tables within it are inline."""
     table = tomlkit.table()
     for name, value in model.model_dump(mode="json", exclude_defaults=True).items():
         table[name] = _plain(value)
@@ -158,37 +166,39 @@ def _table(model: BaseModel, note: str) -> Table:
 
 
 def _plain(value: object) -> object:
-    """A value to stand on one line."""
+    """Return a value in a form that TOML writes on one line."""
     if isinstance(value, BaseModel):
         value = value.model_dump(mode="json", exclude_defaults=True)
     if isinstance(value, tuple | list):
-        return [_plain(one) for one in value]
+        return [_plain(element) for element in value]
     if not isinstance(value, dict):
         return value
     table = tomlkit.inline_table()
-    for name, one in value.items():
-        table[name] = _plain(one)
+    for name, element in value.items():
+        table[name] = _plain(element)
     return table
 
 
 def _inside(item: object, note: str) -> str:
-    """The note for changes within an item, if there is room for one."""
+    """Return the note for changes inside an item, or an empty one if the item is inline."""
     return "" if _in_line(item) else note
 
 
 def _note_beside(item: Any, note: str) -> None:
-    """A note for changes within what has no room for one."""
+    """Add the note beside an inline item, for changes inside it."""
     if _in_line(item):
         _add_note(item, note)
 
 
 def _add_note(item: Item, note: str) -> None:
+    """Append a note to the comment at the end of an item's line, unless the comment has it."""
     there = item.trivia.comment.lstrip("# ").rstrip()
     if note and note not in there:
         item.comment(f"{there}; {note}" if there else note)
         item.trivia.comment_ws = "  "
 
 
-def _anew(study: Study, notes: list[str]) -> str:
+def _rewritten(study: Study, notes: list[str]) -> str:
+    """Return a study file with all keys of a study that are not defaults, after some comments."""
     lines = "".join(f"# {note}\n" for note in notes if note)
     return f"{lines}\n{tomlkit.dumps(study.model_dump(mode='json', exclude_defaults=True))}"

@@ -1,4 +1,4 @@
-"""Keys of a study that describe the inference: prior, held-out readings, the plan."""
+"""Keys of a study that describe the inference: prior, held-out readings, measurement plan."""
 
 from __future__ import annotations
 
@@ -23,19 +23,22 @@ from halbach_fe.study.types import (
 
 
 class Prior(StudyModel):
-    """What is known of the blocks before the map: sd about the nominal magnetization.
+    """Prior standard deviations of the blocks' magnetizations about their nominal values.
 
-    ``magnitude_sd`` and ``common_mode_sd`` are fractions of the nominal magnetization: the first
-    is independent from block to block, the second shared by all (the calibration of the
-    Helmholtz coil, or a nominal value that is off). ``direction_sd_deg`` holds for each of the
-    two directions across the easy axis.
+    ``magnitude_sd`` and ``common_mode_sd`` are fractions of the nominal magnetization. The
+    deviation of ``magnitude_sd`` is independent from block to block; that of ``common_mode_sd`` is
+    shared by all blocks (an error of the data sheet, or of the Helmholtz coil's calibration).
+    ``direction_sd_deg`` is the standard deviation of the angle of the magnetization, in each of the
+    two directions perpendicular to the easy axis.
 
-    Where the blocks themselves were measured (`halbach_fe.measurement.block_table`), their moments
-    take the place of ``magnitude_sd`` and ``direction_sd_deg``, and the rest holds:
-    ``mounting_sd_deg`` is how far each block may be turned about each axis when it is mounted.
-    ``types`` are the slots of each type of block (default: each slot is a type, its number the
-    label). Moments m are taken to the reference temperature by ``m(T) = m(T_ref) (1 + coefficient
-    (T - T_ref))``, if both are given.
+    The other keys concern a block table, the measured moments of the single blocks (see
+    `halbach_fe.measurement.block_table`). With a block table, the measured moments replace
+    ``magnitude_sd`` and ``direction_sd_deg``; ``common_mode_sd`` still applies.
+    ``mounting_sd_deg`` is the standard deviation of the rotation of a mounted block about each
+    axis. ``types`` lists the slots of every block type; by default every slot is a type of its own,
+    labelled by its number. With ``temperature_coefficient_per_K`` and ``reference_temperature_C``,
+    moments are corrected to the reference temperature by
+    ``m(T) = m(T_ref) (1 + coefficient (T - T_ref))``.
     """
 
     magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
@@ -55,11 +58,13 @@ class Prior(StudyModel):
 
 
 class HeldOut(StudyModel):
-    """Which readings are kept from the update and only predicted: all that any key names.
+    """Held-out readings, which the update does not use and only predicts.
 
-    Readings are grouped in runs of ``window`` consecutive z positions; the last of every
-    ``every`` runs is held out (without any key: of every 2). ``radii_m`` are distances from the
-    axis, ``z_ranges_m`` pairs of limits.
+    A reading is held out if any of these keys selects it. ``every`` groups the readings into
+    windows of ``window`` consecutive z positions and selects the last of every ``every`` windows;
+    a table without any key means ``every = 2``. ``radii_m`` selects readings at these distances
+    from the axis, ``components`` selects components of B, and ``z_ranges_m`` selects readings
+    between a lower and an upper limit of z.
     """
 
     every: Annotated[int, Field(ge=2, le=1000)] | None = None
@@ -77,7 +82,8 @@ class HeldOut(StudyModel):
     @model_validator(mode="after")
     def _consistent(self) -> HeldOut:
         if self.every is None and self.window > 1:
-            raise ValueError("window needs every: the last of how many windows is held out?")
+            raise ValueError("window needs every, because the last of every so many windows is "
+                             "held out; give every too")
         for low, high in self.z_ranges_m:
             if low > high:
                 raise ValueError(f"z_ranges_m must be pairs of a lower and an upper limit, not "
@@ -86,21 +92,26 @@ class HeldOut(StudyModel):
 
 
 class ExcludedReading(StudyModel):
-    """Components, or all, of a row of the map, from 1; its number alone stands for all."""
+    """Components of B in one row of the map that are excluded from the inference.
+
+    Rows are numbered from 1. A row number in place of this table excludes all components.
+    """
 
     row: Annotated[int, Field(ge=1)]
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
 
 
 def _row_or_table(value: Any) -> Any:
+    """Expand a row number to the table of that row."""
     return {"row": value} if isinstance(value, int) else value
 
 
 class Inference(StudyModel):
-    """How the update is done and judged.
+    """Readings that the inference does not use.
 
-    ``excluded_readings`` are neither used nor predicted, as outliers should be. Their components
-    are those of the magnet's axes.
+    Readings of ``held_out`` are predicted, as a test of the model. Those of ``excluded_readings``,
+    outliers for example, are neither used nor predicted. Their components are along the magnet's
+    axes, after the axes of the map have been converted (see Instrument).
     """
 
     held_out: HeldOut | None = None
@@ -110,8 +121,10 @@ class Inference(StudyModel):
 
 
 class Plan(StudyModel):
-    """What `halbach-fe plan` chooses from (default: the observation's positions), and how many
-    points (default: as many as the observation has).
+    """Settings of `halbach-fe plan`, which chooses the most informative measurement positions.
+
+    ``points`` is the number of positions to choose (default: as many as ``observation`` has),
+    ``candidates`` the positions to choose from (default: those of ``observation``).
     """
 
     points: Annotated[int, Field(ge=1, le=100_000)] | None = None

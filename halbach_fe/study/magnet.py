@@ -1,4 +1,4 @@
-"""Keys of a study that describe the magnet: blocks, iron, what is around it."""
+"""Keys of a study that describe the magnet: its blocks, its iron ring, and external sources."""
 
 from __future__ import annotations
 
@@ -30,16 +30,19 @@ from halbach_fe.study.types import (
 
 
 class SectorBlock(StudyModel):
-    """A sector of an annulus; ``angular_gap_deg`` is the free angle between neighbours."""
+    """A block that is a sector of an annulus.
+
+    ``angular_gap_deg`` is the angle between the side faces of neighbouring blocks.
+    """
 
     shape: Literal["sector"]
     angular_gap_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
 
 
 class TrapezoidBlock(StudyModel):
-    """A trapezoid with flat faces at the inner and the outer radius.
+    """A block that is a trapezoid with flat faces at the inner and the outer radius.
 
-    ``side_gap_m`` is the clearance between the parallel side faces of neighbours.
+    ``side_gap_m`` is the distance between the facing, parallel side faces of neighbouring blocks.
     """
 
     shape: Literal["trapezoid"]
@@ -47,10 +50,11 @@ class TrapezoidBlock(StudyModel):
 
 
 class CuboidBlock(StudyModel):
-    """A cuboid, radially from the inner to the outer radius of the array, ``width_m`` wide.
+    """A cuboid block: as thick as the array's outer minus inner radius, and ``width_m`` wide.
 
-    ``orientation`` says what its faces follow: the block's ``position`` angle, or its
-    ``magnetization`` angle, as is usual in arrays built from magnetized cubes.
+    With ``orientation = "position"`` the block's thickness is along the radius. With
+    ``"magnetization"`` it is along the nominal magnetization of its slot, as is usual in arrays
+    that are built from magnetized cubes.
     """
 
     shape: Literal["cuboid"]
@@ -62,23 +66,32 @@ Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminato
 
 
 class BlockException(StudyModel):
-    """What is different in the blocks of one ring, or one slot, or both, from the array's.
+    """Deviations of some blocks from the array's common values.
 
-    ``magnetization_angle_deg`` turns the magnetization, never the shape. A recoil permeability
-    alone is that in all directions. ``mounted_from`` is the ring and slot that the block was meant
-    for: its magnetization comes with it, in its own axes.
+    The exception holds for the blocks of ``ring``, of ``slot``, or for the one block of both; with
+    neither key it holds for all blocks.
 
-    ``magnetization_factor`` is 0 for a block that is missing, -1 for one upside down.
-    ``magnetization_gradient`` is by how much the magnetization of the outer half exceeds that of
-    the inner one, as a fraction of their mean; ``inner_corner_loss`` the fraction that both corners
-    of the bore have lost, over a sixth of the block's width and a sixth of its thickness.
+    Material: ``remanence_T``, ``recoil_permeability`` and ``recoil_permeability_across`` replace
+    the array's values; ``recoil_permeability`` alone holds in all directions.
 
-    A block stands off its place by ``displacement_m`` along its own axes (radial, azimuthal,
-    axial), turned by ``rotation_deg`` about them through its middle; ``shift_m`` is along x, y, z,
-    and ``twist_deg`` turns it about the magnet's axis. Several exceptions of a block add up in
-    these, and multiply in ``magnetization_factor``; of the other keys the last counts. Finite
-    elements, which know the reaction of permeability and iron only, take blocks to be in their
-    places, whole and uniform.
+    Magnetization: ``magnetization_angle_deg`` replaces the direction of the magnetization and
+    leaves the block's shape as it is. ``mounted_from`` names the ring and slot that the block was
+    made for; its magnetization keeps the direction that it has relative to the block.
+    ``magnetization_factor`` multiplies the magnetization: 0 for a missing block, -1 for a block
+    that was mounted upside down. ``magnetization_gradient`` is the magnetization of the outer half
+    minus that of the inner half of the block, as a fraction of their mean. ``inner_corner_loss`` is
+    the fraction of the magnetization that the two corners at the bore have lost, each over a sixth
+    of the block's width and a sixth of its thickness.
+
+    Position: ``displacement_m`` displaces the block along its own radial, azimuthal and axial
+    direction, and ``rotation_deg`` is a rotation vector along the same axes, about the block's
+    middle. ``shift_m`` displaces the block along x, y and z, and ``twist_deg`` rotates it about the
+    magnet's axis.
+
+    If several exceptions hold for a block, their displacements and rotations add up, and their
+    factors multiply; of every other key, the last value counts. The finite-element part of the
+    field, which is only the reaction of permeability and iron, treats every block as if it were in
+    its nominal place, whole and uniformly magnetized.
     """
 
     ring: Annotated[int, Field(ge=1)] | None = None
@@ -98,13 +111,18 @@ class BlockException(StudyModel):
 
 
 class Array(StudyModel):
-    """The permanent-magnet array, in general: ``rings`` equal rings of ``blocks_per_ring`` blocks.
+    """The permanent-magnet array: ``rings`` equal rings of ``blocks_per_ring`` = N blocks.
 
-    Block ``i`` (from 1) sits at ``first_block_angle_deg + (i-1) 360/N``; its magnetization turns
-    ``1 + multipole_order`` times faster (K. Halbach, Nucl. Instrum. Methods 169 (1980) 1), from
-    ``first_magnetization_angle_deg``. Rings are numbered from 1 at the lowest z.
-    ``recoil_permeability`` is relative and holds along the easy axis, and across it unless
-    ``recoil_permeability_across`` says otherwise.
+    The middle of slot ``i`` (from 1) is at the angle ``first_block_angle_deg + (i-1) 360/N`` about
+    the z axis. The angle of its magnetization is ``first_magnetization_angle_deg +
+    (1 + multipole_order) (i-1) 360/N`` (K. Halbach, Nucl. Instrum. Methods 169 (1980) 1). Rings are
+    numbered from 1 at the lowest z; ``ring_length_m`` is along z, ``ring_gap_m`` lies between
+    rings.
+
+    ``recoil_permeability`` is relative and holds along the easy axis;
+    ``recoil_permeability_across`` holds perpendicular to it (default: the same). Exactly one of
+    ``remanence_T`` and ``block_moment_A_m2``, the magnetic moment of every block, gives the
+    strength.
     """
 
     multipole_order: Annotated[int, Field(ge=1, le=20)] = 1
@@ -134,12 +152,13 @@ class Array(StudyModel):
             raise ValueError("give exactly one of remanence_T and block_moment_A_m2")
         if self.block_moment_A_m2 is not None and self.ring_length_m is None:
             raise ValueError("block_moment_A_m2 needs ring_length_m, to know the block's volume")
-        for one in self.exceptions:
-            if (one.ring or 1) > self.rings or (one.slot or 1) > self.blocks_per_ring:
+        for exception in self.exceptions:
+            ring, slot = exception.ring or 1, exception.slot or 1
+            if ring > self.rings or slot > self.blocks_per_ring:
                 raise ValueError(
-                    f"an exception names ring {one.ring}, slot {one.slot} of an array of "
-                    f"{self.rings} rings of {self.blocks_per_ring} blocks")
-            ring, slot = one.mounted_from or (1, 1)
+                    f"an exception names ring {exception.ring}, slot {exception.slot} of an array "
+                    f"of {self.rings} rings of {self.blocks_per_ring} blocks")
+            ring, slot = exception.mounted_from or (1, 1)
             if ring > self.rings or slot > self.blocks_per_ring:
                 raise ValueError(
                     f"an exception's block was meant for ring {ring}, slot {slot} of an array of "
@@ -148,9 +167,11 @@ class Array(StudyModel):
 
 
 class TableCurve(StudyModel):
-    """H(B) as a table, in a CSV file (``H_A_per_m,B_T``, its path from the study's folder) or here.
+    """A magnetization curve as a table of H in A/m and B in T.
 
-    Read from a file, the study holds its numbers.
+    The table is either the CSV file ``file``, with the header ``H_A_per_m,B_T`` (its path is
+    relative to the study's folder), or the two lists ``H_A_per_m`` and ``B_T``. When a study is
+    read, the numbers of the file replace its name.
     """
 
     kind: Literal["table"]
@@ -170,7 +191,7 @@ class TableCurve(StudyModel):
 
 
 class SteelCurve(StudyModel):
-    """A curve that comes with halbach-fe, by name."""
+    """A magnetization curve that comes with halbach-fe, by name."""
 
     kind: Literal["steel"]
     name: str
@@ -184,7 +205,10 @@ class SteelCurve(StudyModel):
 
 
 class FroehlichKennellyCurve(StudyModel):
-    """B = mu_0 H + J_s H / (H + h), h following from the initial permeability."""
+    """The magnetization curve B = mu_0 H + J_s H / (H + h) of Froehlich and Kennelly.
+
+    J_s is the saturation polarization; h follows from the initial relative permeability.
+    """
 
     kind: Literal["froehlich_kennelly"]
     initial_relative_permeability: Annotated[float, Field(ge=2.0, le=1e6)]
@@ -198,7 +222,10 @@ class FroehlichKennellyCurve(StudyModel):
 
 
 class BrauerCurve(StudyModel):
-    """H = (k1 exp(k2 B^2) + k3) B, as far as its slope stays below that of vacuum."""
+    """Brauer's magnetization curve H = (k1 exp(k2 B^2) + k3) B.
+
+    Where dH/dB would exceed that of vacuum, the curve continues with the slope of vacuum.
+    """
 
     kind: Literal["brauer"]
     k1_m_per_H: Annotated[float, Field(gt=0.0, le=1e6)]
@@ -216,7 +243,11 @@ IronCurve = Annotated[TableCurve | SteelCurve | FroehlichKennellyCurve | BrauerC
 
 
 class IronRing(StudyModel):
-    """A coaxial iron tube outside the array, of constant permeability or with an H(B) curve."""
+    """A coaxial iron tube outside the array.
+
+    The iron has either a constant ``relative_permeability`` or a magnetization ``curve``.
+    ``length_m`` is along z, centred at z = 0 (default: as long as the array).
+    """
 
     inner_radius_m: Length
     outer_radius_m: Length
@@ -237,8 +268,10 @@ class IronRing(StudyModel):
 
 
 class Neighbour(StudyModel):
-    """Another magnet like this one, in vacuum: its middle on the axis at ``z_m``, turned about the
-    axis, and stronger or weaker by ``factor``.
+    """Another magnet with the same blocks, in vacuum, on the same axis.
+
+    Its middle is at ``z_m``; it is rotated by ``turn_deg`` about the axis, and its magnetizations
+    are those of this magnet multiplied by ``factor``.
     """
 
     z_m: Coordinate
@@ -247,14 +280,17 @@ class Neighbour(StudyModel):
 
 
 class PointDipole(StudyModel):
-    """A magnetized object, as a point."""
+    """A distant magnetized object, approximated by a point dipole."""
 
     position_m: Point
     moment_A_m2: tuple[Moment, Moment, Moment]
 
 
 class External(StudyModel):
-    """Fields that are not the magnet's, added to it: they magnetize no iron."""
+    """Fields of sources outside the magnet, added to its field.
+
+    ``background_T`` is uniform. The reaction of iron and blocks to external fields is neglected.
+    """
 
     background_T: FluxDensityVector = (0.0, 0.0, 0.0)
     neighbours: tuple[Neighbour, ...] = ()
@@ -262,12 +298,13 @@ class External(StudyModel):
 
 
 class Demagnetization(StudyModel):
-    """What the magnet material withstands, by its data sheet at the reference temperature, and the
-    hottest it gets.
+    """Resistance of the magnet material to demagnetization, and the temperature to assess it at.
 
-    The knee is at ``squareness`` times the intrinsic coercivity: there the polarization has lost a
-    tenth (H_k of IEC 60404-8-1). Remanence and intrinsic coercivity change linearly with
-    temperature, by the fraction of a coefficient per kelvin.
+    Remanence (of ``array``) and intrinsic coercivity are the data-sheet values at
+    ``reference_temperature_C``; both change linearly with temperature, by the fraction
+    ``..._coefficient_per_K`` per kelvin. ``temperature_C`` is the highest temperature of the
+    magnet. The knee of the demagnetization curve is at ``squareness`` times the intrinsic
+    coercivity, where the polarization is a tenth below the remanence (H_k of IEC 60404-8-1).
     """
 
     intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=1e4, le=1e7)]
@@ -282,7 +319,7 @@ class Demagnetization(StudyModel):
         for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
                                   ("coercivity", self.coercivity_coefficient_per_K)):
             if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
-                raise ValueError(f"{name}_coefficient_per_K ({coefficient}) leaves nothing of it "
-                                 f"at {self.temperature_C:g} °C; use a fraction per kelvin, not "
-                                 "per cent, and a temperature the linear law holds for")
+                raise ValueError(f"{name}_coefficient_per_K ({coefficient}) makes the {name} zero "
+                                 f"or negative at {self.temperature_C:g} °C; use a fraction per "
+                                 "kelvin, not per cent, and a temperature the linear law holds for")
         return self

@@ -1,10 +1,11 @@
-"""Magnetization curves H(B) of iron: read, checked, and turned into the law that is solved with.
+"""Magnetization curves H(B) of iron: reading, checks, and conversion to constitutive laws.
 
-A curve is isotropic, without hysteresis, and odd in B. Whatever it comes from, a table or a closed
-form, it ends as two laws, ``H = nu(B^2) B`` for the vector potential and ``B = mu_0 mu_r(g^2) H``,
-``g = mu_0 H``, for the scalar one: a coefficient between points by Akima's method (J. ACM 17 (1970)
-589), which GetDP has too, so that both programs solve with the same numbers. Beyond the last point
-the polarization ``J = B - mu_0 H`` stays as it is.
+A curve is isotropic, without hysteresis, and odd in B. Tables and closed forms are both converted
+to two constitutive laws: ``H = nu(B^2) B`` for the vector potential, and ``B = mu_0 mu_r(g^2) H``
+with ``g = mu_0 H`` for the scalar potential. The coefficients nu and mu_r are interpolated between
+points by Akima's method (J. ACM 17 (1970) 589). GetDP offers the same interpolation, so that GetDP
+and halbach-fe evaluate the same law. Beyond the last point the polarization ``J = B - mu_0 H`` is
+constant.
 """
 
 from __future__ import annotations
@@ -23,46 +24,64 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import parse_number as number_in
 
 MU_0 = 4e-7 * math.pi
-"""Vacuum permeability in T m/A; the pre-2019 value, 1.3e-10 relative from the measured one."""
+"""Vacuum permeability in T m/A. The value before 2019; it differs from the measured value by
+1.3e-10 (relative)."""
 
 COLUMNS = ("H_A_per_m", "B_T")
 MIN_POINTS = 4
 MAX_POINTS = 10_000
-MAX_FLUX_DENSITY = 10.0  # T; steels are measured up to some 2.5 T, more is another unit
-MAX_POLARIZATION = 2.6  # T; the largest there is, iron with cobalt, has 2.45 T
-MAX_RELATIVE_PERMEABILITY = ((0.0, 2e6), (1.5, 2e5))
-"""From a flux density in T on. The purest iron reaches 1e6, but from 1.5 T on even
-grain-oriented steel has less than some 1e5."""
+MAX_FLUX_DENSITY = 10.0
+"""Largest B of a table in T. Steels are measured up to some 2.5 T; more reveals another unit."""
 
-MIN_RELATIVE_PERMEABILITY = 1.5  # what is below is no iron
-MAX_FALL = 0.02  # of the polarization, relative to the largest B
-MIN_STEP = 1e-6  # of B, relative to the largest: closer points have no slope between them
+MAX_POLARIZATION = 2.6
+"""Largest polarization of a curve in T. The largest of any iron, alloyed with cobalt, is 2.45 T."""
+
+MAX_RELATIVE_PERMEABILITY = ((0.0, 2e6), (1.5, 2e5))
+"""Pairs of a flux density in T and the largest relative permeability from there on. The purest iron
+reaches 1e6, but from 1.5 T on even grain-oriented steel has less than some 1e5."""
+
+MIN_RELATIVE_PERMEABILITY = 1.5
+"""A material whose largest relative permeability is smaller is not iron."""
+
+MAX_FALL = 0.02
+"""Accepted fall of the polarization along a table, relative to the largest B: tables are rounded.
+"""
+
+MIN_STEP = 1e-6
+"""Smallest step of B between two points, relative to the largest B: between closer points the slope
+is lost to rounding."""
 
 SUBDIVISION = 16
-"""Intervals of a law between two points of the table. Akima's cubics then keep to the table's
-monotone ones, and the two laws to one another, within 1e-3, and 3e-3 where points are as far apart
-as those of AISI 1010 beyond 1.7 T. The error falls about with the square of this."""
+"""Intervals of a constitutive law between two points of the table. With 16, the law agrees with the
+monotone cubic interpolation of the table within 1e-3, and so do the two laws with one another; the
+difference is 3e-3 where points are as far apart as those of AISI 1010 beyond 1.7 T. It decreases
+with about the square of this number."""
 
 LEAST_START = 0.5
-"""dH/dB at the origin is at least this part of H / B at the table's first point."""
+"""Lower limit of dH/dB at the origin, as a fraction of H / B at the first point of the table."""
 
 _CLOSED_FORM_POINTS = 800
-_WIDEST_FIELD = 1e7  # A/m; closed forms are followed up to there
+"""Points at which a closed form is evaluated to make a curve."""
 
+_WIDEST_FIELD = 1e7
+"""Largest H in A/m at which a closed form is evaluated."""
 
 
 @dataclass(frozen=True)
 class ConstitutiveLaw:
-    """y = c(|x|^2) x, with the coefficient c given at points and tending to a limit.
+    """An isotropic law y = c(|x|^2) x between two vectors.
+
+    The coefficient c is interpolated by Akima's method; beyond the last point d|y|/d|x| is
+    constant.
 
     Attributes
     ----------
-    squares : ndarray, shape (n,), ascending from 0
-        |x|^2 in T^2.
+    squares : ndarray, shape (n,), in T^2
+        Values of |x|^2, ascending from 0.
     values : ndarray, shape (n,)
-        The coefficient there.
+        The coefficient c at ``squares``.
     limit : float
-        dy/dx beyond the last point.
+        d|y|/d|x| beyond the last point.
     """
 
     squares: Floats
@@ -71,7 +90,7 @@ class ConstitutiveLaw:
 
     @property
     def excess(self) -> float:
-        """c |x| - limit |x|, constant beyond the last point."""
+        """The value of |y| - limit |x|, which is constant beyond the last point."""
         return float((self.values[-1] - self.limit) * np.sqrt(self.squares[-1]))
 
     @cached_property
@@ -84,7 +103,7 @@ class ConstitutiveLaw:
         return self._spline.derivative()
 
     def coefficient(self, square: Floats) -> Floats:
-        """c at squares (...,)."""
+        """Return c at values (...,) of |x|^2 in T^2."""
         inside = self._spline(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
@@ -92,21 +111,24 @@ class ConstitutiveLaw:
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def slope(self, square: Floats) -> Floats:
-        """dc / d|x|^2 at squares (...,)."""
+        """Return dc / d(|x|^2) at values (...,) of |x|^2 in T^2."""
         inside = self._derivative(np.minimum(square, self.squares[-1]))
         if square.max(initial=0) <= self.squares[-1]:
             return inside
         outside = np.maximum(square, self.squares[-1])
-        beyond = -self.excess / 2 / outside / np.sqrt(outside)  # its cube may be no number
+        beyond = -self.excess / 2 / outside / np.sqrt(outside)  # outside**1.5 could overflow
         return np.where(square <= self.squares[-1], inside, beyond)
 
     def differential(self, square: Floats) -> Floats:
-        """dy/dx along x: the coefficient plus 2 |x|^2 times its slope."""
+        """Return d|y| / d|x| = c + 2 |x|^2 dc/d(|x|^2) at values (...,) of |x|^2 in T^2."""
         return self.coefficient(square) + 2 * (square * self.slope(square))
 
 
 def _akima_slopes(x: Floats, y: Floats) -> Floats:
-    """Slopes of Akima's method as GetDP has them (scipy tells straight pieces by another limit)."""
+    """Return the slopes of Akima's method as GetDP computes them.
+
+    SciPy differs: it uses another threshold to recognize points on a straight line.
+    """
     secant = np.diff(y) / np.diff(x)
     m = np.concatenate([[0, 0], secant, [0, 0]])
     m[1], m[-2] = 2 * m[2] - m[3], 2 * m[-3] - m[-4]
@@ -120,12 +142,14 @@ def _akima_slopes(x: Floats, y: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of a magnetization curve, the origin first, close enough for both laws.
+    """Points of a magnetization curve that are close enough for both constitutive laws.
 
     Attributes
     ----------
     H : ndarray, shape (n,), in A/m
+        Ascending from 0.
     B : ndarray, shape (n,), in T
+        Ascending from 0.
     initial : float
         Relative permeability at the origin.
     """
@@ -136,30 +160,31 @@ class Curve:
 
     @cached_property
     def reluctivity(self) -> ConstitutiveLaw:
-        """H = nu(B^2) B, nu in m/H."""
+        """The law H = nu(B^2) B, with nu in m/H."""
         values = np.concatenate([[1 / (MU_0 * self.initial)], self.H[1:] / self.B[1:]])
         return ConstitutiveLaw(self.B**2, values, 1 / MU_0)
 
     @cached_property
     def permeability(self) -> ConstitutiveLaw:
-        """B = mu_r(g^2) g with g = mu_0 H in T."""
+        """The law B = mu_r(g^2) g with g = mu_0 H in T."""
         values = np.concatenate([[self.initial], self.B[1:] / (MU_0 * self.H[1:])])
         return ConstitutiveLaw((MU_0 * self.H) ** 2, values, 1.0)
 
 
 def table_curve(field: Floats, flux_density: Floats) -> Curve:
-    """The curve through a table of H in A/m and B in T, monotone between its points.
+    """Return the curve through a table of H in A/m and B in T, monotone between its points.
 
     Raises
     ------
     ValueError
-        With what is wrong with the table, see `check_table`.
+        If the table is not that of iron, for one of the reasons that `check_table` lists.
     """
     field, flux_density = check_table(field, flux_density)
     slopes = PchipInterpolator(flux_density, field).derivative()(flux_density)
-    # where H turns up steeply behind the first point it would start flat: no reluctivity at all
+    # PCHIP sets the first slope to 0 where H rises steeply after the first point: the reluctivity
+    # at the origin would vanish
     slopes[0] = max(slopes[0], LEAST_START * field[1] / flux_density[1])
-    smooth = CubicHermiteSpline(flux_density, field, slopes)  # monotone, its derivative continuous
+    smooth = CubicHermiteSpline(flux_density, field, slopes)
     steps = np.arange(SUBDIVISION) / SUBDIVISION
     inner = flux_density[:-1, None] + np.diff(flux_density)[:, None] * steps
     nodes = np.append(inner.ravel(), flux_density[-1])
@@ -167,15 +192,17 @@ def table_curve(field: Floats, flux_density: Floats) -> Curve:
 
 
 def froehlich_kennelly(initial: float, saturation: float) -> Curve:
-    """B = mu_0 H + J_s H / (H + h), h chosen for the initial relative permeability.
+    """Return the curve B = mu_0 H + J_s H / (H + h) of Froehlich and Kennelly.
+
+    The formula is A. E. Kennelly's (Trans. AIEE 8 (1891) 485), after O. Froehlich, for the
+    polarization; mu_0 H is added so that the slope of B tends to mu_0.
 
     Parameters
     ----------
     initial : float
-        Relative permeability at the origin.
+        Relative permeability at the origin, from which h follows.
     saturation : float
-        Polarization J_s in T. The form is A. E. Kennelly's, Trans. AIEE 8 (1891) 485, on
-        O. Froehlich's; with mu_0 H added so that the slope tends to mu_0.
+        Saturation polarization J_s in T.
     """
     half = saturation / (MU_0 * (initial - 1))
     field = np.concatenate([[0.0], np.geomspace(half * 1e-4, _WIDEST_FIELD, _CLOSED_FORM_POINTS)])
@@ -183,18 +210,19 @@ def froehlich_kennelly(initial: float, saturation: float) -> Curve:
 
 
 def brauer(k1: float, k2: float, k3: float) -> Curve:
-    """H = (k1 exp(k2 B^2) + k3) B: J. R. Brauer, IEEE Trans. Magn. 11 (1975) 81.
+    """Return the curve H = (k1 exp(k2 B^2) + k3) B of J. R. Brauer, IEEE Trans. Magn. 11 (1975) 81.
 
-    It is followed up to where dH/dB reaches 1/mu_0, beyond which it is no material's.
+    The formula is used up to the B where dH/dB reaches 1/mu_0: no material exceeds that slope.
 
     Raises
     ------
     ValueError
-        If it starts above that or below iron's, or reaches it at no iron's polarization.
+        If the reluctivity at the origin, k1 + k3, is not that of iron, or if the polarization
+        becomes larger than that of any iron.
     """
     def differential(b: float) -> float:
         exponent = k2 * b**2
-        # what overflows is far above vacuum's
+        # an exponential that would overflow is far above the reluctivity of vacuum
         return math.inf if exponent > 500 else k1 * math.exp(exponent) * (1 + 2 * exponent) + k3
 
     least = 1 / (MU_0 * MAX_RELATIVE_PERMEABILITY[0][1])
@@ -216,14 +244,14 @@ def brauer(k1: float, k2: float, k3: float) -> Curve:
 
 
 def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
-    """Return a table of H in A/m and B in T with its origin, or say what is wrong with it.
+    """Return a table of H in A/m and B in T, starting at the origin, after checking it.
 
     Raises
     ------
     ValueError
-        Named: lengths that differ, too few points, values that are not finite, negative, exchanged,
-        of another unit, or not rising. H in Oe, 1/80 of that in A/m, is iron too unless the table
-        goes far into saturation.
+        If the lengths differ, there are too few or too many points, or values are not finite,
+        negative, exchanged, in another unit, or not increasing. H in Oe (1/80 of its value in A/m)
+        is found only if the table goes far into saturation: below, it looks like good iron.
     """
     h, b = np.asarray(field, float), np.asarray(flux_density, float)
     if h.shape != b.shape or h.ndim != 1:
@@ -249,14 +277,15 @@ def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
     return np.append(0.0, h), np.append(0.0, b)
 
 
-def _check_points(bad: NDArray[np.bool_], h: Floats, b: Floats, what: str) -> None:
+def _check_points(bad: NDArray[np.bool_], h: Floats, b: Floats, problem: str) -> None:
+    """Raise ValueError for the first of the points that are marked as bad."""
     if bad.any():
         first = int(np.argmax(bad))
-        raise ValueError(f"point {first + 1} (H = {h[first]:g}, B = {b[first]:g}) {what}")
+        raise ValueError(f"point {first + 1} (H = {h[first]:g}, B = {b[first]:g}) {problem}")
 
 
 def _check_units(h: Floats, b: Floats) -> None:
-    """A wrong unit, or H for B, makes a material that does not exist."""
+    """Raise ValueError if no iron has such a curve: a unit is wrong, or H and B are exchanged."""
     if b[-1] > MAX_FLUX_DENSITY:
         if h[-1] < MAX_FLUX_DENSITY:
             raise ValueError(f"H and B look exchanged: B goes up to {b[-1]:g} T, and H only to "
@@ -274,7 +303,7 @@ def _check_units(h: Floats, b: Floats) -> None:
     if permeability.max() < MIN_RELATIVE_PERMEABILITY:
         raise ValueError(f"B / (mu_0 H) goes up to {permeability.max():.3g} only, and in iron far "
                          "higher; is B in another unit than T, or H in another than A/m?")
-    # the polarization neither falls nor exceeds that of iron; a fall allows for rounded tables
+    # the polarization of iron does not fall; a small fall is accepted because tables are rounded
     polarization = b - MU_0 * h
     fall = float((np.maximum.accumulate(np.append(0.0, polarization))[1:] - polarization).max())
     if fall > MAX_FALL * b[-1]:
@@ -286,7 +315,7 @@ def _check_units(h: Floats, b: Floats) -> None:
 
 
 def _checked(curve: Curve) -> Curve:
-    """Refuse a curve along which H or B does not rise everywhere."""
+    """Return the curve, or raise ValueError if H(B) or B(H) does not rise everywhere."""
     for name, unit, scale, law in (("B", "T", 1.0, curve.reluctivity),
                                    ("H", "A/m", MU_0, curve.permeability)):
         root = np.sqrt(law.squares)
@@ -300,7 +329,7 @@ def _checked(curve: Curve) -> Curve:
 
 
 def steels() -> dict[str, Traversable]:
-    """The curves that come with halbach-fe, by name."""
+    """Return the files of the curves that come with halbach-fe, by name."""
     folder = resources.files("halbach_fe.study") / "steels"
     return {path.name.removesuffix(".csv"): path
             for path in sorted(folder.iterdir(), key=lambda path: path.name)
@@ -308,18 +337,20 @@ def steels() -> dict[str, Traversable]:
 
 
 def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """H in A/m and B in T of a CSV file with the header ``H_A_per_m,B_T``; ``#`` starts a comment.
+    """Read H in A/m and B in T from a CSV file with the header ``H_A_per_m,B_T``.
 
-    What is in it is not quoted: a study can name any file.
+    Lines that start with ``#`` are comments. Error messages do not quote the file, because a study
+    can name any file on the machine.
 
     Raises
     ------
     ValueError
-        Named: no text, nothing in it, the header, or a line that is not two numbers.
+        If the file is not text, is empty, has another header, or has a line without two numbers.
     OSError
+        If the file cannot be read.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin with a mark
+        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError:
         raise ValueError("it must be UTF-8 text; save it as such") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)

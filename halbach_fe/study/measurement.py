@@ -1,4 +1,4 @@
-"""Keys of a study that describe the measurement: where, with which instrument, how noisy."""
+"""Keys of a study that describe the measurement: positions, instrument, noise."""
 
 from __future__ import annotations
 
@@ -34,26 +34,28 @@ from halbach_fe.study.types import (
 
 
 class Instrument(StudyModel):
-    """How the mapper's readings differ from B where it says it was; taken out of the map before
-    anything else is done with it.
+    """Known errors and conventions of the field mapper, which are corrected before a map is used.
 
-    First what is written in the map is put right. Its coordinates and its sigma and B count in
-    ``length_unit_m`` and ``flux_density_unit_T`` (0.001 if they are in mm and mT). Its columns x,
-    y, z are along ``position_axes`` of the magnet, and Bx, By, Bz along ``field_axes``: with
-    ``field_axes = ["y", "-x", "z"]`` the column of Bx holds By, and that of By -Bx.
+    Units and axes. Coordinates in the map are multiples of ``length_unit_m``, and B and its sigma
+    multiples of ``flux_density_unit_T`` (0.001 and 0.001 for mm and mT). The map's columns x, y, z
+    are coordinates along ``position_axes`` of the magnet, its columns Bx, By, Bz components along
+    ``field_axes``: with ``field_axes = ["y", "-x", "z"]`` the column Bx holds the magnet's By, and
+    the column By holds its -Bx.
 
-    The probe was at ``r' = T(s(r))`` where the map says r: s stretches the distance from the axis
-    by ``1 + radius_scale``, adds ``radius_offset_m`` to it (on the axis along x), and off the axis
-    at the angle phi ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi``, stretches z by
-    ``1 + z_scale`` and lets the arm sag towards -y, by ``arm_sag_m`` at the far end (largest z of
-    the map), with the square of the distance from the near one; T turns by ``rotation_rad`` (a
-    rotation vector) about the origin and moves by ``translation_m``.
-    The sensor of component i is ``sensor_position_m[i]`` from there. With B' the field in the
-    turned axes, the reading of component i is
+    Positions. Where the map says r, the sensor of component i was at
+    ``T(s(r) + sensor_position_m[i])``. The map s multiplies the distance from the axis by
+    ``1 + radius_scale`` and adds ``radius_offset_m`` to it (along x for points on the axis). For
+    points off the axis at the angle phi it also adds
+    ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi`` to the distance. It multiplies z by
+    ``1 + z_scale`` and lowers y by the sag of the arm, which grows with the square of the distance
+    from the map's smallest z and is ``arm_sag_m`` at its largest z. T rotates by the rotation
+    vector ``rotation_rad`` about the origin, then translates by ``translation_m``.
+
+    Readings. With B' the components of B along the rotated axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
-    + cubic_i B'_i^3 + offset_i + drift_i t``, j and k being the other two, and t running from 0 to
-    1 over the map (its time_s, or its order). ``crosstalk`` is by name: ``zx`` is what the z sensor
-    sees of x.
+    + cubic_i B'_i^3 + offset_i + drift_i t``, where j and k are the two other components and t runs
+    from 0 to 1 over the map (by its column time_s, or by the order of its rows). The key ``zx`` of
+    ``crosstalk`` is the sensitivity of the z sensor to B'_x.
     """
 
     length_unit_m: Unit = 1.0
@@ -96,8 +98,10 @@ class LinePositions(StudyModel):
 
 
 class CirclePositions(StudyModel):
-    """Circles about the z axis: ``angles`` points each, at ``count`` positions along z, of one
-    radius or of each of several.
+    """Circles about the z axis, with ``angles`` equally spaced points each.
+
+    There is one circle for each radius in ``radius_m`` (a value or a list) at each of ``count``
+    positions z, equally spaced from ``z_min_m`` to ``z_max_m``, both included.
     """
 
     kind: Literal["circles"]
@@ -121,8 +125,10 @@ class CirclePositions(StudyModel):
 
 
 class GridPositions(StudyModel):
-    """A regular grid of ``count`` points along x, y and z, from ``start_m`` to ``end_m``, both
-    included; one point along an axis needs equal limits. z changes fastest, x slowest.
+    """A regular grid with ``count`` points along x, y and z, from ``start_m`` to ``end_m``.
+
+    Both limits are included; an axis with a single point needs equal limits. In the order of the
+    points z changes fastest, x slowest.
     """
 
     kind: Literal["grid"]
@@ -164,7 +170,11 @@ class FluxDensity(StudyModel):
 
 
 class FourierCoefficients(StudyModel):
-    """Observe A_1..A_K, B_1..B_K of B_r on circles: B_r = sum A_k cos(k phi) + B_k sin(k phi)."""
+    """Observe the Fourier coefficients of the radial flux density on circles, in tesla.
+
+    They are A_1..A_K and B_1..B_K of ``B_r = sum_k A_k cos(k phi) + B_k sin(k phi)``, with K given
+    by ``harmonics``.
+    """
 
     quantity: Literal["fourier_coefficients"]
     harmonics: Annotated[int, Field(ge=1, le=1000)]
@@ -184,10 +194,10 @@ ObservationSettings = Annotated[FluxDensity | FourierCoefficients, Field(discrim
 
 
 class NoiseRegion(StudyModel):
-    """A z window with one standard deviation per reading, of all components or of some.
+    """A region in z whose readings have the same standard deviation ``sigma_T``.
 
-    The first region that fits a reading is used. A limit that is left out is none. Regions of one
-    name are one region in reports.
+    A reading belongs to the first region that contains its z and lists its component. A limit that
+    is left out does not restrict the region. Reports combine regions that have the same name.
     """
 
     name: Annotated[Line, Field(min_length=1, max_length=100)]
@@ -204,12 +214,13 @@ class NoiseRegion(StudyModel):
 
 
 class NoiseSettings(StudyModel):
-    """Measurement noise by region, which a map that carries its own sigma overrides, and what the
-    positions add to either.
+    """Standard deviation of the readings, and of their positions.
 
-    ``position_sd_m`` is how far each point may be from where the map has it, along x, y and z
-    (one value: the same along each). It moves a reading by the local gradient of the nominal
-    field, all components of a point together: much in the fringe, little in the homogeneous field.
+    ``regions`` give the standard deviation of a reading; a map with a sigma of its own replaces
+    them. ``position_sd_m`` is the standard deviation of every point's position along x, y and z (a
+    single value holds for all three). The position uncertainty adds to the noise of both: it
+    changes the readings of a point by the local gradient of the nominal field, all components of
+    the point together, which is much in the fringe field and little in the homogeneous field.
     """
 
     regions: tuple[NoiseRegion, ...] = ()

@@ -1,12 +1,11 @@
-"""The study file: one TOML document that says everything about a magnet and its measurement.
+"""The study: a validated description of a magnet, its discretization and its measurement.
 
-Keys carry their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors. The models are
-frozen: a study is a value, and everything downstream is a function of it.
+The names of keys end with their unit (``inner_radius_m``, ``sigma_T``). Unknown keys are errors.
+The models are immutable: every result is a function of the study (and of measured data).
 
-The convention for magnetization, used everywhere in halbach-fe, is that of
-``nu(|B|) B = H + M``. In a block of recoil permeability mu_r therefore
-``M = B_r / (mu_0 mu_r)``, with B_r the remanence: M is neither ``B_r / mu_0`` nor the
-magnetization at the working point.
+The magnetization M follows the same convention everywhere in halbach-fe: ``nu(|B|) B = H + M``. In
+a block of remanence B_r and recoil permeability mu_r therefore ``M = B_r / (mu_0 mu_r)``. M is
+neither ``B_r / mu_0`` nor the magnetization at the working point.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 
 FIELD_KEYS = {"dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"}
-"""All that a solved field depends on."""
+"""Keys of a study that its computed field depends on."""
 
 
 class Study(StudyModel):
-    """A magnet, how it is discretized, how it is measured, and what is known beforehand."""
+    """A magnet, its discretization, its measurement, and the prior knowledge of its blocks."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     description: Lines = ""
@@ -60,13 +59,13 @@ class Study(StudyModel):
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
-            "noise.regions": any(set(one.components) != set(COMPONENTS) for one in regions),
+            "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),
             "inference.held_out": bool(held_out and held_out.components)}
         for key, named in by_component.items():
             if named and self.observation.quantity == "fourier_coefficients":
                 raise ValueError(f"{key} may name components of flux_density only; Fourier "
                                  "coefficients have none")
-        slots = sorted(slot for one in self.prior.types.values() for slot in one)
+        slots = sorted(slot for members in self.prior.types.values() for slot in members)
         if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
             raise ValueError(f"prior.types must name every slot from 1 to "
                              f"{self.array.blocks_per_ring} once, but names {slots}")
@@ -78,12 +77,18 @@ class Study(StudyModel):
 
 
 def is_nonlinear(study: Study) -> bool:
-    """Tell whether the field is no linear function of the magnetizations."""
+    """Tell whether the field is a non-linear function of the magnetizations (iron with a curve)."""
     return study.iron_ring is not None and study.iron_ring.curve is not None
 
 
 def curve_of(study: Study) -> Curve | None:
-    """The iron ring's magnetization curve, if it has one."""
+    """Return the magnetization curve of the iron ring, or None if it has none.
+
+    Raises
+    ------
+    StudyError
+        If the curve is in a file that has not been read (`read_study` reads it).
+    """
     curve = study.iron_ring and study.iron_ring.curve
     if not curve:
         return None
@@ -96,7 +101,7 @@ def curve_of(study: Study) -> Curve | None:
         table = materials.read_table(materials.steels()[curve.name])
     elif curve.file is None:
         table = curve.H_A_per_m, curve.B_T
-    else:  # no file, no folder that the path would start from
+    else:  # the folder that the path is relative to is not known here
         raise StudyError(must_be("`iron_ring.curve.file`", f"study {study.name}",
                                  "read together with the study's own file", f"'{curve.file}'",
                                  "Use read_study, or give H_A_per_m and B_T."))

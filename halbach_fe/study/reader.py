@@ -1,4 +1,7 @@
-"""Reading a study file; every refusal is one sentence that names file, key and remedy."""
+"""Reading and validation of study files.
+
+Every error message is one sentence that names the file, the key, and what to do.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,8 @@ from halbach_fe.study.magnet import TableCurve
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_LENGTH_M
 
-MAX_EXPLAINED = 1e9  # by a wrong unit
+MAX_WRONG_UNIT = 1e9
+"""Values from this size on are not explained by a wrong unit."""
 
 
 def read_study(path: str | Path) -> Study:
@@ -28,7 +32,14 @@ def read_study(path: str | Path) -> Study:
     Raises
     ------
     StudyError
-        With one sentence that names the file, the key, what was expected and what to do.
+        If the file cannot be read or is not a valid study. The message is one sentence that names
+        the file, the key, what was expected and what to do.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.read_study("dipole.toml").array.blocks_per_ring
+    16
     """
     path = Path(path)
     where = f"study file {path}"
@@ -56,7 +67,7 @@ def read_study(path: str | Path) -> Study:
     except RecursionError:
         raise StudyError(must_be("syntax", where, "TOML of a few levels", "hundreds of them")
                          ) from None
-    except ValueError as error:  # of TOML, or of an integer with thousands of digits
+    except ValueError as error:  # a syntax error, or an integer with thousands of digits
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
         ) from None
@@ -72,14 +83,14 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
 
 
 def _with_table(study: Study, folder: Path, where: str) -> Study:
-    """The study with the numbers of its H(B) file in place of the file's name."""
+    """Return the study with the numbers of its H(B) file in place of the file's name."""
     ring = study.iron_ring
     if ring is None or ring.curve is None or ring.curve.kind != "table" or not ring.curve.file:
         return study
     path = folder / ring.curve.file
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
-            raise ValueError("it must be a file")  # a device may have no end
+            raise ValueError("it must be a file")  # reading a device might never end
         field, flux_density = materials.read_table(path)
         table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:
@@ -95,9 +106,9 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
 
 
 def _sentence(error: ValidationError, where: str) -> str:
-    """Turn the first of pydantic's complaints into our sentence, and count the others."""
+    """Return one sentence about the first of pydantic's errors, and the number of the others."""
     errors = error.errors(include_url=False)
-    # An unknown key is the likeliest cause of the others (a misspelt key is also a missing one).
+    # An unknown key is the likeliest cause of the others: a misspelt key is also a missing key.
     errors.sort(key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     key, model = _locate(first["loc"])
@@ -134,8 +145,8 @@ def _more(errors: list[Any]) -> str:
 
 
 def _unit_hint(key: str, value: float) -> str:
-    """Guess a unit that is wrong by a factor of 1000."""
-    if not abs(value) < MAX_EXPLAINED:
+    """Return a hint to a unit that is wrong by a factor of 1000, as far as the value shows it."""
+    if not abs(value) < MAX_WRONG_UNIT:
         return "Correct the value."
     wrong = {"_m": "millimetres", "_T": "millitesla"}
     key = key.partition("[")[0] if key.endswith("]") else key
@@ -150,7 +161,8 @@ def _unit_hint(key: str, value: float) -> str:
 def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
     """Return the dotted key of a pydantic location, and the model that holds its last part.
 
-    pydantic puts the tag of a discriminated union into the location; a user never wrote it.
+    pydantic puts the tag of a discriminated union into the location. It is left out here, because
+    it is no key of the file.
     """
     models: list[type[BaseModel]] = [Study]
     owner: type[BaseModel] | None = Study
@@ -172,6 +184,7 @@ def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | Non
 
 
 def _tags(model: type[BaseModel]) -> set[str]:
+    """Return the values of a model's literal keys, which tag it in a discriminated union."""
     return {
         str(value)
         for field in model.model_fields.values()
@@ -181,7 +194,7 @@ def _tags(model: type[BaseModel]) -> set[str]:
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """All models mentioned in an annotation, in order."""
+    """Return all models that a type annotation mentions, in order."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if get_origin(annotation) in (Union, types.UnionType, Annotated, tuple):

@@ -1,4 +1,4 @@
-"""Keys of a study that describe mesh, boundary and solver."""
+"""Keys of a study that describe the mesh, the outer boundary and the solver."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from halbach_fe.study.types import MAX_LENGTH_M, MIN_LENGTH_M, Length, StudyMode
 
 
 class MeshSettings(StudyModel):
-    """Element sizes. In 3D the cross-section is extruded in layers along z.
+    """Sizes of the finite elements.
 
-    ``meridian_size_m`` is that of the (r, z) half-plane, for rotationally symmetric materials
-    (default: a twelfth of the blocks' radial thickness).
+    ``block_size_m`` holds in the blocks and iron, ``bore_size_m`` in the bore (default: the same).
+    Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` - 1 per
+    unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the cross-section
+    is extruded along z, in ``layers_per_ring`` layers per ring.
+
+    ``meridian_size_m`` is the size in the mesh of the (r, z) half-plane, which is used for
+    rotationally symmetric materials (default: a twelfth of the blocks' radial thickness).
     """
 
     block_size_m: Length
@@ -26,22 +31,31 @@ class MeshSettings(StudyModel):
 
 
 class OpenBoundary(StudyModel):
-    """Where the field is cut off. Elements grow geometrically towards it, so far is cheap."""
+    """The cylinder around the magnet at which the computational domain ends.
+
+    Elements grow towards this boundary, so that a distant boundary costs little. By default it is
+    10 to 30 magnet radii away, depending on the kind of mesh.
+    """
 
     radius_m: Annotated[float, Field(ge=MIN_LENGTH_M, le=100 * MAX_LENGTH_M)] | None = None
     half_length_m: Annotated[float, Field(ge=MIN_LENGTH_M, le=100 * MAX_LENGTH_M)] | None = None
 
 
 class SolverSettings(StudyModel):
-    """``reaction``: exact field of the blocks plus the finite-element reaction of permeability
-    and iron. ``direct``: the finite-element field as it is.
+    """Choice of the method that computes the field.
 
-    ``route`` is how a 3D reaction is computed: ``azimuthal_modes``, one (r, z) problem per mode,
-    for rotationally symmetric materials (sectors without gaps); ``edge_elements``, curl-curl in
-    3D, for any geometry; ``scalar_potential``, its dual, of second order, for any geometry too.
-    ``auto`` takes the first where it can, the scalar potential elsewhere, and edge elements for
-    ``direct``. ``edge_order`` is the order of the edge elements. ``symmetry`` lets one block stand
-    for those that turning and mirroring the magnet puts in its place.
+    ``method``: ``reaction`` adds the finite-element reaction of permeability and iron to the exact
+    field that the blocks have in vacuum; ``direct`` is the finite-element field alone.
+
+    ``route`` is the formulation in 3D. ``azimuthal_modes`` solves one (r, z) problem for each mode
+    of the azimuth, and needs rotationally symmetric materials (sector blocks without gaps).
+    ``edge_elements`` solves the curl-curl equation of the vector potential, for any geometry;
+    ``edge_order`` is the order of its elements. ``scalar_potential`` solves the dual problem with
+    nodal elements of second order, for any geometry too. ``auto`` takes azimuthal modes where
+    possible and the scalar potential elsewhere, and edge elements for ``method = "direct"``.
+
+    With ``symmetry`` the field of only one block is computed of all those that a rotation or
+    reflection of the magnet maps onto one another.
     """
 
     method: Literal["reaction", "direct"] = "reaction"

@@ -1,4 +1,4 @@
-"""A commented study file to start from."""
+"""The commented study file that `halbach-fe new` writes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ TEMPLATE = "new_study.toml.j2"
 
 @dataclass(frozen=True)
 class MagnetTemplate:
-    """What a new study has to know; the rest follows, and can be changed in the file.
+    """Values of the magnet in a new study file; all other values of the file follow from them.
 
-    Lengths in m, remanence in T. ``ring_length_m`` is None for a cross-section.
+    Lengths are in m, the remanence is in T. ``ring_length_m`` is None for a cross-section.
     """
 
     multipole_order: int = 1
@@ -37,12 +37,12 @@ class MagnetTemplate:
 
 
 def new_study(name: str, magnet: MagnetTemplate) -> str:
-    """The text of a study file, which says of every key what it means, and is valid as it stands.
+    """Return the text of a valid study file with comments that explain its keys.
 
     Raises
     ------
     StudyError
-        If there is no such magnet.
+        If no valid study has these values.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe.study", "."), undefined=jinja2.StrictUndefined,
@@ -53,19 +53,19 @@ def new_study(name: str, magnet: MagnetTemplate) -> str:
 
 
 def parse_new_study(text: str) -> Study:
-    """The study that a new file holds; StudyError with what the options must be, if none."""
+    """Return the study in a new file; raise StudyError if the options make it invalid."""
     return parse_study(tomllib.loads(text), "new study")
 
 
 def write_new_study(path: Path, magnet: MagnetTemplate) -> None:
-    """Write a study file where there is none.
+    """Write a new study file; an existing file is never overwritten.
 
     Raises
     ------
     StudyError
-        See `new_study`.
+        If no valid study has these values.
     OutputError
-        If the file is there already, or cannot be written.
+        If the file exists already, or cannot be written.
     """
     if path.exists():
         raise OutputError(must_be("path", "new study", "a file that does not exist yet",
@@ -76,6 +76,6 @@ def write_new_study(path: Path, magnet: MagnetTemplate) -> None:
 
 
 def _name(stem: str) -> str:
-    """What a study may be called, from a file's name."""
+    """Return a valid name of a study, made from the name of its file."""
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", stem).lstrip("._-")[:100]
     return name or "magnet"

@@ -1,4 +1,4 @@
-"""Types of single keys of a study, with the limits that catch a wrong unit."""
+"""Types of the keys of a study, with limits that reveal a wrong unit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
 MAX_POINTS = 1_000_000
 
-# The limits exist to catch a wrong unit (mm for m, mT for T), not to say what is sensible.
+# The limits are there to reveal a wrong unit (mm for m, mT for T); they are wider than is sensible.
 Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
 Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
 Coordinate = Annotated[
@@ -45,7 +45,7 @@ COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
 
 def one_or_list(kind: Any) -> BeforeValidator:
-    """Let a single value stand for a list of one."""
+    """Return a validator that lets a single value stand for a list of one element."""
     return BeforeValidator(lambda value: value if isinstance(value, list | tuple) else (value,),
                            json_schema_input_type=Union[kind, list[kind]])  # noqa: UP007
 
@@ -63,12 +63,14 @@ def _lines(text: str) -> str:
 
 
 Line = Annotated[str, AfterValidator(_one_line)]
-"""Text that is shown on terminals, in pages, in tables."""
+"""Text without control characters or line breaks: it is shown on terminals, in reports, in tables.
+"""
 Lines = Annotated[str, AfterValidator(_lines)]
+"""Text of any number of lines, in which tabs are allowed too."""
 
 
 class StudyModel(BaseModel):
-    """A table of a study file: unknown keys are errors, and values do not change.
+    """Base of all tables of a study file: unknown keys are errors, and instances are immutable.
 
     Examples
     --------
@@ -80,14 +82,16 @@ class StudyModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def with_(self, **changes: Any) -> Self:
-        """The same table with other values of some keys, validated like one that was read.
+        """Return a copy with other values of some keys, validated like a table from a file.
 
         ``mesh__growth`` changes the key ``growth`` of the table ``mesh``.
 
         Raises
         ------
         pydantic.ValidationError
-            If the result is no valid table.
+            If the result is not valid.
+        TypeError
+            If there is no such key.
         """
         values = {name: getattr(self, name) for name in type(self).model_fields}
         for key, value in changes.items():

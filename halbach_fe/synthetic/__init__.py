@@ -1,1 +1,1 @@
-"""Campaigns that were never measured, made by other programs than the model that they test."""
+"""Synthetic measurement campaigns, computed by programs other than the model that they test."""

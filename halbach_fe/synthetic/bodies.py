@@ -1,8 +1,11 @@
-"""The true magnet as plain data: bodies of magnet material, iron, and what else makes a field.
+"""The true magnet of a synthetic campaign as plain data: blocks, iron and other sources of field.
 
-Everything is built anew from a study's radii and angles. A body has axes of its own: x radially
-outward through its middle, z along the magnet's axis, y azimuthal (z cross x), the origin in its
-middle. Angles are in rad, lengths in m, remanences in T.
+Everything is built from a study's radii and angles without `halbach_fe.geometry`, so that an error
+of the geometry of halbach-fe cannot hide in the synthetic data as well.
+
+Each body has its own axes: the origin is in its middle, x points radially outward through it, z is
+along the magnet's axis, and y is azimuthal (z cross x). Angles are in rad, lengths in m, remanences
+in T.
 """
 
 from __future__ import annotations
@@ -22,12 +25,22 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
 Vector = tuple[float, float, float]
-NOWHERE: Vector = (0.0, 0.0, 0.0)
+ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class SectorBody:
-    """A sector of a tube about an axis at x = -(inner + outer) / 2 of its own axes."""
+    """A sector of a tube, whose axis is at x = -(inner + outer) / 2 in the body's own axes.
+
+    Attributes
+    ----------
+    inner, outer : float, in m
+        Radii.
+    half_angle : float, in rad
+        Half of the angle that the sector spans.
+    length : float, in m
+        Length along z; infinite in two dimensions.
+    """
 
     inner: float
     outer: float
@@ -36,29 +49,31 @@ class SectorBody:
 
     @property
     def middle(self) -> float:
-        """Distance from the tube's axis to the body's origin."""
+        """Distance in m from the tube's axis to the body's origin, the mean radius."""
         return (self.inner + self.outer) / 2
 
     @property
     def volume(self) -> float:
-        """In m^3."""
+        """The volume in m^3."""
         return self.half_angle * (self.outer**2 - self.inner**2) * self.length
 
     def share(self, u: tuple[float, float], v: tuple[float, float]) -> float:
-        """Part of the volume between such fractions, see `part`."""
+        """Return the fraction of the body's volume that a part has; u and v are as in `part`."""
         radii, angles = self.part(u, v)
         return float(np.diff(angles)[0] * np.diff(radii**2)[0] / 2 / (
             self.half_angle * (self.outer**2 - self.inner**2)))
 
     def part(self, u: tuple[float, float], v: tuple[float, float]) -> tuple[Floats, Floats]:
-        """Radii (2,) and angles (2,) of the part between fractions u of the thickness, from
-        inside, and v of the half angle.
+        """Return the limiting radii (2,) in m and angles (2,) in rad of a part.
+
+        The part lies between the fractions u of the thickness, from 0 inside to 1 outside, and
+        between the fractions v of the half angle, from -1 to 1.
         """
         return (self.inner + (self.outer - self.inner) * np.array(u),
                 self.half_angle * np.array(v))
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3), in its own axes, are inside or on the surface."""
+        """Tell which points (n, 3) in m, in the body's own axes, are inside or on the surface."""
         x, y, z = points.T
         x = x + self.middle
         radius = np.hypot(x, y)
@@ -68,9 +83,18 @@ class SectorBody:
 
 @dataclass(frozen=True)
 class PrismBody:
-    """A trapezoid or cuboid: ``depth`` along x, its widths along y at the inner and outer face.
+    """A trapezoidal prism or a cuboid.
 
-    ``turn`` is by how much it is turned about z from its own axes.
+    Attributes
+    ----------
+    depth : float, in m
+        Extent along x.
+    inner_width, outer_width : float, in m
+        Extents along y at the inner and the outer face.
+    length : float, in m
+        Length along z; infinite in two dimensions.
+    turn : float, in rad
+        Angle about z by which the prism is turned relative to the body's own axes.
     """
 
     depth: float
@@ -81,18 +105,20 @@ class PrismBody:
 
     @property
     def volume(self) -> float:
-        """In m^3."""
+        """The volume in m^3."""
         return self.depth * (self.inner_width + self.outer_width) / 2 * self.length
 
     def share(self, u: tuple[float, float], v: tuple[float, float]) -> float:
-        """Part of the volume between such fractions, see `part`."""
+        """Return the fraction of the body's volume that a part has; u and v are as in `part`."""
         middle = self.inner_width + (self.outer_width - self.inner_width) * (u[0] + u[1]) / 2
         return middle * (v[1] - v[0]) * (u[1] - u[0]) / (self.inner_width + self.outer_width)
 
     def part(self, u: tuple[float, float] = (0.0, 1.0), v: tuple[float, float] = (-1.0, 1.0)
              ) -> Floats:
-        """Corners (4, 2), counter-clockwise, of the part between fractions u of the depth, from
-        inside, and v of the half width.
+        """Return the corners (4, 2) in m, counter-clockwise, of a part; by default of the whole.
+
+        The part lies between the fractions u of the depth, from 0 inside to 1 outside, and between
+        the fractions v of the half width, from -1 to 1.
         """
         def corner(a: float, b: float) -> tuple[float, float]:
             width = self.inner_width + (self.outer_width - self.inner_width) * a
@@ -104,7 +130,7 @@ class PrismBody:
         return local @ np.array([[c, s], [-s, c]])
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3), in its own axes, are inside or on the surface."""
+        """Tell which points (n, 3) in m, in the body's own axes, are inside or on the surface."""
         corners = self.part()
         inside = np.abs(points[:, 2]) <= self.length / 2
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -117,9 +143,12 @@ Shape = SectorBody | PrismBody
 
 
 @dataclass(frozen=True)
-class Part:
-    """A part of a body, between fractions of its thickness and half width, whose magnetization is
-    ``factor`` times the body's. Where parts of one body overlap, their deviations add up.
+class BodyPart:
+    """A part of a body whose magnetization is ``factor`` times that of the rest of the body.
+
+    It lies between the fractions ``u`` of the body's thickness, from 0 inside to 1 outside, and
+    ``v`` of its half width or half angle, from -1 to 1. Where parts of a body overlap, the
+    deviations of their factors from 1 add up.
     """
 
     u: tuple[float, float]
@@ -134,22 +163,27 @@ class Body:
     Attributes
     ----------
     ring, slot : int
-        From 1.
-    shape : Sector or Prism
-    angle : float
-        Of its own x axis about z, before ``rotation``.
+        Place of the block in the array, both counted from 1.
+    shape : SectorBody or PrismBody
+    angle : float, in rad
+        Angle about z of the body's own x axis, before ``rotation``.
     centre : tuple, in m
-        Of its own origin, before ``displacement``.
-    remanence, easy_axis : tuple
-        B_r in T, and the unit vector of the easy axis, in its own axes.
+        Position of the body's origin, before ``displacement``.
+    remanence : tuple, in T
+        B_r in the body's own axes.
+    easy_axis : tuple
+        Unit vector in the body's own axes.
     along, across : float
         Relative recoil permeability along and across the easy axis.
-    displacement, rotation : tuple
-        In m, and a rotation vector in rad about its own origin, both along the magnet's axes.
-    parts : tuple of Part
-    room : Sector or Prism, optional
-        The shape that finite elements take it for, where its own would leave slits that no mesh
-        resolves.
+    displacement : tuple, in m
+        Along the magnet's axes.
+    rotation : tuple, in rad
+        Rotation vector about the body's origin, along the magnet's axes.
+    parts : tuple of BodyPart
+        Parts with another magnetization.
+    meshed_shape : SectorBody or PrismBody, optional
+        Shape that the finite elements use instead of ``shape``. It is given where gaps between the
+        true shapes would be too narrow for a mesh to resolve.
     """
 
     ring: int
@@ -161,41 +195,44 @@ class Body:
     easy_axis: Vector
     along: float = 1.0
     across: float = 1.0
-    displacement: Vector = NOWHERE
-    rotation: Vector = NOWHERE
-    parts: tuple[Part, ...] = ()
-    room: Shape | None = None
+    displacement: Vector = ZERO_VECTOR
+    rotation: Vector = ZERO_VECTOR
+    parts: tuple[BodyPart, ...] = ()
+    meshed_shape: Shape | None = None
 
     @property
     def position(self) -> Floats:
-        """Of its own origin, (3,) in m."""
+        """Position of the body's origin, (3,) in m."""
         return np.add(self.centre, self.displacement)
 
     @property
     def orientation(self) -> Rotation:
-        """From its own axes to the magnet's."""
+        """Rotation from the body's own axes to the magnet's."""
         return Rotation.from_rotvec(self.rotation) * Rotation.from_euler("z", self.angle)
 
     @property
     def mean_factor(self) -> float:
-        """Mean magnetization over that outside of its parts."""
+        """Mean magnetization of the body relative to that outside its parts."""
         return 1 + sum((part.factor - 1) * self.shape.share(part.u, part.v)
                        for part in self.parts)
 
     @property
     def permeability(self) -> Floats:
-        """Relative recoil permeability in its own axes, (3, 3)."""
+        """Relative recoil permeability in the body's own axes, (3, 3)."""
         outer = np.outer(self.easy_axis, self.easy_axis)
         return self.across * np.eye(3) + (self.along - self.across) * outer
 
     @property
     def magnetization(self) -> Floats:
-        """M = B_r / (mu_0 mu_r) of ``nu B = H + M`` along the magnet's axes, (3,) in A/m."""
+        """M = B_r / (mu_0 mu_r) along the magnet's axes, (3,) in A/m.
+
+        It is the magnetization of the material law ``B / (mu_0 mu_r) = H + M``.
+        """
         return self.orientation.apply(
             np.linalg.solve(MU_0 * self.permeability, np.array(self.remanence)))
 
     def with_magnetization(self, magnetization: Floats) -> Body:
-        """The same body with another M, (3,) in A/m along the magnet's axes."""
+        """Return the body with another `magnetization`, (3,) in A/m along the magnet's axes."""
         own = self.orientation.inv().apply(magnetization)
         return replace(self, remanence=vector(MU_0 * self.permeability @ own))
 
@@ -206,7 +243,15 @@ class Body:
 
 @dataclass(frozen=True)
 class FroehlichLaw:
-    """B = mu_0 H + J_s H / (H + h), h following from the initial relative permeability."""
+    """The Froehlich-Kennelly law of iron, B = mu_0 H + J_s H / (H + h).
+
+    Attributes
+    ----------
+    initial : float
+        Initial relative permeability, from which h follows.
+    saturation : float, in T
+        Saturation polarization J_s.
+    """
 
     initial: float
     saturation: float
@@ -214,19 +259,37 @@ class FroehlichLaw:
 
 @dataclass(frozen=True)
 class TableLaw:
-    """B (n,) in T at H (n,) in A/m, both from 0; J = B - mu_0 H is constant beyond the last."""
+    """An H(B) table of iron.
+
+    Attributes
+    ----------
+    field, flux_density : tuple of float
+        H in A/m and B in T, rising from 0. The polarization J = B - mu_0 H is constant beyond the
+        last entry.
+    """
 
     field: tuple[float, ...]
     flux_density: tuple[float, ...]
 
 
 IronLaw = float | FroehlichLaw | TableLaw
-"""Of iron: a constant relative permeability, or a curve."""
+"""Material law of iron: a constant relative permeability, or a curve."""
 
 
 @dataclass(frozen=True)
 class Tube:
-    """An iron tube about the z axis, ``half_length`` to both sides of ``middle``."""
+    """An iron tube about the z axis.
+
+    Attributes
+    ----------
+    inner, outer : float, in m
+        Radii.
+    half_length : float, in m
+        Distance from the middle to each end.
+    law : IronLaw
+    middle : float, in m
+        Position of the middle along z.
+    """
 
     inner: float
     outer: float
@@ -242,16 +305,18 @@ class Tube:
 
 
 @dataclass(frozen=True)
-class Copy:
-    """The same magnet once more, elsewhere on its axis, ``shift`` in m along z."""
+class MagnetCopy:
+    """A second magnet like the first, displaced by ``shift`` in m along the axis."""
 
     shift: float
 
 
 @dataclass(frozen=True)
 class SoftSphere:
-    """A small sphere of soft iron of a volume in m^3: the field B where it is gives it the moment
-    3 V B / mu_0.
+    """A small sphere of soft iron, centred at ``place`` in m, of a ``volume`` in m^3.
+
+    The field B at its place magnetizes it to the moment 3 V B / mu_0, the limit of high
+    permeability.
     """
 
     place: Vector
@@ -260,36 +325,40 @@ class SoftSphere:
 
 @dataclass(frozen=True)
 class TrueMagnet:
-    """All that makes the field. In two dimensions lengths along z are infinite.
+    """All sources of the field. In two dimensions lengths along z are infinite.
 
     Attributes
     ----------
+    dimension : int
+        2 or 3.
     bodies : tuple of Body
-        Ring by ring, slot by slot.
+        The blocks, ring by ring and slot by slot.
     iron : Tube, optional
     background : tuple, in T
-        A uniform field, which iron and magnets leave as it is.
-    copies, objects : tuple
-        What else is near.
+        A uniform field that is added as it is: neither iron nor blocks respond to it.
+    copies : tuple of MagnetCopy
+        Neighbouring magnets.
+    objects : tuple of SoftSphere
+        Ferromagnetic objects in the surroundings.
     """
 
     dimension: int
     bodies: tuple[Body, ...]
     iron: Tube | None = None
-    background: Vector = NOWHERE
-    copies: tuple[Copy, ...] = ()
+    background: Vector = ZERO_VECTOR
+    copies: tuple[MagnetCopy, ...] = ()
     objects: tuple[SoftSphere, ...] = ()
 
     @property
     def all_bodies(self) -> tuple[Body, ...]:
-        """Those of the copies too."""
+        """The blocks of the magnet and of its copies."""
         return self.bodies + tuple(
             replace(body, centre=vector(np.add(body.centre, (0, 0, copy.shift))))
             for copy in self.copies for body in self.bodies)
 
     @property
     def all_iron(self) -> tuple[Tube, ...]:
-        """That of the copies too."""
+        """The iron of the magnet and of its copies."""
         if self.iron is None:
             return ()
         iron = self.iron
@@ -297,19 +366,20 @@ class TrueMagnet:
 
     @property
     def is_vacuum(self) -> bool:
-        """Tell whether nothing in it responds to a field."""
+        """Whether no material responds to a field: no iron, and all permeabilities 1."""
         return self.iron is None and all(
             body.along == body.across == 1.0 for body in self.bodies)
 
     def with_magnetizations(self, magnetizations: Floats) -> TrueMagnet:
-        """The same magnet with other M, (bodies, dimension) in A/m along its axes."""
+        """Return the magnet with other magnetizations (bodies, dimension) in A/m."""
         full = np.zeros((len(self.bodies), 3))
         full[:, :self.dimension] = magnetizations
         return replace(self, bodies=tuple(
-            body.with_magnetization(one) for body, one in zip(self.bodies, full, strict=True)))
+            body.with_magnetization(magnetization)
+            for body, magnetization in zip(self.bodies, full, strict=True)))
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m are inside of some material."""
+        """Tell which points (n, 3) in m are inside a block or the iron."""
         inside = np.zeros(len(points), bool)
         for body in self.all_bodies:
             inside |= body.holds(points)
@@ -319,13 +389,13 @@ class TrueMagnet:
 
 
 def vector(values: Floats | tuple[float, ...]) -> Vector:
-    """Three numbers as plain ones."""
+    """Return three numbers as a tuple of Python floats."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 def magnet_of(study: Study) -> TrueMagnet:
-    """The nominal magnet of a study."""
+    """Return the nominal magnet of a study."""
     array = study.array
     bodies = tuple(_body(array, ring, slot, z, study.dimension)
                    for ring, z in enumerate(_ring_middles(study), start=1)
@@ -334,7 +404,7 @@ def magnet_of(study: Study) -> TrueMagnet:
 
 
 def ring_length(study: Study) -> float:
-    """Length of a ring in m; infinite in two dimensions."""
+    """Return the length of a ring in m; infinite in two dimensions."""
     length = study.array.ring_length_m
     return np.inf if study.dimension == 2 or length is None else length
 
@@ -357,21 +427,21 @@ def _body(array: Array, ring: int, slot: int, z: float, dimension: int) -> Body:
     direction, remanence = nominal, array.remanence_T
     along = array.recoil_permeability
     across = array.recoil_permeability_across or along
-    for one in array.exceptions:  # the last one counts
-        if (one.ring or ring, one.slot or slot) != (ring, slot):
+    for exception in array.exceptions:  # of several with the same key the last counts
+        if (exception.ring or ring, exception.slot or slot) != (ring, slot):
             continue
-        if one.magnetization_angle_deg is not None:
-            direction = np.radians(one.magnetization_angle_deg)
-        if one.recoil_permeability is not None:
-            along = across = one.recoil_permeability
-        if one.recoil_permeability_across is not None:
-            across = one.recoil_permeability_across
-        if one.remanence_T is not None:
-            remanence = one.remanence_T
+        if exception.magnetization_angle_deg is not None:
+            direction = np.radians(exception.magnetization_angle_deg)
+        if exception.recoil_permeability is not None:
+            along = across = exception.recoil_permeability
+        if exception.recoil_permeability_across is not None:
+            across = exception.recoil_permeability_across
+        if exception.remanence_T is not None:
+            remanence = exception.remanence_T
     length = np.inf if dimension == 2 else float(array.ring_length_m or 0.0)
     shape = _shape(array, length, nominal - angle)
     if remanence is None:
-        assert array.block_moment_A_m2 is not None  # the study has one of the two
+        assert array.block_moment_A_m2 is not None  # a study has the remanence or the moment
         solid = replace(shape, length=float(array.ring_length_m or 0.0))
         remanence = MU_0 * array.block_moment_A_m2 / solid.volume
     middle = (array.inner_radius_m + array.outer_radius_m) / 2
@@ -405,15 +475,21 @@ def _tube(study: Study, ring: IronRing | None) -> Tube | None:
 
 
 def law_of(ring: IronRing) -> IronLaw:
-    """The law of a study's iron."""
+    """Return the material law of a study's iron.
+
+    Raises
+    ------
+    StudyError
+        If the H(B) curve is in a file that has not been read.
+    """
     curve = ring.curve
     if curve is None:
-        assert ring.relative_permeability is not None  # the study has one of the two
+        assert ring.relative_permeability is not None  # a study has the permeability or a curve
         return ring.relative_permeability
     if curve.kind == "froehlich_kennelly":
         return FroehlichLaw(curve.initial_relative_permeability, curve.saturation_polarization_T)
     if curve.kind == "brauer":
-        # as far as it is a material's: where its slope reaches vacuum's
+        # up to the flux density where dB/dH falls to mu_0: beyond it Brauer's law is unphysical
         b = np.linspace(0, materials.MAX_FLUX_DENSITY, 20_001)
         exponent = np.minimum(curve.k2_per_T2 * b**2, 500)
         slope = curve.k1_m_per_H * np.exp(exponent) * (1 + 2 * exponent) + curve.k3_m_per_H
@@ -424,7 +500,8 @@ def law_of(ring: IronRing) -> IronLaw:
         field, flux_density = materials.read_table(materials.steels()[curve.name])
     elif curve.file is not None:
         raise StudyError(must_be("`iron_ring.curve.file`", "study",
-                                 "read together with the study's own file", f"'{curve.file}'"))
+                                 "read together with the study's own file", f"'{curve.file}'",
+                                 "Read the study with halbach_fe.study.reader.read_study."))
     else:
         field, flux_density = curve.H_A_per_m, curve.B_T
     start = () if field[0] == 0 else (0.0,)

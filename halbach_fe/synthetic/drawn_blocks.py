@@ -1,4 +1,4 @@
-"""The blocks of one magnet, drawn from the study's prior, and what a coil says of them."""
+"""Blocks of one magnet, drawn from the study's prior, and their moments measured in a coil."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from halbach_fe.synthetic.helmholtz_coil import moments
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """A magnet with the errors of its blocks.
+class DrawnMagnet:
+    """A magnet whose blocks have the errors that were drawn for them.
 
     Attributes
     ----------
-    single : Magnet
-        Every block as it is before it is mounted.
-    mounted : Magnet
+    single : TrueMagnet
+        The blocks before they are mounted.
+    mounted : TrueMagnet
+        The same blocks in the magnet, with the errors of their mounting.
     common : float
-        What all magnetizations have in common, relative to the nominal.
+        Deviation that all magnetizations have in common, relative to the nominal.
     """
 
     single: TrueMagnet
@@ -32,8 +33,8 @@ class Drawn:
     common: float
 
 
-def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> Drawn:
-    """Draw the magnetizations of all blocks from the study's prior."""
+def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
+    """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
     prior = study.prior
     common = float(prior.common_mode_sd * generator.standard_normal())
     single, mounted = [], []
@@ -43,17 +44,19 @@ def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generato
         turn = np.radians(prior.mounting_sd_deg) * generator.standard_normal(3)
         if study.dimension == 2:
             deviation[2] = turn[0] = turn[1] = 0.0
-        one = _deviating(body, deviation + np.array([common, 0.0, 0.0]))
-        single.append(one)
-        mounted.append(one.with_magnetization(
-            Rotation.from_rotvec(turn).apply(one.magnetization)))
-    return Drawn(replace(nominal, bodies=tuple(single)), replace(nominal, bodies=tuple(mounted)),
-                 common)
+        block = _deviating(body, deviation + np.array([common, 0.0, 0.0]))
+        single.append(block)
+        mounted.append(block.with_magnetization(
+            Rotation.from_rotvec(turn).apply(block.magnetization)))
+    return DrawnMagnet(replace(nominal, bodies=tuple(single)),
+                       replace(nominal, bodies=tuple(mounted)), common)
 
 
 def _deviating(body: Body, deviation: Floats) -> Body:
-    """The body with M changed along it, across it in the ring's plane, and along z, by fractions
-    (3,) of it.
+    """Return the body with another magnetization M.
+
+    ``deviation`` (3,) is the change as fractions of M: along M, perpendicular to it in the plane of
+    the ring, and along z.
     """
     nominal = body.magnetization
     axes = np.array([nominal, np.cross([0, 0, 1], nominal), np.linalg.norm(nominal) * np.eye(3)[2]])
@@ -64,17 +67,29 @@ def coil_table(
     study: Study, nominal: TrueMagnet, single: TrueMagnet, coil_sd: float,
     generator: np.random.Generator
 ) -> tuple[BlockTable, float]:
-    """Moments of the single blocks in a Helmholtz coil, and by how much the coil reads too low.
+    """Measure the moments of the single blocks in a Helmholtz coil.
 
-    ``coil_sd`` is the noise of every component relative to the nominal moment; the calibration is
-    off by the study's ``prior.common_mode_sd``, the same for all blocks.
+    Parameters
+    ----------
+    nominal, single : TrueMagnet
+        The nominal blocks, and those that are measured before they are mounted.
+    coil_sd : float
+        Noise of every component, relative to the nominal moment.
+
+    Returns
+    -------
+    table : BlockTable
+    calibration : float
+        Relative error of the coil, drawn with the standard deviation ``prior.common_mode_sd``. It
+        is the same for all blocks, whose moments are measured too small if it is positive.
     """
     length = study.array.ring_length_m or study.array.outer_radius_m
     true = moments(single.bodies, length)
     sigma = coil_sd * np.linalg.norm(moments(nominal.bodies, length), axis=1)
     calibration = float(study.prior.common_mode_sd * generator.standard_normal())
     measured = true / (1 + calibration) + sigma[:, None] * generator.standard_normal(true.shape)
-    digits = 10 - int(np.log10(np.abs(measured).max()))  # no two solves agree to the last one
+    # the last digits differ from solve to solve
+    digits = 10 - int(np.log10(np.abs(measured).max()))
     label = {slot: name for name, slots in study.prior.types.items() for slot in slots}
     reference = study.prior.reference_temperature_C
     bodies = nominal.bodies
@@ -90,7 +105,7 @@ def coil_table(
 
 
 def magnetizations(magnet: TrueMagnet) -> list[dict[str, object]]:
-    """M of every block as plain data."""
+    """Return the magnetization of every block, in A/m, as plain data."""
     return [{"ring": body.ring, "slot": body.slot,
              "magnetization_A_per_m": list(vector(body.magnetization.round(6)))}
             for body in magnet.bodies]

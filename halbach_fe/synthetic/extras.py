@@ -1,4 +1,4 @@
-"""The programs that make the fields; they come with the extra ``campaign``."""
+"""Import of magpylib and NGSolve, which come with the optional extra ``campaign``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from halbach_fe.core.errors import ExtraMissingError
 
 
-def needed(module: str) -> Any:
-    """Import a module of magpylib or NGSolve.
+def import_extra(module: str) -> Any:
+    """Import a module of magpylib or NGSolve by its name.
 
     Raises
     ------
     ExtraMissingError
-        If it is not installed.
+        If the module is not installed.
     """
     try:
         return import_module(module)
@@ -25,5 +25,5 @@ def needed(module: str) -> Any:
 
 
 def version_of(name: str) -> str:
-    """Version of an installed distribution."""
+    """Return the version of an installed distribution."""
     return metadata.version(name)

@@ -1,7 +1,8 @@
-"""The moment that a coil shows of a block on its own, by NGSolve.
+"""The moment of a single block that a Helmholtz coil measures, by NGSolve.
 
-A block of recoil permeability mu demagnetizes itself. With psi as in
-`halbach_fe.synthetic.ngsolve_reaction` its moment is ``int (B_r + (mu - 1) mu_0 H) dV / mu_0``.
+The demagnetizing field of a block of recoil permeability mu changes its moment, which is
+``int (B_r + (mu - 1) mu_0 H) dV / mu_0``. The field ``mu_0 H = -grad psi`` follows from the same
+equation for psi as in `halbach_fe.synthetic.ngsolve_reaction`.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
-from halbach_fe.synthetic.extras import needed
+from halbach_fe.synthetic.extras import import_extra
 from halbach_fe.synthetic.ngsolve_reaction import outline_face
 
 PRECISION = 1e-12
-"""Of conjugate gradients, in the energy."""
+"""Relative tolerance of the conjugate gradients."""
 
 
 def moments(bodies: tuple[Body, ...], length: float) -> Floats:
-    """Moments (n, 3) in A m^2 of bodies on their own, in their own axes.
+    """Return the moments (n, 3) in A m^2 of single bodies, each in its own axes.
 
-    Infinite bodies are taken for ``length`` in m. Bodies that are alike share the solves.
+    Bodies of infinite length are given the finite ``length`` in m. Bodies of the same shape and
+    permeability share their solves.
     """
     found = []
     for body in bodies:
@@ -39,7 +41,10 @@ def moments(bodies: tuple[Body, ...], length: float) -> Floats:
 
 @lru_cache(maxsize=1024)
 def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
-    """`moment_matrix` of a permeability row by row. An easy axis has no sign: blocks share it."""
+    """Return `moment_matrix`, cached; ``permeability`` is the tensor row by row.
+
+    The tensor does not depend on the sign of the easy axis, so opposite blocks share a matrix.
+    """
     tensor = np.reshape(permeability, (3, 3))
     vacuum = np.array_equal(tensor, np.eye(3))
     return moment_matrix(shape, tensor, None if vacuum else _known_mesh(shape))
@@ -51,12 +56,21 @@ def _known_mesh(shape: Shape) -> Any:
 
 
 def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: int = 3) -> Floats:
-    """Moment over remanence (3, 3) in A m^2 / T, in the block's own axes, of a relative recoil
-    permeability (3, 3); ``mesh`` is a `block_mesh`.
+    """Return the matrix (3, 3) in A m^2 / T from a block's remanence to its moment.
+
+    Parameters
+    ----------
+    shape : SectorBody or PrismBody
+    permeability : ndarray, shape (3, 3)
+        Relative recoil permeability in the block's own axes, as is the matrix.
+    mesh : ngsolve.Mesh, optional
+        A `block_mesh` of the shape, which is made if it is not given.
+    order : int
+        Order of the elements.
     """
     if np.array_equal(permeability, np.eye(3)):
         return shape.volume / MU_0 * np.eye(3)
-    ngs = needed("ngsolve")
+    ngs = import_extra("ngsolve")
     mesh = mesh or block_mesh(shape)
     space = ngs.H1(mesh, order=order, dirichlet="far")
     u, v = space.TnT()
@@ -75,22 +89,24 @@ def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: i
         psi.vec.data = inverse * source.vec
         field = np.array(ngs.Integrate(-ngs.grad(psi), mesh, definedon=inside, order=2 * order))
         columns.append((axis * volume + (permeability - np.eye(3)) @ field) / MU_0)
-    # the curved mesh misses some of the volume
+    # the volume of the curved mesh differs slightly from the true one
     return np.array(columns).T * shape.volume / volume
 
 
 def block_mesh(shape: Shape, size: float | None = None) -> Any:
-    """The block in a sphere, its own origin in the middle, in elements of ``size`` in m (default: a
-    third of its thickness, which leaves 4e-5 of the moment of a sector of the FASER dipole).
+    """Return a mesh of a block in a large sphere of air, centred at the block's origin.
+
+    Elements in the block have the ``size`` in m, by default a third of the block's thickness. The
+    error of the moment is then 4e-5 for a sector of the FASER dipole.
     """
-    ngs, occ = needed("ngsolve"), needed("netgen.occ")
+    ngs, occ = import_extra("ngsolve"), import_extra("netgen.occ")
     thickness = shape.outer - shape.inner if isinstance(shape, SectorBody) else shape.depth
     size = size or thickness / 3
     block = outline_face(shape, np.zeros(2), 0.0, -shape.length / 2).Extrude(
         occ.Vec(0, 0, shape.length))
     block.mat("block")
     block.maxh = size
-    block.edges.maxh = size / 3  # the field is singular there
+    block.edges.maxh = size / 3  # the field is singular at the edges
     extent = max(thickness, shape.length)
     centre = occ.Pnt(0, 0, 0)
     near, world = occ.Sphere(centre, 1.5 * extent) - block, occ.Sphere(centre, 30 * extent)

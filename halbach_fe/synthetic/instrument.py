@@ -1,7 +1,7 @@
-"""The mapper and its Hall probe, with all their faults: from the field to what is written down.
+"""The mapper and its Hall probe with all their faults: from the field to the recorded map.
 
-A map records where the probe should have been. Faults of position mean that the field is taken
-elsewhere; the recorded points stay the nominal ones.
+A map records the nominal points, where the probe should have been. A fault of position means that
+the field is read at another point, while the recorded point stays the nominal one.
 """
 
 from __future__ import annotations
@@ -12,67 +12,68 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.synthetic.bodies import NOWHERE, Vector
+from halbach_fe.synthetic.bodies import ZERO_VECTOR, Vector
 
-PERFECT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+IDEAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
 class FaultyInstrument:
-    """Faults of a mapper; a default one has none. Lengths in m, angles in rad, fields in T.
+    """Faults of a mapper; the default has none. Lengths are in m, angles in rad, fields in T.
 
     Attributes
     ----------
     translation, rotation : tuple
-        Of the whole mapper, axes of the probe included, along the magnet's axes; a rotation
-        vector about the origin.
+        Displacement and rotation vector (about the origin) of the whole mapper, the axes of the
+        probe included, along the magnet's axes.
     z_scale, radius_scale : float
-        True z, true radius is 1 + this times the recorded.
+        The true z or radius is the recorded one times 1 plus this number.
     radius_error : float
-        What the true radius is larger by; on the axis it points along x.
+        Length that is added to the true radius; on the axis it points along x.
     run_out : tuple
-        Amplitude, and the angle where the radius is largest: r + d cos(phi - phi_0).
+        Amplitude d and angle phi_0 of a radius that varies as r + d cos(phi - phi_0).
     sag : tuple
-        How far the arm hangs down, along -y, at its far end, and the z of its two ends; it hangs
-        as the square of the distance from the first.
+        Sag of the arm's far end towards -y, and the z of its near and far end. The arm sags with
+        the square of the distance from its near end.
     vibration : float
         Standard deviation of the probe's position along each axis.
     sensors : tuple of three tuples
         Displacements of the sensors of B_x, B_y and B_z, along the mapper's axes.
     axes : tuple of three tuples
-        ``axes[i][j]``: what sensor i picks up of component j.
+        ``axes[i][j]`` is the sensitivity of sensor i to component j.
     planar_hall, quadratic, cubic : float
-        Sensor i adds planar_hall times the product of the two other components, in 1/T, and
-        quadratic times the square, cubic times the third power of its reading, in 1/T and 1/T^2.
+        Coefficients in 1/T, 1/T and 1/T^2. Sensor i adds planar_hall times the product of the two
+        other components, and quadratic times the square and cubic times the third power of its
+        reading.
     gain, offset : tuple
-        Of every sensor: (1 + gain) times the reading, plus the offset.
+        A sensor shows (1 + gain) times its reading, plus the offset.
     drift : float
-        What is added to all readings from the first of the map to the last, growing with time.
+        Growth of all readings from the first to the last point of the map, linear in time.
     outliers : tuple
-        The fraction of the readings that are off, and by how much.
+        Fraction of the readings that are outliers, and their typical deviation.
     reversed_z : bool
-        The probe is at -z.
+        Whether the probe is at -z when z is recorded.
     order, signs : tuple
-        Which sensor is written down for each component, and with which sign.
+        Number of the sensor that is recorded as each component, and the sign it is given.
     length_unit, field_unit : float
-        What a metre, a tesla is written down as.
+        Recorded number per metre and per tesla, such as 1000 for a record in mm or mT.
     """
 
-    translation: Vector = NOWHERE
-    rotation: Vector = NOWHERE
+    translation: Vector = ZERO_VECTOR
+    rotation: Vector = ZERO_VECTOR
     z_scale: float = 0.0
     radius_scale: float = 0.0
     radius_error: float = 0.0
     run_out: tuple[float, float] = (0.0, 0.0)
-    sag: Vector = NOWHERE
+    sag: Vector = ZERO_VECTOR
     vibration: float = 0.0
-    sensors: tuple[Vector, Vector, Vector] = (NOWHERE, NOWHERE, NOWHERE)
-    axes: tuple[Vector, Vector, Vector] = PERFECT
+    sensors: tuple[Vector, Vector, Vector] = (ZERO_VECTOR, ZERO_VECTOR, ZERO_VECTOR)
+    axes: tuple[Vector, Vector, Vector] = IDEAL_AXES
     planar_hall: float = 0.0
     quadratic: float = 0.0
     cubic: float = 0.0
-    gain: Vector = NOWHERE
-    offset: Vector = NOWHERE
+    gain: Vector = ZERO_VECTOR
+    offset: Vector = ZERO_VECTOR
     drift: float = 0.0
     outliers: tuple[float, float] = (0.0, 0.0)
     reversed_z: bool = False
@@ -82,7 +83,10 @@ class FaultyInstrument:
     field_unit: float = 1.0
 
     def places(self, points: Floats, generator: np.random.Generator) -> Floats:
-        """Where each of the three sensors is, (3, n, 3) in m, instead of at points (n, 3)."""
+        """Return the true positions of the three sensors, (3, n, 3) in m.
+
+        ``points`` (n, 3) in m are the nominal ones.
+        """
         x, y, z = points.T
         radius, angle = np.hypot(x, y), np.arctan2(y, x)
         swing, phase = self.run_out
@@ -101,14 +105,14 @@ class FaultyInstrument:
                          for sensor in self.sensors])
 
     def readings(self, fields: Floats, time: Floats, generator: np.random.Generator) -> Floats:
-        """What the sensors show, (n, 3) in T, without noise.
+        """Return the readings of the three sensors, (n, 3) in T, without noise.
 
         Parameters
         ----------
         fields : ndarray, shape (3, n, 3), in T
-            At each sensor's places, along the magnet's axes.
+            B at the positions of each sensor, along the magnet's axes.
         time : ndarray, shape (n,)
-            From 0 at the map's first reading to 1 at its last.
+            Time of each reading, from 0 at the first of the map to 1 at its last.
         """
         turn = Rotation.from_rotvec(self.rotation).as_matrix()
         columns = []
@@ -119,12 +123,15 @@ class FaultyInstrument:
             columns.append((1 + self.gain[sensor]) * shown + self.offset[sensor])
         fraction, size = self.outliers
         shown = np.column_stack(columns)
-        off = generator.random(shown.shape) < fraction
+        is_outlier = generator.random(shown.shape) < fraction
         jump = size * generator.uniform(0.5, 1.5, shown.shape) * generator.choice(
             [-1.0, 1.0], shown.shape)
-        return np.asarray(shown + self.drift * time[:, None] + np.where(off, jump, 0.0))
+        return np.asarray(shown + self.drift * time[:, None] + np.where(is_outlier, jump, 0.0))
 
     def record(self, points: Floats, readings: Floats) -> tuple[Floats, Floats]:
-        """What is written down of points (n, 3) in m and readings (n, 3) in T."""
+        """Return points (n, 3) in m and readings (n, 3) in T as they are recorded.
+
+        Units, the order of the components and their signs are those of the record.
+        """
         return (points * self.length_unit,
                 readings[:, self.order] * self.signs * self.field_unit)

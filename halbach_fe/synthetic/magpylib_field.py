@@ -1,9 +1,8 @@
 """The field of bodies in vacuum, by magpylib.
 
-A body of remanence B_r and recoil permeability mu_r is taken for one of polarization B_r and
-permeability 1, as if its material did not respond: with ``B = mu_0 mu_r H + B_r``, or
-``M = B_r / (mu_0 mu_r)``, what the permeability adds is the rest
-(`halbach_fe.synthetic.ngsolve_reaction`).
+A body of remanence B_r and recoil permeability mu_r follows ``B = mu_0 mu_r H + B_r``. Here it is
+replaced by one of polarization B_r and permeability 1, as if its material did not respond to the
+field. `halbach_fe.synthetic.ngsolve_reaction` adds the field of that response.
 """
 
 from __future__ import annotations
@@ -18,38 +17,60 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
-from halbach_fe.synthetic.extras import needed
+from halbach_fe.synthetic.extras import import_extra
 
 LONG = 250.0
-"""Length of what is infinite, over the distance of points from its middle. The ends add 1/length^2
-of the field; from two lengths, this and its double, that is taken off, which leaves 1e-9 of the
-remanence, about magpylib's rounding for such bodies."""
+"""Length that stands for an infinite one, relative to the distance of the points from the middle.
+
+The ends change the field by a term in 1/length^2. Extrapolation from this length and its double
+removes that term; the remaining error is 1e-9 of the remanence, about magpylib's rounding error for
+bodies of this length.
+"""
 
 SAME_PLACE = 10
-"""Digits, in m, to which points are in the same place of two bodies: 1e-10 m, or 1e-9 T."""
+"""Decimals of coordinates in m to which two points count as the same: 1e-10 m, or 1e-9 T."""
 
 ASIDE = np.array([1e-8, 2e-8, 3e-8])
-"""Where the field is taken instead, in m, at points 1e-9 m and the like from the plane of a face,
-for which magpylib's sectors have no number; that is 1e-7 T off at most."""
+"""Displacement in m of points at which magpylib returns no finite field.
 
-AT_ONCE = 10_000  # points between two signs of progress
+Its sectors do so at points some 1e-9 m from the plane of a face. The displacement changes the field
+by at most 1e-7 T.
+"""
+
+AT_ONCE = 10_000
+"""Number of points between two reports of progress."""
 
 Progress = Callable[[int, int], None]
+"""Function that is called with the amount of work done and its total."""
+
 Fractions = tuple[float, float]
 Piece = tuple[Shape, Fractions, Fractions]
-"""A shape, and the part of it between fractions of its thickness and of its half width."""
+"""A shape, and the fractions of its thickness and half width that limit a part of it.
+
+See `halbach_fe.synthetic.bodies.BodyPart`.
+"""
 
 WHOLE: tuple[Fractions, Fractions] = ((0.0, 1.0), (-1.0, 1.0))
 
 
-def silent(done: int, total: int) -> None:
-    """Show no progress."""
+def no_progress(done: int, total: int) -> None:
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
 class _Task:
-    """Field of a piece of some polarizations (k, 3) in T at points (n, 3) in its own axes, and what
-    is made of it: for each body its number, the index of its points, and its own polarization.
+    """A field to compute, and the bodies that use it.
+
+    Attributes
+    ----------
+    piece : Piece
+    polarizations : ndarray, shape (k, 3), in T
+        Polarizations of the piece for which the field is computed.
+    points : ndarray, shape (n, 3), in m
+        Points in the piece's own axes.
+    users : tuple
+        For each body that uses the field: its number, the index of its points among ``points``,
+        and its weights (k,) of the polarizations; None stands for a weight of 1.
     """
 
     piece: Piece
@@ -58,11 +79,14 @@ class _Task:
     users: tuple[tuple[int, Any, Floats | None], ...]
 
 
-def vacuum_field(bodies: Sequence[Body], points: Floats, progress: Progress = silent) -> Floats:
-    """B (n, 3) in T of bodies at points (n, 3) in m outside them.
+def vacuum_field(
+    bodies: Sequence[Body], points: Floats, progress: Progress = no_progress
+) -> Floats:
+    """Return B (n, 3) in T of bodies in vacuum, at points (n, 3) in m outside them.
 
-    Infinite bodies give the field of a cross-section, whatever the z of the points. Bodies that are
-    alike and see points from the same places share the work: of a map on circles many do.
+    The field of infinite bodies is that of a cross-section and does not depend on the points' z.
+    Bodies of the same shape share the computation at points that have the same coordinates in the
+    axes of both, as many points of a map on circles have.
     """
     tasks = tasks_of(bodies, points)
     total = sum(len(task.points) * len(task.polarizations) for task in tasks)
@@ -71,27 +95,29 @@ def vacuum_field(bodies: Sequence[Body], points: Floats, progress: Progress = si
         columns = []
         for polarization in task.polarizations:
             parts = []
-            for some in np.array_split(task.points, len(task.points) // AT_ONCE + 1):
-                parts.append(_field(task.piece, polarization, some))
-                done += len(some)
+            for chunk in np.array_split(task.points, len(task.points) // AT_ONCE + 1):
+                parts.append(_field(task.piece, polarization, chunk))
+                done += len(chunk)
                 progress(done, total)
             columns.append(np.vstack(parts))
         own = np.stack(columns, axis=2)
         for number, index, weights in task.users:
-            one = own[index] @ (np.ones(1) if weights is None else weights)
-            field += bodies[number].orientation.apply(one)
+            body_field = own[index] @ (np.ones(1) if weights is None else weights)
+            field += bodies[number].orientation.apply(body_field)
     return field
 
 
 def tasks_of(bodies: Sequence[Body], points: Floats) -> list[_Task]:
-    """What is to be computed: unit fields where bodies share enough of the points, else each body's
-    own.
+    """Divide the computation of `vacuum_field` into tasks.
+
+    Where pieces of the same shape share enough points, one task computes the fields of three unit
+    polarizations for all of them; otherwise each piece has a task with its own polarization.
     """
     groups: dict[Piece, list[tuple[int, Floats]]] = {}
     for number, body in enumerate(bodies):
         remanence = np.array(body.remanence)
         groups.setdefault((body.shape, *WHOLE), []).append((number, remanence))
-        for part in body.parts:  # what it differs by
+        for part in body.parts:  # deviation of the part from the body
             groups.setdefault((body.shape, part.u, part.v), []).append(
                 (number, (part.factor - 1) * remanence))
     tasks = []
@@ -99,7 +125,7 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> list[_Task]:
         seen = [bodies[number].orientation.inv().apply(points - bodies[number].position)
                 for number, _ in members]
         if np.isinf(piece[0].length):
-            seen = [one * [1, 1, 0] for one in seen]
+            seen = [local * [1, 1, 0] for local in seen]
         together = np.vstack(seen)
         _, first, inverse = np.unique(together.round(SAME_PLACE), axis=0, return_index=True,
                                       return_inverse=True)
@@ -109,13 +135,19 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> list[_Task]:
                 (number, places[row], polarization)
                 for row, (number, polarization) in enumerate(members))))
         else:
-            tasks += [_Task(piece, polarization[None], one, ((number, slice(None), None),))
-                      for (number, polarization), one in zip(members, seen, strict=True)]
+            tasks += [_Task(piece, polarization[None], local, ((number, slice(None), None),))
+                      for (number, polarization), local in zip(members, seen, strict=True)]
     return tasks
 
 
 def _field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
-    """B (n, 3) in T of a piece at points (n, 3) in m, in its own axes."""
+    """Return B (n, 3) in T of a piece at points (n, 3) in m, both in its own axes.
+
+    Raises
+    ------
+    CheckFailedError
+        If magpylib returns no finite field at some of the points.
+    """
     shape, u, v = piece
     if np.isinf(shape.length):
         length = LONG * max(np.abs(points).max(), _reach(shape))
@@ -123,8 +155,8 @@ def _field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
                        for factor in (1, 2))
         return (4 * long - short) / 3 * [1, 1, 0]
     source = _source(shape, u, v, polarization)
-    # a mesh need not look for points inside, which takes long and fails for slender bodies
-    mesh = isinstance(source, needed("magpylib").magnet.TriangularMesh)
+    # All points are outside. A test for points inside a mesh is slow, and wrong for slender bodies.
+    mesh = isinstance(source, import_extra("magpylib").magnet.TriangularMesh)
     where = {"in_out": "outside"} if mesh else {}
 
     def field(at: Floats) -> Floats:
@@ -136,19 +168,20 @@ def _field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
     if lost.any():
         found[lost] = field(points[lost] + ASIDE)
     if not np.isfinite(found).all():
-        raise CheckFailedError("magpylib gives no field at some of the points.")
+        raise CheckFailedError("magpylib returns no finite field at some of the points.")
     return found
 
 
 def _reach(shape: Shape) -> float:
-    """A length of the size of the body."""
+    """Return a length in m that is characteristic of the body's cross-section."""
     if isinstance(shape, SectorBody):
         return shape.outer - shape.inner
     return max(shape.depth, shape.outer_width)
 
 
 def _source(shape: Shape, u: Fractions, v: Fractions, polarization: Floats) -> Any:
-    magnet = needed("magpylib").magnet
+    """Return the magpylib source of a piece, in the piece's own axes."""
+    magnet = import_extra("magpylib").magnet
     if isinstance(shape, SectorBody):
         radii, angles = shape.part(u, v)
         return magnet.CylinderSegment(

@@ -1,15 +1,16 @@
-"""What recoil permeability and iron add to the field, by NGSolve.
+"""The field that recoil permeability and iron add to that of bodies in vacuum, by NGSolve.
 
-The scalar potential psi, ``mu_0 H = -grad psi``, of ``div(mu_r grad psi) = div B_r`` is solved in
-elements of high order on curved boundaries, every body a region with its own magnetization. The
-materials respond by the polarization ``(mu_r - 1) mu_0 H``, and its field, summed over the elements
-as that of dipoles, is the reaction. A sum forgives what elements miss near the bodies' edges, where
-the field is singular: taken from the potential itself at the points, with that of vacuum on the
-same mesh subtracted, it is 40 times less accurate.
+The scalar potential psi, ``mu_0 H = -grad psi``, satisfies ``div(mu_r grad psi) = div B_r``. It is
+computed with curved elements of high order; every body is a region with its own magnetization. The
+materials respond to the field with the polarization ``(mu_r - 1) mu_0 H``. The reaction is the
+field of this polarization, summed over the quadrature points of the elements as that of dipoles.
+The sum is insensitive to the errors of the potential near the edges of bodies, where the field is
+singular: the gradient of the potential at the points, less that of vacuum on the same mesh, is 40
+times less accurate.
 
-Bodies are meshed in their nominal places: where a displacement of a tenth of a millimetre, or a
-slit, would ask for elements of that size, only magnetizations follow the true body. What is left
-out is mu_r - 1 times the change of the field by the displacement.
+Bodies are meshed in their nominal places. A displacement of a tenth of a millimetre, or a gap as
+narrow, would need elements of that size, so only the magnetizations follow the true body. The
+neglected field is mu_r - 1 times the change that the displacement makes.
 """
 
 from __future__ import annotations
@@ -32,20 +33,30 @@ from halbach_fe.synthetic.bodies import (
     TrueMagnet,
     Tube,
 )
-from halbach_fe.synthetic.extras import needed
+from halbach_fe.synthetic.extras import import_extra
 
 RESIDUAL = 1e-11
-"""Newton's method stops there, relative to the first residual; one or two steps more and it is at
-rounding, some 1e-14."""
+"""Residual, relative to the first, at which Newton's method stops.
+
+Rounding errors limit it to some 1e-14, one or two steps further on.
+"""
 
 MAX_STEPS = 40
+"""Largest number of steps of Newton's method."""
+
 FAR = {2: 100.0, 3: 8.0}
-"""Distance of the boundary over the magnet's largest extent, by dimension. A dipole's potential
-falls with its first or second power; a boundary there changes the reaction by the square of 1/100
-or the cube of 1/8, and Halbach arrays have hardly a dipole outside."""
+"""Distance of the outer boundary relative to the magnet's largest extent, by dimension.
+
+The potential of a dipole falls with the first power of the distance in two dimensions and with the
+second in three. The boundary therefore changes the reaction by (1/100)^2 or (1/8)^3 of the dipole's
+field, and Halbach arrays have a very small dipole moment.
+"""
 
 TABLE_POINTS = 4000
-CHUNK = 4_000_000  # numbers in one temporary array: 32 MB
+"""Number of points at which an H(B) table is interpolated."""
+
+CHUNK = 4_000_000
+"""Largest number of entries of a temporary array, 32 MB."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +65,13 @@ class Elements:
 
     Attributes
     ----------
-    size : float, optional
-        Largest element in the magnet in m; default a third of the blocks' thickness, and half of
-        that in two dimensions.
+    size : float, optional, in m
+        Largest element size in the magnet; by default a third of the blocks' thickness in three
+        dimensions, and a sixth in two.
     order : int, optional
-        Of the potential; default 3 in three dimensions and 5 in two.
+        Polynomial order of the potential; by default 3 in three dimensions and 5 in two.
     grading : float
-        How slowly elements grow, towards 0, or fast, towards 1.
+        Growth of the elements with the distance from the magnet, from 0 (slow) to 1 (fast).
     """
 
     size: float | None = None
@@ -69,11 +80,14 @@ class Elements:
 
 
 def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None = None) -> Floats:
-    """What the materials' response adds to B (n, 3) in T at points (n, 3) in m in air."""
+    """Return the part of B (n, 3) in T, at points (n, 3) in m in air, that the materials add.
+
+    It is the difference between the field with their response and that of `vacuum_field`.
+    """
     if magnet.is_vacuum:
         return np.zeros((len(points), 3))
     elements, size = elements or Elements(), magnet.dimension
-    with needed("ngsolve").TaskManager():
+    with import_extra("ngsolve").TaskManager():
         mesh = mesh_of(magnet, points, elements)
         potential = solve_potential(magnet, mesh, elements.order or {2: 5, 3: 3}[size])
         places, moments = _response(magnet, mesh, potential)
@@ -83,8 +97,12 @@ def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None
 
 
 def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Floats]:
-    """Where the materials' response sits (n, d) in m; mu_0 times its moments (n, d) in T m^d."""
-    ngs, size = needed("ngsolve"), magnet.dimension
+    """Return the dipoles that represent the materials' response.
+
+    These are their positions (n, d) in m, which are the quadrature points of the elements, and mu_0
+    times their moments (n, d) in T m^d.
+    """
+    ngs, size = import_extra("ngsolve"), magnet.dimension
     field = -ngs.grad(potential)
     unity = ngs.CF(tuple(np.eye(size).ravel()), dims=(size, size))
     polarization = (_recoil(magnet, mesh) - unity) * field
@@ -105,10 +123,11 @@ def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Fl
 
 
 def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
-    """B (n, d) in T at points (n, d) of dipoles (m, d) with mu_0 times their moments in T m^d.
+    """Return B (n, d) in T of dipoles at points (n, d) in m.
 
-    In two dimensions they are lines of dipoles: J. D. Jackson, Classical Electrodynamics, 3rd ed.,
-    equation 5.56, integrated along z.
+    ``places`` (m, d) in m are the positions of the dipoles, ``moments`` (m, d) mu_0 times their
+    moments in T m^d. In two dimensions they are lines of dipoles. Source: J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., equation 5.56, for two dimensions integrated along z.
     """
     size = points.shape[1]
     centre = places.mean(axis=0)
@@ -117,12 +136,13 @@ def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
     field = np.empty_like(points)
     step = max(1, CHUNK // len(places))
     for first in range(0, len(points), step):
-        some = points[first:first + step]
-        inverse = 1 / (np.einsum("ij,ij->i", some, some)[:, None] + square - 2 * some @ places.T)
+        chunk = points[first:first + step]
+        inverse = 1 / (np.einsum("ij,ij->i", chunk, chunk)[:, None] + square
+                       - 2 * chunk @ places.T)  # 1 / r^2
         near = inverse if size == 2 else inverse * np.sqrt(inverse)  # 1 / r^d
-        along = (some @ moments.T - own) * near * inverse
+        along = (chunk @ moments.T - own) * near * inverse
         field[first:first + step] = size * (
-            some * along.sum(axis=1)[:, None] - along @ places) - near @ moments
+            chunk * along.sum(axis=1)[:, None] - along @ places) - near @ moments
     return field / (2 * np.pi * (size - 1))
 
 
@@ -130,11 +150,11 @@ def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
 
 
 def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
-    """Mesh with the regions ``block0``, ``block1``, ..., ``iron`` and ``air``, bounded by ``far``.
+    """Return a mesh with the regions ``block0``, ``block1``, ..., ``iron`` and ``air``.
 
-    The boundary is beyond the points.
+    Its outer boundary is named ``far`` and encloses all ``points`` (n, 3) in m.
     """
-    ngs, occ = needed("ngsolve"), needed("netgen.occ")
+    ngs, occ = import_extra("ngsolve"), import_extra("netgen.occ")
     flat = magnet.dimension == 2
     size = elements.size or _thickness(magnet.bodies[0].shape) / (6 if flat else 3)
     parts = []
@@ -159,13 +179,14 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     air = world - occ.Glue(parts)
     _name(air, "air", flat)
     geometry = occ.OCCGeometry(occ.Glue([*parts, air]), dim=magnet.dimension)
-    rules = needed("netgen.meshing").MeshingParameters(maxh=far / 4, grading=elements.grading)
+    rules = import_extra("netgen.meshing").MeshingParameters(maxh=far / 4, grading=elements.grading)
     mesh = ngs.Mesh(geometry.GenerateMesh(mp=rules))
     mesh.Curve(3)
     return mesh
 
 
 def _name(shape: Any, name: str, flat: bool) -> None:
+    """Name the region of a shape, which is a face if ``flat`` and a solid otherwise."""
     if flat:
         shape.faces.name = name
     else:
@@ -173,23 +194,25 @@ def _name(shape: Any, name: str, flat: bool) -> None:
 
 
 def _thickness(shape: Shape) -> float:
+    """Return the radial extent of a block in m."""
     return shape.outer - shape.inner if isinstance(shape, SectorBody) else shape.depth
 
 
 def _solid(body: Body, flat: bool) -> Any:
-    """The body in its nominal place, as a face in two dimensions."""
-    shape = body.room or body.shape
+    """Return the body in its nominal place as a solid, or as a face if ``flat``."""
+    shape = body.meshed_shape or body.shape
     x, y, z = body.centre
     face = outline_face(shape, np.array([x, y]), body.angle,
                         0.0 if flat else z - shape.length / 2)
-    return face if flat else face.Extrude(needed("netgen.occ").Vec(0, 0, shape.length))
+    return face if flat else face.Extrude(import_extra("netgen.occ").Vec(0, 0, shape.length))
 
 
 def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
-    """Cross-section of a body, its own origin at ``centre`` (2,) in m and its own x axis at an
-    angle; arcs are true arcs.
+    """Return the cross-section of a body as a face at height ``z``, with exact arcs.
+
+    The body's origin is at ``centre`` (2,) in m, and its own x axis at ``angle`` in rad.
     """
-    occ = needed("netgen.occ")
+    occ = import_extra("netgen.occ")
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 
     def at(x: float, y: float) -> Any:
@@ -212,7 +235,8 @@ def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
 
 
 def _tube(iron: Tube, flat: bool) -> Any:
-    occ = needed("netgen.occ")
+    """Return an iron tube as a solid, or as a face if ``flat``."""
+    occ = import_extra("netgen.occ")
     if flat:
         return occ.Circle((0, 0), iron.outer).Face() - occ.Circle((0, 0), iron.inner).Face()
     axis = occ.Axes((0, 0, iron.middle - iron.half_length), occ.Z)
@@ -224,33 +248,43 @@ def _tube(iron: Tube, flat: bool) -> Any:
 
 
 def _region(body: Body) -> tuple[Floats, Floats]:
-    """Remanence (d,) in T and permeability (d, d) along the magnet's axes, as meshed."""
+    """Return remanence (3,) in T and permeability (3, 3) of a meshed body, along the magnet's axes.
+
+    The remanence is the mean over the body, scaled to the body's moment where the meshed shape has
+    another volume.
+    """
     turn = body.orientation.as_matrix()
     remanence = turn @ body.remanence * body.mean_factor
-    room = body.room or body.shape
+    room = body.meshed_shape or body.shape
     if np.isfinite(room.length):
-        remanence *= body.shape.volume / room.volume  # a moment is what it is
+        remanence *= body.shape.volume / room.volume  # keep the moment
     return remanence, turn @ body.permeability @ turn.T
 
 
 def permeability(law: IronLaw, square: Any) -> Any:
-    """B / (mu_0 H) of iron at (mu_0 H)^2 in T^2, as NGSolve has coefficients."""
-    ngs = needed("ngsolve")
+    """Return the relative permeability B / (mu_0 H) of iron, a number or an NGSolve function.
+
+    ``square`` is (mu_0 H)^2 in T^2, an NGSolve function.
+    """
+    ngs = import_extra("ngsolve")
     if isinstance(law, float):
         return law
-    size = ngs.sqrt(square + 1e-24)  # the root has no slope at 0
+    size = ngs.sqrt(square + 1e-24)  # the square root is not differentiable at 0
     if isinstance(law, FroehlichLaw):
         return 1 + law.saturation / (size + half_field(law))
     return 1 + _polarization(law)(size) / size
 
 
 def half_field(law: FroehlichLaw) -> float:
-    """mu_0 h in T: where the polarization is half of J_s."""
+    """Return mu_0 h in T, the field mu_0 H at which the polarization is half of J_s."""
     return law.saturation / (law.initial - 1)
 
 
 def _polarization(table: TableLaw) -> Any:
-    """J in T at mu_0 H in T: piecewise linear, through a monotone curve through the table."""
+    """Return the polarization J in T as an NGSolve function of mu_0 H in T.
+
+    It is piecewise linear between many points of a monotone interpolation of the table.
+    """
     from scipy.interpolate import PchipInterpolator
 
     h, b = MU_0 * np.array(table.field), np.array(table.flux_density)
@@ -258,24 +292,24 @@ def _polarization(table: TableLaw) -> Any:
     fine_h = PchipInterpolator(b, h)(fine_b)
     j = fine_b - fine_h
     knots = [0.0, *fine_h.tolist(), 1e4]
-    return needed("ngsolve").BSpline(2, knots, [*j.tolist(), float(j[-1])])
+    return import_extra("ngsolve").BSpline(2, knots, [*j.tolist(), float(j[-1])])
 
 
 # --- solution ----------------------------------------------------------------------------------
 
 
 def _recoil(magnet: TrueMagnet, mesh: Any) -> Any:
-    """Relative permeability (d, d) of the bodies, and of vacuum elsewhere, iron included."""
+    """Return the relative permeability (d, d) of the bodies; it is 1 elsewhere, in iron too."""
     size = magnet.dimension
     tensors = {f"block{number}": tuple(_region(body)[1][:size, :size].ravel())
                for number, body in enumerate(magnet.all_bodies)}
-    return needed("ngsolve").CF(mesh.MaterialCF(tensors, default=tuple(np.eye(size).ravel())),
+    return import_extra("ngsolve").CF(mesh.MaterialCF(tensors, default=tuple(np.eye(size).ravel())),
                                 dims=(size, size))
 
 
 def solve_potential(magnet: TrueMagnet, mesh: Any, order: int) -> Any:
-    """The potential psi in T m, ``mu_0 H = -grad psi``, 0 on the boundary."""
-    ngs = needed("ngsolve")
+    """Return the potential psi in T m, with ``mu_0 H = -grad psi`` and psi = 0 on the boundary."""
+    ngs = import_extra("ngsolve")
     space = ngs.H1(mesh, order=order, dirichlet="far")
     u, v = space.TnT()
     size = magnet.dimension
@@ -294,12 +328,17 @@ def solve_potential(magnet: TrueMagnet, mesh: Any, order: int) -> Any:
 
 
 def newton(form: Any, solution: Any, iterate: bool = False) -> list[float]:
-    """Newton's method, halving steps until the residual falls; its residuals.
+    """Solve a nonlinear form for ``solution`` by Newton's method, and return the residuals.
 
-    A linear problem takes one step or two. ``iterate`` solves for the steps by conjugate gradients
-    in place of a factorization.
+    A step is halved until the residual falls. A linear problem takes one step or two. With
+    ``iterate`` the steps are computed by conjugate gradients instead of a factorization.
+
+    Raises
+    ------
+    CheckFailedError
+        If the residual has not fallen to `RESIDUAL` of the first after `MAX_STEPS` steps.
     """
-    ngs = needed("ngsolve")
+    ngs = import_extra("ngsolve")
     space = solution.space
     free = space.FreeDofs()
     preconditioner = ngs.Preconditioner(form, "bddc") if iterate else None

@@ -1,4 +1,4 @@
-"""Where a campaign measures, and where it checks."""
+"""Points of the held-out map of a synthetic campaign."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from halbach_fe.study.measurement import Positions
 
 
 def between(positions: Positions) -> Floats:
-    """Points (n, 3) in m half a step between a study's own; none if it has one only.
+    """Return points (n, 3) in m halfway between those of a study; none if it has one point only.
 
-    On circles that is half a step in the angle and along z, on lines half a step, on grids half a
-    step along each axis that has several points, and each of single points is moved half of the
-    way to the nearest of the others.
+    Circles are shifted by half a step in the angle and along z, lines by half a step, and grids by
+    half a step along each axis that has several points. Of points that are given one by one, each
+    is moved halfway to its nearest neighbour.
     """
     points = points_from(positions)
     if positions.kind == "circles":

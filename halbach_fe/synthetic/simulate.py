@@ -1,7 +1,7 @@
 """A synthetic measurement campaign: block table, map, held-out map, and the truth.
 
-The field is by magpylib, and by NGSolve what permeability and iron add; halbach-fe's own model of
-the field has no part in it.
+magpylib computes the field of the blocks in vacuum, and NGSolve the field that permeability and
+iron add. halbach-fe's own model of the field is not used, so that it can be tested on the result.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
+from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
@@ -27,42 +28,54 @@ from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.bodies import TrueMagnet, magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
 from halbach_fe.synthetic.extras import version_of
-from halbach_fe.synthetic.hidden_effects import Wanted, chosen, instrument_with, with_effects
+from halbach_fe.synthetic.hidden_effects import (
+    RequestedEffect,
+    choose_effects,
+    instrument_with,
+    with_effects,
+)
 from halbach_fe.synthetic.hidden_effects.kinds import site_of
 from halbach_fe.synthetic.instrument import FaultyInstrument
-from halbach_fe.synthetic.magpylib_field import Progress, silent, vacuum_field
+from halbach_fe.synthetic.magpylib_field import Progress, no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
 from halbach_fe.synthetic.positions import between
 
 COIL_SD = 0.001
-"""Noise of a Helmholtz coil over the moment; usual coils reach 0.1 %."""
+"""Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""
 
 DIGITS = 12
-"""Fields are kept to 1e-12 T: the same seed gives the same files, whatever the order in which two
-processors sum."""
+"""Decimals of fields in T.
+
+Rounding to 1e-12 T makes the files depend on the seed only, and not on the order in which
+processors sum.
+"""
 
 SECONDS = 1.0
-"""Between two readings; held-out points are measured after the map."""
+"""Time in s between two readings; the held-out points are measured after the map."""
 
 LARGEST_CSV = 5e6 / 20
-"""Numbers in a map, of some 20 characters each, beyond which it is HDF5."""
+"""Count of numbers in a map, of some 20 characters each, from which it is written as HDF5."""
 
 
 @dataclass(frozen=True)
-class SimulatedCampaign:
-    """What was measured, and what is known of it.
+class SimulatedCampaign(ShownInNotebook):
+    """The measurements of a synthetic campaign, and the truth behind them.
 
     Attributes
     ----------
+    study : Study
     readings, held_out : xarray.Dataset
-        See `halbach_fe.measurement.field_map`; no held-out map where the study has one point only.
+        The two maps, see `halbach_fe.measurement.field_map`. The held-out map is None if the study
+        has one point only.
     blocks : BlockTable
+        Moments of the single blocks, measured in a Helmholtz coil.
     truth : dict
-        As plain data.
+        The magnetizations, hidden effects and other numbers that were drawn, as plain data.
     without_noise : ndarray, shape (n, 3)
-        The readings of the map, as they would be without it.
+        Readings of the map before noise was added, in the field unit of the record.
     """
 
+    study: Study
     readings: xr.Dataset
     held_out: xr.Dataset | None
     blocks: BlockTable
@@ -71,33 +84,44 @@ class SimulatedCampaign:
 
 
 def simulate_campaign(
-    study: Study, seed: int, coil_sd: float = COIL_SD, hide: Sequence[Wanted] = (),
-    hide_random: int = 0, elements: Elements | None = None, progress: Progress = silent,
+    study: Study, seed: int, coil_sd: float = COIL_SD, hide: Sequence[RequestedEffect] = (),
+    hide_random: int = 0, elements: Elements | None = None, progress: Progress = no_progress,
 ) -> SimulatedCampaign:
-    """Build, measure and describe one magnet.
+    """Draw a magnet, measure it, and describe the truth.
 
     Parameters
     ----------
-    hide : sequence of pairs
-        Effects, and their values unless those are to be drawn; they are applied in this order.
+    study : Study
+    seed : int
+        Seed of all random numbers.
+    coil_sd : float
+        Noise of the Helmholtz coil, relative to the nominal moment.
+    hide : sequence of RequestedEffect
+        Effects that the truth has and the study does not, with their values or None if these are to
+        be drawn. They are applied in this order.
     hide_random : int
-        How many more effects are drawn.
+        Number of further effects that are drawn at random.
+    elements : Elements, optional
+        Resolution of NGSolve's mesh.
+    progress : callable
+        Function that receives the amount of work that magpylib has done and its total.
 
     Raises
     ------
     StudyError
-        If the study does not say how noisy its readings are, measures inside of material, or cannot
-        have an effect.
+        If the study does not state the noise of its readings, measures at a point inside a
+        material, or cannot have one of the effects.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
     """
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
-    blocks, coil, noise, effects, faults = (  # what one draws does not change the others
+    # separate streams of random numbers: a further draw from one does not change the others
+    blocks, coil, noise, effects, faults = (
         np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5))
     nominal = magnet_of(study)
     site = site_of(study, nominal)
-    hidden = chosen(site, hide, hide_random, effects)
+    hidden = choose_effects(site, hide, hide_random, effects)
     drawn = draw_magnet(study, nominal, blocks)
     table, calibration = coil_table(study, nominal, with_effects(
         drawn.single, site, hidden, single=True), coil_sd, coil)
@@ -108,7 +132,7 @@ def simulate_campaign(
         magnet, instrument, points, others, elements, faults, progress, offsets)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
-        "effects": [one.plain() for one in hidden],
+        "effects": [effect.plain() for effect in hidden],
         "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
         "noise_free": {"largest_T": float(np.linalg.norm(readings, axis=1).max()),
                        "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
@@ -123,7 +147,7 @@ def simulate_campaign(
     maps = [_map(study, recorded[part], readings[part], unit * sigma[part], seal)
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
-    return SimulatedCampaign(maps[0], maps[1] if len(others) else None, table, truth, exact)
+    return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact)
 
 
 def measured(
@@ -131,14 +155,16 @@ def measured(
     elements: Elements | None, generator: np.random.Generator, progress: Progress,
     offsets: Floats | None = None,
 ) -> tuple[Floats, Floats]:
-    """What is written down: points and readings without noise, both (n, 3), of the map and the
-    held-out points, one after the other; the probe was ``offsets`` (n, 3) in m from there.
+    """Return the recorded points and readings without noise, both (n, 3).
+
+    The ``points`` of the map come first, the held-out points ``others`` last. ``offsets`` (n, 3) in
+    m displace the probe from each of them.
     """
     nominal = np.vstack([points, others])
     places = instrument.places(nominal, generator)
     if offsets is not None:
-        places = places + offsets  # of all sensors
-    # mostly the three sensors are in one place
+        places = places + offsets  # the same for all sensors
+    # the three sensors are usually in one place, whose field is then computed once
     distinct, inverse = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
     check_air(magnet, distinct)
     fields = true_field(magnet, distinct, elements, progress)[inverse].reshape(places.shape)
@@ -150,10 +176,10 @@ def measured(
 
 def true_field(
     magnet: TrueMagnet, points: Floats, elements: Elements | None = None,
-    progress: Progress = silent
+    progress: Progress = no_progress
 ) -> Floats:
-    """B (n, 3) in T of a magnet at points (n, 3) in m in air."""
-    spheres = np.array([one.place for one in magnet.objects]).reshape(-1, 3)
+    """Return B (n, 3) in T of a magnet and its surroundings, at points (n, 3) in m in air."""
+    spheres = np.array([sphere.place for sphere in magnet.objects]).reshape(-1, 3)
     everywhere = np.vstack([points, spheres])
     field = (vacuum_field(magnet.all_bodies, everywhere, progress)
              + reaction_field(magnet, everywhere, elements) + magnet.background)
@@ -165,7 +191,7 @@ def true_field(
 
 
 def model_of(magnet: TrueMagnet) -> dict[str, str]:
-    """Which programs make a magnet's field, with their versions."""
+    """Return the programs that compute a magnet's field, with their versions."""
     programs = {"vacuum": f"magpylib {version_of('magpylib')}"}
     if not magnet.is_vacuum:
         programs["reaction"] = f"NGSolve {version_of('ngsolve')}"
@@ -173,11 +199,16 @@ def model_of(magnet: TrueMagnet) -> dict[str, str]:
 
 
 def point_noise(study: Study, points: Floats) -> Floats:
-    """Standard deviations (n, 3) in T of the components at points (n, 3) in m; NaN of those that
-    the study does not observe.
+    """Return the standard deviations (n, 3) in T of the components at points (n, 3) in m.
 
-    Fourier coefficients of n points have 2/n of the points' variance, and the study's sigma is
-    theirs.
+    They are NaN for components that the study does not observe. If the study observes Fourier
+    coefficients, its sigma is theirs; the variance of a coefficient of n points is 2/n times that
+    of a point.
+
+    Raises
+    ------
+    StudyError
+        If the study has no noise regions.
     """
     if study.noise is None or not study.noise.regions:
         raise StudyError(must_be("`noise`", f"study {study.name}",
@@ -195,13 +226,16 @@ def point_noise(study: Study, points: Floats) -> Floats:
 
 
 def observed_components(study: Study) -> tuple[str, ...]:
-    """Which components of B a study's readings are made of."""
+    """Return the components of B that a study's readings consist of."""
     observed = study.observation
     return ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components
 
 
 def real_places(study: Study, points: Floats, generator: np.random.Generator) -> Floats:
-    """Where the probe was, (n, 3) in m, in place of points that are uncertain."""
+    """Return the true points (n, 3) in m of the probe, drawn about the nominal ``points``.
+
+    They are the nominal ones if the study states no uncertainty of its positions.
+    """
     if study.noise is None or study.noise.position_sd_m is None:
         return points
     sd = np.array(study.noise.position_sd_m)
@@ -209,33 +243,40 @@ def real_places(study: Study, points: Floats, generator: np.random.Generator) ->
 
 
 def check_air(magnet: TrueMagnet, points: Floats) -> None:
-    """Refuse points inside of material."""
+    """Raise a StudyError if a point (n, 3) in m is inside a block or iron."""
     inside = magnet.holds(points)
     if inside.any():
         x, y, z = points[int(np.argmax(inside))]
         raise StudyError(must_be(
-            "`observation.positions`", "the study", "in air, as those half a step between them and "
-            "where hidden effects take the probe", f"({x:g}, {y:g}, {z:g}) m, inside magnet or "
+            "`observation.positions`", "the study", "in air, as must be the held-out points halfway "
+            "between them, and the points to which hidden effects take the probe", f"({x:g}, {y:g}, {z:g}) m, inside magnet or "
             "iron"))
 
 
 def _map(
     study: Study, points: Floats, readings: Floats, sigma: Floats, seal: dict[str, str]
 ) -> xr.Dataset:
-    """A map of the components that the study observes."""
-    # the study tells the noise of flux densities itself
+    """Return a map of the components that the study observes.
+
+    ``seal`` holds the attributes of the map, among them the hash of the truth.
+    """
+    # the noise of flux densities is stated in the study, that of single points behind Fourier
+    # coefficients is not
     known = None if study.observation.quantity == "flux_density" else sigma
     shown = np.where([name in observed_components(study) for name in COMPONENTS], readings, np.nan)
     return field_map(points, shown.round(DIGITS), known, seal)
 
 
 def truth_text(truth: dict[str, object]) -> str:
-    """The truth as it is written, and sealed."""
+    """Return the truth as JSON text, the text whose hash the maps name."""
     return json.dumps(truth, indent=1, allow_nan=False) + "\n"
 
 
 def write_campaign(campaign: SimulatedCampaign, folder: Path) -> list[Path]:
-    """Write blocks.csv, map and held-out (.csv, or .h5 if large), and truth/truth.json."""
+    """Write the files of a campaign to a folder, and return their paths.
+
+    These are blocks.csv, map and held-out (.csv, or .h5 if large), and truth/truth.json.
+    """
     write_blocks(campaign.blocks, folder / "blocks.csv")
     written = [folder / "blocks.csv"]
     for name, data in (("map", campaign.readings), ("held-out", campaign.held_out)):

@@ -29,7 +29,7 @@ from halbach_fe.report.calibration import write_calibration
 from halbach_fe.response.nonlinear import nonlinear_model
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import nominal_prior
-from halbach_fe.stats.noise import independent
+from halbach_fe.stats.noise import independent_noise
 from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
 from halbach_fe.stats.sbc import ranks, uniformity
 from halbach_fe.study.reader import read_study
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         model = nonlinear_model(build_magnet(study), observation, replace(
             session, folder=session.folder / "model"), generator)
     prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
-    noise = independent(np.full(len(observation), SIGMA_T))
+    noise = independent_noise(np.full(len(observation), SIGMA_T))
     tangent = model.jacobian(model.nominal)
 
     def closed_form(readings: Floats, generator: np.random.Generator) -> Floats:

@@ -45,7 +45,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.extras import needed
+from halbach_fe.synthetic.extras import import_extra
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.synthetic.simulate import simulate_campaign
 
@@ -103,7 +103,7 @@ def cases(singles: int, clean: int, pairs: int, outside: int) -> list[Case]:
 
 def coil(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Field (n, 3) in T of a loop of current around the magnet."""
-    magpylib = needed("magpylib")
+    magpylib = import_extra("magpylib")
     loop = magpylib.current.Circle(
         current=generator.uniform(50, 200), diameter=generator.uniform(0.4, 0.6),
         position=(0, 0, generator.uniform(-0.15, 0.15)))
@@ -145,11 +145,11 @@ def run_case(
         exact = readings.assign(B_T=(readings["B_T"].dims, campaign.without_noise))
         result["fringe_T"] = [fringe(one, readings, exact, replace(
             session, folder=session.folder / f"fringe-{when}"), campaign.blocks)
-            for when, one in (("before", found.read), ("after", found.study))]
+            for when, one in (("before", found.corrected_study), ("after", found.study))]
     if not case.hidden and not case.outside and case.seed % 4 == 0:  # it takes long
         sure = study.with_(prior=study.prior.with_(**NO_BLOCKS))
         alarm = diagnose(sure, readings, session, solver=solver)
-        result["without_blocks"] = bool(alarm.anything or alarm.unknown)
+        result["without_blocks"] = bool(alarm.found_anything or alarm.unknown)
     return result
 
 
@@ -157,13 +157,13 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
     """What is scored of a diagnosis."""
     chi2 = {name: [score.chi2_posterior for score in update.scores if score.part == HELD_OUT]
             for name, update in (("before", found.before), ("after", found.after))}
-    named = [sorted({name for reading in (one.reading, *one.alternatives)
-                     for name in reading.names}) for one in found.gross]
+    named = [sorted({name for reading in (one.convention, *one.alternatives)
+                     for name in reading.names}) for one in found.gross_errors]
     named += [[name] for name, there in (
-        ("outliers", found.outliers), ("vibration", found.vibration)) if there]
+        ("outliers", found.outliers), ("vibration", found.position_noise)) if there]
     return {
-        "named": named + [list(one.found.effects) for one in found.named],
-        "factors": [one.found.log_bayes_factor for one in found.named],
+        "named": named + [list(one.selection.effects) for one in found.identified],
+        "factors": [one.selection.log_bayes_factor for one in found.identified],
         "unknown": None if found.unknown is None else found.unknown.kind,
         "probabilities": found.probabilities,
         "disagrees": found.before.prior_conflict > found.before.conflict_limit,
@@ -204,8 +204,10 @@ def known_as(name: str) -> list[str]:
 
 
 def detectable(result: dict[str, Any], name: str) -> bool:
-    """Whether readings can tell of an effect at all: by its own evidence, or, of what has none
-    because it is no signature, by their disagreement.
+    """Tell whether the readings contain evidence of an effect at all.
+
+    An effect without a signature, such as position noise, is detectable if the readings disagree
+    with the model.
     """
     if name not in result["best"]:
         return bool(result["named"] or result["disagrees"])
@@ -271,8 +273,9 @@ def truly_there(result: dict[str, Any]) -> set[str]:
 
 
 def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
-    """How often effects are there to which some probability is given, where one at most is; what no
-    reading can tell of does not count.
+    """Return how often effects are present, for bins of the probability that was stated.
+
+    Cases with at most one hidden effect count, unless the effect is not detectable.
     """
     single = [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]
               and all(detectable(one, name) for name in one["hidden"])]

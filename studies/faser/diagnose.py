@@ -15,10 +15,11 @@ import sys
 from run import HERE, assumptions, options, profile_to_map, with_step
 
 from halbach_fe.cli import common
-from halbach_fe.cli.diagnose import tell, write
+from halbach_fe.cli.diagnose import print_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.measurement.field_map import read_map
+from halbach_fe.report.write import write_diagnosis
 from halbach_fe.study.reader import read_study
 
 
@@ -33,9 +34,9 @@ def run(arguments: argparse.Namespace) -> int:
         next_ones = separations(found, data, session)
     assumed = assumptions(found.before, arguments.z_step_m)
     text = arguments.study.read_text(encoding="utf-8")
-    write(found, next_ones, study, text, arguments.output, assumed)
+    write_diagnosis(found, next_ones, study, text, arguments.output, assumed)
     common.say("Assumed:\n" + "\n".join(f"- {one}" for one in assumed))
-    tell(found, arguments.output)
+    print_diagnosis(found, arguments.output)
     return 0
 
 

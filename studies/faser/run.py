@@ -23,7 +23,7 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.report.inference import score_table, write_inference_report
-from halbach_fe.report.prediction import Published
+from halbach_fe.report.prediction import PublishedErrors
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 
@@ -32,7 +32,7 @@ Z_STEP_M = 0.010
 """Of the study file, whose regions are the published index ranges at this step."""
 
 
-def profile_to_map(source: Path, target: Path, z_step: float) -> Published:
+def profile_to_map(source: Path, target: Path, z_step: float) -> PublishedErrors:
     """Write the published profile as a map; return the published relative errors."""
     index, prior, posterior, measured = np.loadtxt(source, delimiter=",", skiprows=1).T
     z = np.round((index - (len(index) + 1) / 2) * z_step, 9)
@@ -41,7 +41,7 @@ def profile_to_map(source: Path, target: Path, z_step: float) -> Published:
     flux_density[:, 0] = measured
     write_map(field_map(points, flux_density, attributes={
         "source": "Fleig et al. 2023, Fig. 4", "assumed_z_step_m": str(z_step)}), target)
-    return Published("paper", z, prior, posterior)
+    return PublishedErrors("paper", z, prior, posterior)
 
 
 def with_step(study: Study, z_step: float) -> Study:

@@ -25,7 +25,7 @@ from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.report.inference import write_inference_report
-from halbach_fe.report.magnetizations import scores, write_magnetizations
+from halbach_fe.report.magnetizations import error_summary, write_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import predict
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         return medians(points[:, 2], np.abs(measured - mean) / np.abs(measured))
 
     results = {"paper": published(), "here": {
-        name: errors(one) | scores(one, truth) for name, one in known.items()}}
+        name: errors(one) | error_summary(one, truth) for name, one in known.items()}}
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     write_magnetizations(

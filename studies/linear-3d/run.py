@@ -22,7 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.report.magnetizations import scores, write_magnetizations
+from halbach_fe.report.magnetizations import error_summary, write_magnetizations
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.model import Study
@@ -94,7 +94,7 @@ def figures(prior: Gaussian, posterior: Gaussian, truth: Floats) -> dict[str, fl
                  for one, other in zip(*draws, strict=True)], percent))
     error, covariance = posterior.mean - truth, posterior.covariance
     correlation = covariance / np.outer(posterior.sd, posterior.sd)
-    return found | scores(posterior, truth) | {
+    return found | error_summary(posterior, truth) | {
         "z_rms_spread": float(np.linalg.norm(correlation) / np.sqrt(2) / len(truth)),
         "chi2_per_parameter": float(error @ np.linalg.solve(covariance, error) / len(truth))}
 

@@ -23,7 +23,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.magnetizations import scores, write_magnetizations
+from halbach_fe.report.magnetizations import error_summary, write_magnetizations
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
                                          say=common.say, mapped=pool.map)
         write_sampled(found, folder)
         updated = with_samples(update, found)
-        results[f"{what}: prior"] = dict(scores(prior, truth))
-        results[f"{what}: posterior"] = scores(
+        results[f"{what}: prior"] = dict(error_summary(prior, truth))
+        results[f"{what}: posterior"] = error_summary(
             updated.posterior, truth) | sampled_summary(found)
         write_magnetizations(
             build_magnet(study), {"prior": prior, "posterior": updated.posterior}, truth, folder,

@@ -16,7 +16,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.map_conventions import PLAUSIBLE
+from halbach_fe.diagnosis.map_conventions import ERRORS_BY_PLAUSIBILITY
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
@@ -218,7 +218,8 @@ def test_a_misread_map_with_outliers(study, tmp_path, capsys):
     assert main(["diagnose", str(study), "--measurements", str(data), "-o", str(out),
                  "--effects", "gain_x"]) == 0
     said = capsys.readouterr()
-    assert "Gross error: coordinates in millimetres. 3 readings are off singly" in said.err
+    assert ("Gross error: coordinates in millimetres. 3 readings are outliers and excluded"
+            in said.err)
     assert "Nothing else is missing" in said.err
     assert "millimetres" in said.out
     found = json.loads((out / "diagnosis.json").read_text())
@@ -303,12 +304,12 @@ def test_the_readme_says_what_is_in_the_file():
         study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
         relative_error=lambda _: np.zeros(1), prediction_posterior=None)
     nothing = SimpleNamespace(
-        before=update, after=update, gross=(), outliers=(), named=(), vibration=None,
-        numerical=None, unknown=None, anything=False, probabilities={}, groups_before=[],
-        groups_after=[], left_out_before=np.zeros(1), left_out_after=np.zeros(1), rounds=1,
-        at_rest=True)
+        before=update, after=update, gross_errors=(), outliers=(), identified=(),
+        position_noise=None, solver_error=None, unknown=None, found_anything=False,
+        probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
+        loo_residuals_after=np.zeros(1), rounds=1, converged=True)
     assert keys == list(diagnosis_summary(nothing))
-    assert all(f"`{name}`" in section for name in PLAUSIBLE)
+    assert all(f"`{name}`" in section for name in ERRORS_BY_PLAUSIBILITY)
     rows = [line.split("|") for line in section.splitlines()
             if line.startswith(("| field |", "| instrument |"))]
     assert {(row[1].strip(), name.strip()) for row in rows for name in row[2].split(",")} == {

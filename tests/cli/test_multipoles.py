@@ -206,7 +206,7 @@ def test_sort(made, tmp_path, capsys):
     assert sorted(table.places) == [(1, slot) for slot in range(1, 13)]
     assert found["rms_sorted_units"] < found["rms_random_units"]["0.01"]
     assert found["table_order"] == "as placed in the table"
-    assert "which block where" in page(tmp_path / "sort.html")
+    assert "which block goes into which slot" in page(tmp_path / "sort.html")
     again = run(capsys, "sort", study, tmp_path / "blocks.sorted.csv", "-o", tmp_path / "again",
                 *TARGET, "--json")
     assert again["rms_unsorted_units"] == pytest.approx(found["rms_sorted_units"])

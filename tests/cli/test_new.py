@@ -10,7 +10,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
-from halbach_fe.measurement.observation import held_out, observe
+from halbach_fe.measurement.observation import held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
@@ -67,5 +67,5 @@ def test_new_study_can_be_measured(tmp_path, options):
     study = read_study(path)
     points = points_from(study.observation.positions)
     readings = observe(study, points, np.ones_like(points, bool))
-    hidden = held_out(study, readings)
+    hidden = held_out_readings(study, readings)
     assert 0 < hidden.sum() < len(hidden) / 1.9

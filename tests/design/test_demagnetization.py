@@ -112,7 +112,8 @@ def test_cells_fill_the_blocks(short_dipole):
         assert blocks[number].contains(cells.middles[mine]).all()
         # arcs as chords of a fifth of 22.5 degrees: (0.079 rad)^2 / 6 = 1.03e-3
         assert cells.volumes[mine].sum() == pytest.approx(blocks[number].volume, rel=1.1e-3)
-    in_place = replace(blocks[2], shift=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0))
+    in_place = replace(blocks[2], displacement_m=(0.0, 0.0, 0.0),
+                       rotation_rad=(0.0, 0.0, 0.0))
     assert not in_place.contains(cells.middles[cells.block == 2]).all()
 
 

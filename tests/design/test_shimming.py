@@ -369,8 +369,8 @@ def test_what_fits_where():
     """
     study = study_of(array__exceptions=[{"slot": 9, "recoil_permeability": 1.1}])
     mounts = mounts_of(build_magnet(study))
-    fits = mounts.fits(mounts.there, mounts.kinds_there)
-    angles = np.degrees(np.arctan2(mounts.wanted[:, 1], mounts.wanted[:, 0])).round()
+    fits = mounts.fits(mounts.current, mounts.current_kinds)
+    angles = np.degrees(np.arctan2(mounts.designed[:, 1], mounts.designed[:, 0])).round()
     for slot in range(12):
         expected = {(0, i) for i in range(12) if (angles[i] - angles[slot]) % 360 == 0}
         expected |= {(1, i) for i in range(12) if (angles[i] + angles[slot]) % 360 == 0}
@@ -411,7 +411,7 @@ def test_a_shimmed_study_solves(session):
     """
     study = study_of(array__recoil_permeability=1.05)
     mounts = mounts_of(build_magnet(study))
-    fits = mounts.fits(mounts.there, mounts.kinds_there)
+    fits = mounts.fits(mounts.current, mounts.current_kinds)
     turn, to, source = (int(numbers[0]) for numbers in np.nonzero(
         fits[1:] & ~np.eye(12, dtype=bool)))
     turns = mounts.turns[1 + turn]

@@ -45,12 +45,14 @@ def test_a_search_among_pairs_of_blocks(name, session, generator):
         "background", "gain_x", "gain_z", "length", "offset_x", "z_scale")]
     found = diagnose(STUDY, data, session, effects=[Restless(), *some])
     assert found.unknown is None
-    assert [name] == [one for each in found.named for one in each.found.effects if one == name] or (
-        name == "none" and not found.named)
+    assert [name] == [
+        one for each in found.identified for one in each.selection.effects if one == name] or (
+        name == "none" and not found.identified)
     assert found.after.prior_conflict < found.after.conflict_limit
     if name == "z_scale":
-        assert found.named[0].values == pytest.approx([0.005], abs=4 * found.named[0].sd[0])
-    assert np.isfinite(found.left_out_after).all()
+        scale = found.identified[0]
+        assert scale.values == pytest.approx([0.005], abs=4 * scale.sd[0])
+    assert np.isfinite(found.loo_residuals_after).all()
 
 
 @pytest.mark.parametrize("name", ["azimuthal_gap", "radial_gap"])
@@ -67,9 +69,9 @@ def test_impossible_amplitudes_are_no_explanation(session, generator, name):
     wider, narrower = (field_map(CIRCLES, nominal + sign * change + noise) for sign in (-1, 1))
     tight = study.with_(prior__magnitude_sd=1e-4, prior__direction_sd_deg=0.01,
                         prior__common_mode_sd=1e-4)
-    (named,) = diagnose(tight, narrower, session, effects=[gap]).named
+    (named,) = diagnose(tight, narrower, session, effects=[gap]).identified
     assert named.values == pytest.approx([3e-4], abs=4 * named.sd[0])
-    assert diagnose(tight, wider, session, effects=[gap]).named == ()
+    assert diagnose(tight, wider, session, effects=[gap]).identified == ()
 
 
 def test_no_recoil_permeability_is_below_one():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.discriminating_measurements import (
-    ENOUGH,
-    Seen,
+    SEPARATING_GAIN,
+    ScanFields,
     _readings,
     candidate_measurements,
     distance,
@@ -29,7 +29,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import probe, remainder
+from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
 from halbach_fe.solver.session import Session
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.measurement import Instrument
@@ -69,16 +69,17 @@ def case(inferred):
         update, data = inferred(components)
         effect = EFFECTS[named]
         at = next(one for one in effect.places(update.study) if one.name == place)
-        found = SelectedEffect(Candidate(named, place, (0,), effect.certain), 20.0, 16.0, tuple(
+        found = SelectedEffect(Candidate(named, place, (0,), effect.is_binary), 20.0, 16.0, tuple(
             (Candidate(*(rival if isinstance(rival, tuple) else (rival, "")), (1,)), 19.0)
             for rival in rivals))
         one = IdentifiedEffect(Hypothesis(effect, at), np.array(values), np.array(values) / 10,
                                found)
         return Diagnosis(
-            read=update.study, before=update, after=update, named=(one,), unknown=None,
+            corrected_study=update.study, before=update, after=update, identified=(one,),
+            unknown=None,
             probabilities={}, evidence=None, candidates=(), groups_before=[], groups_after=[],
-            left_out_before=np.zeros(0),
-            left_out_after=np.zeros(0), rounds=1), data
+            loo_residuals_before=np.zeros(0),
+            loo_residuals_after=np.zeros(0), rounds=1), data
     return make
 
 
@@ -100,10 +101,10 @@ def test_known_twins_are_told_apart(
 ):
     diagnosis, data = case(named, values, rival, components=components)
     (found,) = separations(diagnosis, data, session)
-    assert (found.named.effect.name, found.rival.effect.name) == (named, rival)
+    assert (found.identified.effect.name, found.rival.effect.name) == (named, rival)
     assert found.recommended is not None
     assert found.recommended.name == best
-    assert all(found.gains[name] > ENOUGH for name in [best, *also])
+    assert all(found.gains[name] > SEPARATING_GAIN for name in [best, *also])
     assert all(abs(found.gains[name]) < 1 for name in useless)
 
 
@@ -138,8 +139,9 @@ def test_every_rival_has_a_row(case, session):
     assert [one.rival.effect.name for one in found] == [
         "background", "block_missing", "misalignment_yx"]
     assert found[1].rival.place == Place(1, 3)
-    lonely = replace(diagnosis.named[0], found=replace(diagnosis.named[0].found, alternatives=()))
-    assert separations(replace(diagnosis, named=(lonely,)), data, session) == []
+    (one,) = diagnosis.identified
+    lonely = replace(one, selection=replace(one.selection, alternatives=()))
+    assert separations(replace(diagnosis, identified=(lonely,)), data, session) == []
 
 
 def test_the_same_effect_elsewhere_is_no_rival(case, session):
@@ -161,7 +163,7 @@ def test_distance_is_that_of_normal_distributions(generator):
 def test_a_thinned_map_knows_as_much(case, monkeypatch):
     diagnosis, data = case("offset_y", [2e-4], "background")
     whole = present_scan(diagnosis, data)
-    monkeypatch.setattr("halbach_fe.diagnosis.discriminating_measurements.MOST_READINGS", 60)
+    monkeypatch.setattr("halbach_fe.diagnosis.discriminating_measurements.MAX_READINGS", 60)
     thin = present_scan(diagnosis, data)
     assert len(whole.noise) == 264
     assert 45 <= len(thin.noise) <= 75
@@ -173,7 +175,7 @@ def test_a_thinned_map_knows_as_much(case, monkeypatch):
 
 def test_options_fit_the_study(case):
     diagnosis, data = case("offset_y", [2e-4], "background")
-    found = {one.name: one.campaign for one in candidate_measurements(diagnosis, data)}
+    found = {one.name: one.scan for one in candidate_measurements(diagnosis, data)}
     radius = np.hypot(*found["second_radius"].points[:, :2].T)
     assert radius == pytest.approx(0.8 * 0.104)
     assert np.abs(found["far_field"].points[:, 2]).min() > 0.08  # the magnet's end
@@ -216,16 +218,17 @@ def test_a_turned_probe_sees_a_turned_world(name, axis, turn):
     time, effect = np.linspace(0, 1, len(POINTS)), EFFECTS[name]
 
     def shown(instrument):
-        used = probe(instrument, np.zeros((len(POINTS), 3)))  # sensors, from the probe's middle
+        # the sensors' offsets from the middle of the probe
+        used = sensor_model(instrument, np.zeros((len(POINTS), 3)))
         sensors = np.repeat(POINTS, len(used.points) // len(POINTS), axis=0)
         world = field_of(build_magnet(STUDY).blocks, sensors + used.points @ turn.T) @ turn
         linear = (used.operator @ world.ravel()).reshape(-1, 3)
-        return (linear + remainder(instrument, linear, time)) @ turn.T
+        return (linear + nonlinear_part(instrument, linear, time)) @ turn.T
 
     values = 0.05 * np.array([parameter.sd for parameter in effect.parameters])
     change = shown(effect.apply(STUDY, Place(), values.tolist()).instrument) - shown(Instrument())
     scene = NominalFields(STUDY, POINTS, time, lambda other: POINTS)
-    seen = Seen(STUDY, POINTS, time, scene.solve, scene, slice(None), np.eye(3), turn)
+    seen = ScanFields(STUDY, POINTS, time, scene.solve, scene, slice(None), np.eye(3), turn)
     found = np.tensordot(values, effect.signature(seen, Place()), 1) @ turn.T
     size = np.abs(change).max()
     assert np.abs(found - change).max() < 1e-2 * size  # what is not linear
@@ -245,7 +248,8 @@ def test_a_turned_magnet_takes_its_effects_along(case, session, name):
     expected = effect.signature(there, place)
     if name == "ring_shifted":  # along x and y, which turn with the magnet
         expected = np.stack([expected[1], -expected[0]])
-    (one,) = _readings(diagnosis, [replace(present_scan(diagnosis, data), magnet=turn)], session)
+    scan = replace(present_scan(diagnosis, data), magnet_rotation=turn)
+    (one,) = _readings(diagnosis, [scan], session)
     found = one._signature(Hypothesis(effect, place))
     size = np.abs(expected).max()
     assert np.abs(found - expected).max() < 1e-3 * size  # gradients are differences

@@ -13,7 +13,7 @@ from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings
-from halbach_fe.measurement.instrument import probe, remainder
+from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.reader import parse_study
@@ -35,28 +35,28 @@ LARGE = {"wrong_line", "wrong_radius"}
 
 def shown(study):
     """What a map of a study shows, without what permeability and iron add."""
-    used = probe(study.instrument, POINTS)
+    used = sensor_model(study.instrument, POINTS)
     field = field_of(build_magnet(study).blocks, used.points) + external_field(build_magnet(study),
                                                                                used.points)
     linear = (used.operator @ field.ravel()).reshape(-1, 3)
-    return linear + remainder(study.instrument, linear, TIME)
+    return linear + nonlinear_part(study.instrument, linear, TIME)
 
 
 @pytest.fixture(scope="module")
-def scene():
+def nominal():
     return NominalFields(STUDY, POINTS, TIME,
                          lambda study: field_of(build_magnet(study).blocks, POINTS))
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED))
-def test_signatures_are_derivatives(name, scene):
+def test_signatures_are_derivatives(name, nominal):
     effect = EFFECTS[name]
     places = effect.places(STUDY)
     for place in (places[0], places[len(places) // 3]):
-        signature = effect.signature(scene, place)
+        signature = effect.signature(nominal, place)
         assert signature.shape == (len(effect.parameters), len(POINTS), 3)
         for number, parameter in enumerate(effect.parameters):
-            step = parameter.sd * (1 if effect.certain or effect.discrete else STEP)
+            step = parameter.sd * (1 if effect.is_binary or effect.applied_in_full else STEP)
             if name in LARGE:
                 step /= 10
             values = step * np.eye(len(effect.parameters))[number]
@@ -70,35 +70,35 @@ def test_signatures_are_derivatives(name, scene):
 
 
 @pytest.mark.parametrize("loss", [0.4, 1.0, 2.0])
-def test_what_a_block_has_lost_is_no_part_of_the_derivative(scene, loss):
+def test_what_a_block_has_lost_is_no_part_of_the_derivative(nominal, loss):
     """Or a search for the loss of a block upside down goes astray."""
     effect = EFFECTS["block_demagnetized"]
     place = effect.places(STUDY)[5]
-    there = replace(scene, study=effect.apply(STUDY, place, [loss]))
-    assert effect.signature(there, place) == pytest.approx(effect.signature(scene, place))
+    there = replace(nominal, study=effect.apply(STUDY, place, [loss]))
+    assert effect.signature(there, place) == pytest.approx(effect.signature(nominal, place))
 
 
 @pytest.mark.parametrize("name", ["block_missing", "block_flipped", "blocks_swapped"])
-def test_whole_blocks_count_as_they_were_measured(scene, name, generator):
+def test_whole_blocks_count_as_they_were_measured(nominal, name, generator):
     effect = EFFECTS[name]
     place = effect.places(STUDY)[5]
-    nominal = scene.magnetizations
-    known = nominal * (1 + 0.02 * generator.standard_normal((len(nominal), 1)))
-    signature = effect.signature(replace(scene, known=known), place)[0]
+    expected = nominal.magnetizations
+    measured = expected * (1 + 0.02 * generator.standard_normal((len(expected), 1)))
+    signature = effect.signature(replace(nominal, measured_magnetizations=measured), place)[0]
     mountings_of = mountings(build_magnet(effect.apply(STUDY, place, [1.0])))
-    mounted = np.array([matrix @ known[number] for number, matrix in mountings_of])
-    change = sum(scene.field_with(number, mounted[number] - known[number])
-                 for number in range(len(known)))
+    mounted = np.array([matrix @ measured[number] for number, matrix in mountings_of])
+    change = sum(nominal.field_with(number, mounted[number] - measured[number])
+                 for number in range(len(measured)))
     assert signature == pytest.approx(change, abs=1e-12)
-    assert np.abs(signature - effect.signature(scene, place)[0]).max() > 1e-3 * np.abs(
+    assert np.abs(signature - effect.signature(nominal, place)[0]).max() > 1e-3 * np.abs(
         change).max()  # negative control: nominal blocks
 
 
-def test_refinements_are_derivatives(scene):
+def test_refinements_are_derivatives(nominal):
     effect = EFFECTS["neighbour_magnet"]
     place = effect.places(STUDY)[3]
     values = np.array([1.0, 0.3, -0.02])
-    refined = effect.refine(scene, place, values.tolist())
+    refined = effect.refine(nominal, place, values.tolist())
     for number, step in enumerate((1e-3, 1e-5), start=1):
         there, here = (shown(effect.apply(STUDY, place, one.tolist()))
                        for one in (values + step * np.eye(3)[number], values))
@@ -110,7 +110,7 @@ def test_refinements_are_derivatives(scene):
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_effects_of_no_size_change_nothing(name):
     effect = EFFECTS[name]
-    if effect.discrete:
+    if effect.applied_in_full:
         pytest.skip("all or nothing")
     place = effect.places(STUDY)[0]
     applied = effect.apply(STUDY, place, [0.0] * len(effect.parameters))
@@ -128,8 +128,9 @@ def test_places_are_in_the_magnet():
 def test_seams_move_what_is_beyond_them_outwards():
     effect = EFFECTS["ring_gap"]
     moved = [
-        [block.shift[2] for block in build_magnet(effect.apply(STUDY, place, [1e-3])).blocks[::16]]
-             for place in effect.places(STUDY)]
+        [block.displacement_m[2]
+         for block in build_magnet(effect.apply(STUDY, place, [1e-3])).blocks[::16]]
+        for place in effect.places(STUDY)]
     assert moved == pytest.approx(np.array([
         [-1e-3, 0, 0, 0], [-5e-4, -5e-4, 5e-4, 5e-4], [0, 0, 0, 1e-3]]))
 

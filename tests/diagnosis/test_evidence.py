@@ -71,7 +71,7 @@ def test_a_certain_effect_shifts_the_readings(problem):
     evidence = Marginal.of(response).evidence(signatures, residual)
     expected = dense(response, signatures[:, :0], residual - signatures[:, 1]) - dense(
         response, signatures[:, :0], residual)
-    certain = Candidate("missing", "", (1,), certain=True)
+    certain = Candidate("missing", "", (1,), is_binary=True)
     assert log_bayes_factors(evidence, [certain])[0] == pytest.approx(expected)
     other = Candidate("other", "", (3,))
     together = dense(response, signatures[:, [3]], residual - signatures[:, 1]) - dense(
@@ -161,7 +161,7 @@ def test_one_large_effect_is_not_two(monkeypatch):
     """Twenty standard deviations; with the usual prior alone, a twin takes half of it."""
     (found,) = select_effects(*hidden({0: 20.0}))
     assert found.candidate.effect == "effect 0"
-    monkeypatch.setattr("halbach_fe.diagnosis.model_selection.WIDE", 1.0)
+    monkeypatch.setattr("halbach_fe.diagnosis.model_selection.WIDE_PRIOR_SD", 1.0)
     both = select_effects(*hidden({0: 20.0}))
     assert {one.candidate.effect for one in both} == {"effect 0", "effect 19"}
 

@@ -9,7 +9,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.measurement.instrument import as_read, probe, remainder
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.vacuum_field import field_of
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured, with_array
@@ -70,7 +70,7 @@ def test_a_map_that_is_written_wrongly(case, right):
     assert find_gross_errors(study, data) == ()
     if case.startswith(("milli", "centi", "gauss", "wrong_radius", "swapped_axes p")):
         # without a symmetry it is the map that it was
-        read = as_read(study.instrument, data)
+        read = in_si_and_magnet_axes(study.instrument, data)
         factor = 1 + study.instrument.radius_scale
         np.testing.assert_allclose(points_of(read) * [factor, factor, 1], points_of(right),
                                    atol=2e-3)  # a radius to 2 %, by a field that is off by 1 %
@@ -109,7 +109,8 @@ def test_several_errors(right):
     (found,) = find_gross_errors(STUDY, data)
     assert found.names == ("millimetres", "millitesla", "sign_flipped_axis")
     study = found.apply(STUDY)
-    np.testing.assert_allclose(as_read(study.instrument, data)["B_T"], right["B_T"], atol=1e-12)
+    np.testing.assert_allclose(in_si_and_magnet_axes(study.instrument, data)["B_T"], right["B_T"],
+                               atol=1e-12)
 
 
 def test_what_the_study_knows_is_no_error(right):
@@ -153,15 +154,15 @@ def test_effects_of_usual_size_are_no_gross_errors(effect, right, generator):
     """
     places = effect.places(STUDY)
     place = places[int(generator.integers(len(places)))]
-    values = [(1 if effect.certain else 3) * one.sd for one in effect.parameters]
+    values = [(1 if effect.is_binary else 3) * one.sd for one in effect.parameters]
     true = effect.apply(STUDY, place, values)
 
     def shown(study):
-        used = probe(study.instrument, CIRCLES)
+        used = sensor_model(study.instrument, CIRCLES)
         linear = (used.operator
                   @ (field_of(build_magnet(study).blocks, used.points) + external_field(
             build_magnet(study), used.points)).ravel()).reshape(-1, 3)
-        return linear + remainder(study.instrument, linear, np.linspace(0, 1, len(CIRCLES)))
+        return linear + nonlinear_part(study.instrument, linear, np.linspace(0, 1, len(CIRCLES)))
 
     change = shown(true) - shown(STUDY)
     found = find_gross_errors(STUDY, field_map(CIRCLES, right["B_T"].values + change))

@@ -18,7 +18,7 @@ from halbach_fe.diagnosis.position_noise import (
 )
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.vacuum_field import gradient_of, unit_fields
-from halbach_fe.stats.noise import independent
+from halbach_fe.stats.noise import independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 from tests.diagnosis.campaign import DOCUMENT, NOISE_T, STUDY
@@ -54,7 +54,7 @@ def clean(root, generator):
 def odd_ones(root, residual, training=None):
     training = np.ones(COUNT, bool) if training is None else training
     return np.flatnonzero(find_outliers(
-        root, residual, independent(np.full(COUNT, NOISE_T)), training, LABELS,
+        root, residual, independent_noise(np.full(COUNT, NOISE_T)), training, LABELS,
         np.repeat(POINTS, 3, axis=0), LARGEST_T))
 
 
@@ -96,7 +96,7 @@ def test_several_outliers_side_by_side(root, clean, monkeypatch):
     clean[pairs] += OFF_T
     assert odd_ones(root, clean).tolist() == pairs
     assert len(odd_ones(root, crowded)) == 0
-    monkeypatch.setattr("halbach_fe.diagnosis.outliers.CHANCE", 0.0)  # negative control
+    monkeypatch.setattr("halbach_fe.diagnosis.outliers.CROWD_PROBABILITY", 0.0)  # negative control
     assert odd_ones(root, crowded).tolist() == crowd.tolist()
 
 
@@ -123,7 +123,7 @@ def update_of(residual, root, points=POINTS):
         positions=np.repeat(points, 3, axis=0),
         read=lambda fields: fields.reshape(len(fields), -1))
     return SimpleNamespace(
-        study=STUDY, observation=observation, errors=independent(np.full(count, NOISE_T)),
+        study=STUDY, observation=observation, errors=independent_noise(np.full(count, NOISE_T)),
         held_out=np.zeros(count, bool), parts=("training",) * count, readings=residual,
         prior=SimpleNamespace(root=np.eye(root.shape[1])), response=SimpleNamespace(matrix=root),
         prediction_prior=SimpleNamespace(mean=np.zeros(count)), prior_conflict=2.0)

@@ -11,9 +11,15 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
-from halbach_fe.diagnosis.model_selection import MOST, Candidate
+from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
 from halbach_fe.diagnosis.result import UnknownCause
-from halbach_fe.diagnosis.summary import amounts, human_unit, note, place_in_words
+from halbach_fe.diagnosis.summary import (
+    amounts,
+    diagnosis_summary,
+    human_unit,
+    note,
+    place_in_words,
+)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_diagnosis_report
@@ -46,7 +52,7 @@ def flat(dipole, session, generator):
 
 def test_a_cross_section(flat, tmp_path):
     found, further = flat
-    assert [one.hypothesis.effect.name for one in found.named] == ["gain_x"]
+    assert [one.hypothesis.effect.name for one in found.identified] == ["gain_x"]
     write_diagnosis_report(found, further, tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert page.count("<img alt=") == 5
@@ -63,25 +69,25 @@ def test_a_line(short_dipole, session, generator, tmp_path):
     points[:, :2] = 0 * points[:, 2:]  # -0 below the middle, which is no angle of 180 degrees
     found, further = diagnosed(study, points, lambda _: [3e-4, 0, 0],
                                ["background", "gain_x", "offset_x"], session, generator)
-    (one,) = found.named
-    rivals = {candidate.effect for candidate, _ in one.found.alternatives}
+    (one,) = found.identified
+    rivals = {candidate.effect for candidate, _ in one.selection.alternatives}
     assert {one.hypothesis.effect.name, *rivals} >= {"background", "offset_x"}
     write_diagnosis_report(found, further, tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
-    assert "It does not tell" in page
+    assert "The map does not tell" in page
     assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page
     assert "against offset_x" in page or "against background" in page
     assert [row["count"] for row in change_table(found)] == ["41"]
     (row,) = found_table(found)
     assert row["it could be"] == ", ".join(dict.fromkeys(
-        candidate.effect for candidate, _ in one.found.alternatives))
+        candidate.effect for candidate, _ in one.selection.alternatives))
     assert not any(group.kind == "angle" for group in found.groups_before)  # on the axis
     write_diagnosis_report(found, [], tmp_path)  # nothing would tell
     assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
-    alone = replace(one, found=replace(one.found, alternatives=()))
-    write_diagnosis_report(replace(found, named=(alone,)), [], tmp_path)
+    alone = replace(one, selection=replace(one.selection, alternatives=()))
+    write_diagnosis_report(replace(found, identified=(alone,)), [], tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
-    assert "It does not tell" not in page
+    assert "The map does not tell" not in page
     assert "No two effects have to be told apart" in page
 
 
@@ -94,19 +100,23 @@ def test_verdicts(flat):
     unknown = UnknownCause("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
     assert "nothing" not in " ".join(verdict(found))
     assert "outside the catalogue remains" in " ".join(verdict(replace(found, unknown=unknown)))
-    tie = replace(unknown, as_well=True)
-    assert "As well it could be one thing" in " ".join(verdict(replace(found, unknown=tie)))
-    (one,) = found.named
+    tie = replace(unknown, ambiguous=True)
+    assert "A single cause outside the catalogue could equally well" in " ".join(
+        verdict(replace(found, unknown=tie)))
+    assert list(diagnosis_summary(replace(found, unknown=tie))["unknown"]) == [
+        "kind", "log_bayes_factor", "alone", "as_well", "largest_T", "at_m", "source_m"]
+    (one,) = found.identified
     usual = max(abs(one.values) / [parameter.sd for parameter in one.parameters])
     huge = replace(one, values=one.values * 30 / usual)
-    assert "(30 times)" in " ".join(verdict(replace(found, named=(huge,))))
+    assert "(30 times)" in " ".join(verdict(replace(found, identified=(huge,))))
     assert "Far larger" not in " ".join(verdict(found))
-    assert "come to rest" in " ".join(verdict(replace(found, at_rest=False)))
-    assert "come to rest" not in " ".join(verdict(found))
-    many = verdict(replace(found, named=found.named[:1] * MOST))
+    assert "had not converged" in " ".join(verdict(replace(found, converged=False)))
+    assert "had not converged" not in " ".join(verdict(found))
+    many = verdict(replace(found, identified=found.identified[:1] * MAX_EFFECTS))
     assert "a fit rather than a diagnosis" in " ".join(many)
-    assert "a fit rather than" not in " ".join(verdict(replace(found, named=found.named[:1])))
-    nothing = replace(found, named=(), after=found.before)
+    assert "a fit rather than" not in " ".join(
+        verdict(replace(found, identified=found.identified[:1])))
+    nothing = replace(found, identified=(), after=found.before)
     assert "no effect of the catalogue" in verdict(nothing)[0]
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
     assert verdict(alone)[0].startswith("Something outside the catalogue is missing")
@@ -118,7 +128,7 @@ def test_verdicts(flat):
 def test_the_page_of_what_is_unknown(flat, tmp_path):
     found, _ = flat
     unknown = UnknownCause("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
-    write_diagnosis_report(replace(found, named=(), after=found.before, unknown=unknown), [],
+    write_diagnosis_report(replace(found, identified=(), after=found.before, unknown=unknown), [],
                            tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert 'class="warning"' in page
@@ -128,12 +138,12 @@ def test_the_page_of_what_is_unknown(flat, tmp_path):
 
 def test_numbers_for_people(flat):
     found, _ = flat
-    one = found.named[0]
+    one = found.identified[0]
     certain = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["block_missing"]),
                       values=np.ones(1), sd=np.zeros(1))
-    assert amounts(certain) == ["there"]
+    assert amounts(certain) == ["present"]
     sag = replace(one, hypothesis=replace(one.hypothesis, effect=EFFECTS["arm_sag"]),
-                  found=replace(one.found, candidate=Candidate("arm_sag", "", (0,)),
+                  selection=replace(one.selection, candidate=Candidate("arm_sag", "", (0,)),
                                 log_bayes_factor=31.25),
                   values=np.array([-1.2345e-3]), sd=np.array([2.7e-5]))
     assert amounts(sag) == ["−1.234 ± 0.027 mm"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
-from halbach_fe.diagnosis.summary import diagnosis_summary, others
+from halbach_fe.diagnosis.summary import diagnosis_summary, other_findings
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import verdict
@@ -35,11 +35,11 @@ def found(session, generator, method, gain=0.0):
 
 def test_a_coarse_mesh_is_no_effect(session, generator):
     diagnosis = found(session, generator, "direct")
-    assert (diagnosis.named, diagnosis.unknown, diagnosis.rounds) == ((), None, 1)
-    assert diagnosis.numerical.chi2_noise > diagnosis.before.conflict_limit
-    assert diagnosis.numerical.largest_over_noise > 1
+    assert (diagnosis.identified, diagnosis.unknown, diagnosis.rounds) == ((), None, 1)
+    assert diagnosis.solver_error.chi2_noise > diagnosis.before.conflict_limit
+    assert diagnosis.solver_error.largest_over_noise > 1
     assert diagnosis_summary(diagnosis)["verdict"] == "numerical"
-    assert [one.name for one in others(diagnosis)] == ["solver_error"]
+    assert [one.name for one in other_findings(diagnosis)] == ["solver_error"]
     assert verdict(diagnosis)[-1].startswith("The solver's own error explains the misfit")
 
 
@@ -47,6 +47,6 @@ def test_a_coarse_mesh_is_no_effect(session, generator):
 def test_what_the_mesh_does_not_explain(session, generator, method, gain):
     """Negative controls: no misfit, and one that is larger than the error of the mesh."""
     diagnosis = found(session, generator, method, gain)
-    assert diagnosis.numerical is None
+    assert diagnosis.solver_error is None
     assert bool(gain) == (diagnosis.before.prior_conflict > diagnosis.before.conflict_limit)
-    assert bool(gain) == bool(diagnosis.named or diagnosis.unknown)
+    assert bool(gain) == bool(diagnosis.identified or diagnosis.unknown)

@@ -31,7 +31,7 @@ from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_bl
 from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
 from halbach_fe.measurement.formats import READERS as FORMATS
 from halbach_fe.measurement.formats import import_map
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import grid_of
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
 from halbach_fe.response.matrix import Response, StoredMatrix, _beside
@@ -44,7 +44,7 @@ from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.solver.runs import newton_residuals
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian, Root, nominal_prior
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.study.edit import edited_text
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import _with_table, parse_study, read_study
@@ -134,7 +134,7 @@ def posterior() -> bytes:
         coords={"parameter": [f"p{n}" for n in range(count)]}, attrs={"study": "{}"})
     prior = nominal_prior(nominal, 2, 0.01, 1.0, 0.005)
     size = prior.root.shape[1]
-    after = Gaussian(nominal, Root(
+    after = Gaussian(nominal, CovarianceFactor(
         prior.root.outer, np.eye(size)[:, :3], np.array([0.1, 0.2, 1.0])))
     for name, one in (("prior", prior), ("posterior", after)):
         data.update(_stored_root(name, one, prior))
@@ -260,12 +260,12 @@ def check_changed(found: tuple[str, Study]) -> None:
 
 
 VARIANTS = (
-    Declared(), Declared(length_unit="mm", field_unit="mT"),
-    Declared(length_unit="m", field_unit="T", columns=("x", "y", "z", "Bx", "By", "Bz")),
-    Declared(length_unit="cm", field_unit="G", component="z", at={"x": 0.0, "y": 0.0}),
-    Declared(length_unit="inch", field_unit="kG", angle_unit="deg", decimal_comma=True),
-    Declared(encoding="latin-1", origin_m=(0.0, 0.0, -0.5), length_unit="mm", field_unit="T"),
-    Declared(encoding="utf-16", length_unit="mm", field_unit="T"))
+    DeclaredFormat(), DeclaredFormat(length_unit="mm", field_unit="mT"),
+    DeclaredFormat(length_unit="m", field_unit="T", columns=("x", "y", "z", "Bx", "By", "Bz")),
+    DeclaredFormat(length_unit="cm", field_unit="G", component="z", at={"x": 0.0, "y": 0.0}),
+    DeclaredFormat(length_unit="inch", field_unit="kG", angle_unit="deg", decimal_comma=True),
+    DeclaredFormat(encoding="latin-1", origin_m=(0.0, 0.0, -0.5), length_unit="mm", field_unit="T"),
+    DeclaredFormat(encoding="utf-16", length_unit="mm", field_unit="T"))
 
 
 def imported(name: str):

@@ -145,7 +145,7 @@ def test_a_second_map_is_only_predicted(short_dipole, generator, session, tmp_pa
     apart = short_dipole(array__recoil_permeability=1.0, noise=NOISE)
     other = data.isel(point=unseen)
     other["sigma_T"] = (("point", "component"), np.full((len(unseen), 3), 1e-5))
-    two = infer(build_magnet(apart), data.drop_isel(point=unseen), session, unseen=other)
+    two = infer(build_magnet(apart), data.drop_isel(point=unseen), session, validation_map=other)
     np.testing.assert_allclose(two.posterior.mean, one.posterior.mean, rtol=1e-9)
     assert [score.part for score in two.scores] == ["training", "held-out map"]
     assert two.scores[1].chi2_posterior == pytest.approx(one.scores[1].chi2_posterior)
@@ -160,7 +160,7 @@ def test_a_second_map_is_only_predicted(short_dipole, generator, session, tmp_pa
     for name, value in (("x_m", 0.15), ("y_m", 0.0), ("z_m", 0.04)):
         other[name].values[0] = value
     with pytest.raises(MeasurementError, match="reading 1 of held-out map must be at a point in"):
-        infer(build_magnet(apart), data, session, unseen=other)
+        infer(build_magnet(apart), data, session, validation_map=other)
 
 
 def test_the_axis_from_fourier_coefficients(short_dipole, generator, session):
@@ -179,9 +179,9 @@ def test_the_axis_from_fourier_coefficients(short_dipole, generator, session):
     truth = (matrix @ everything.posterior.mean).reshape(-1, 3)
     axis = field_map(points, truth + 1e-5 * generator.standard_normal(truth.shape))
     with pytest.raises(MeasurementError, match="sigma_T of held-out map must be given"):
-        infer(build_magnet(coefficients), data, session, unseen=axis)
+        infer(build_magnet(coefficients), data, session, validation_map=axis)
     axis["sigma_T"] = (("point", "component"), np.full(truth.shape, 1e-5))
-    update = infer(build_magnet(coefficients), data, session, unseen=axis)
+    update = infer(build_magnet(coefficients), data, session, validation_map=axis)
     _, unseen = update.scores
     assert (unseen.part, unseen.readings) == ("held-out map", 63)
     assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.75)  # sd 0.18
@@ -310,7 +310,7 @@ def test_two_radii_with_unequal_noise(dipole, generator, session):
     assert len(set(update.observation.radii[line.index])) == 1
     write_inference_report(update, session.folder)
     page = (session.folder / "report.html").read_text()
-    assert "of the training readings by the prior (nothing was held out)" in page
+    assert "of the training readings for the prior (nothing was held out)" in page
     assert "T, correlated" in page
 
 
@@ -355,7 +355,8 @@ def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, session):
     with pytest.raises(MeasurementError, match="Check the units"):
         infer(build_magnet(short_dipole(noise=NOISE)), far, session)
     with pytest.raises(MeasurementError, match="Check the units"):
-        infer(build_magnet(short_dipole(noise=NOISE)), far.isel(point=[0]), session, unseen=far)
+        infer(build_magnet(short_dipole(noise=NOISE)), far.isel(point=[0]), session,
+              validation_map=far)
 
 
 def test_readings_that_vanish_by_symmetry(short_dipole, session):

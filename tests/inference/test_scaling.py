@@ -20,9 +20,9 @@ from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response import matrix as response_module
 from halbach_fe.response.matrix import StoredMatrix, response_matrix
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, Root, nominal_prior
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import update, whitened
-from halbach_fe.stats.noise import NoiseCovariance, independent
+from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.oracles.cuboids import cuboid_field, long_dipole
 
@@ -73,7 +73,8 @@ def farthest(case, found):
            / np.outer(scale, scale)]
     return max([one.max() for one in off] + [
         abs(one / other - 1) for one, other in zip(
-            (found.log_evidence, found.learnt, found.conflict), figures, strict=True)])
+            (found.log_evidence, found.parameters_learnt, found.prior_conflict), figures,
+            strict=True)])
 
 
 @pytest.mark.parametrize(("readings", "blocks"), [(60, 100), (600, 30), (300, 100)])
@@ -85,7 +86,7 @@ def test_against_the_dense_formula(generator, readings, blocks):
     case = problem(generator, readings, blocks)
     found = update(*case)
     assert farthest(case, found) < 1e-9
-    assert found.left_out == 0
+    assert found.discarded_information == 0
     assert np.all(found.distribution.sd[6:9] == 0)
     # negative control: 1 % less noise
     matrix, values, noise, prior = case
@@ -103,17 +104,17 @@ def test_in_parts_and_compressed(generator, monkeypatch, blocks):
     monkeypatch.setattr(linear_gaussian, "NUMBERS_HELD", 100 * 3 * blocks)
     monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", 0.0)  # by rows in any case
     found = update(*case)
-    assert (found.left_out > 0) == (blocks == 200)
+    assert (found.discarded_information > 0) == (blocks == 200)
     # what is left out bounds the change of variances; of the mean it is its root that does
-    assert found.left_out < 1e-6
-    assert farthest(case, found) < max(1e-9, 3 * np.sqrt(found.left_out))
+    assert found.discarded_information < 1e-6
+    assert farthest(case, found) < max(1e-9, 3 * np.sqrt(found.discarded_information))
     root = found.distribution.root
-    assert isinstance(root, Root)
+    assert isinstance(root, CovarianceFactor)
     assert root.directions.shape[1] <= min(600, 3 * blocks + 1)
     if blocks == 200:  # negative control: what says something must not be left out
         monkeypatch.setattr(linear_gaussian, "NEGLIGIBLE", 0.5)
         coarse = update(*case)
-        assert coarse.left_out > 0.1
+        assert coarse.discarded_information > 0.1
         assert farthest(case, coarse) > 1e-2
 
 
@@ -176,7 +177,7 @@ def test_memory_does_not_grow_with_readings_times_parameters(monkeypatch):
     prior = Gaussian(np.zeros(120), np.eye(120))
 
     def used(count):
-        noise, readings = independent(np.ones(count)), np.zeros(count)
+        noise, readings = independent_noise(np.ones(count)), np.zeros(count)
         return peak(lambda: update(Made(count, 120), readings, noise, prior))
 
     few, many = used(10_000), used(20_000)
@@ -236,7 +237,7 @@ def test_two_thousand_blocks(long_array, tmp_path):
     assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.1)
     assert 100 < update.parameters_learnt < 204
     root = update.posterior.root
-    assert isinstance(root, Root)
+    assert isinstance(root, CovarianceFactor)
     assert root.directions.shape == (6001, 204)
     write_inference(update, tmp_path)
     # far below the 288 MB of one covariance
@@ -253,16 +254,16 @@ def test_two_thousand_blocks(long_array, tmp_path):
 def test_exact_readings_of_many_parameters(generator):
     """Noise of a millionth of the prior: what readings leave of their own prediction is theirs."""
     parameters, readings = 120, 40
-    prior = Gaussian(np.zeros(parameters), Root(
+    prior = Gaussian(np.zeros(parameters), CovarianceFactor(
         sparse.eye_array(parameters, format="csr"), np.zeros((parameters, 0)), np.zeros(0)))
     matrix = generator.standard_normal((readings, parameters))
     noise = 1e-6
-    found = update(matrix, np.zeros(readings), independent(np.full(readings, noise)), prior)
+    found = update(matrix, np.zeros(readings), independent_noise(np.full(readings, noise)), prior)
     np.testing.assert_allclose(found.distribution.sd_of(matrix), noise, rtol=1e-4)
     # the control: squares subtracted from squares leave rounding
     root = found.distribution.root
     seen = matrix @ root.outer
     along = seen @ root.directions
     lost = np.sqrt(np.maximum(0, (seen**2).sum(1) - (along**2).sum(1)) + (
-        (along * root.left) ** 2).sum(1))
+        (along * root.remaining) ** 2).sum(1))
     assert np.abs(lost / noise - 1).max() > 1e-3

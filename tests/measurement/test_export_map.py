@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.measurement.field_map import field_map, points_of, read_map
 from halbach_fe.measurement.formats import WRITERS, export_map, import_map
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 from tests.measurement.test_import_map import FIELD, POINTS
 
 with warnings.catch_warnings():  # its plots use what matplotlib will drop
@@ -51,10 +51,10 @@ def exchanged(data):
 def test_what_is_exported_reads_back(tmp_path, shuffled, name):
     path = tmp_path / f"map.{name}"
     export_map(shuffled, name, path)
-    assert agrees(import_map(path, Declared()).data)
+    assert agrees(import_map(path, DeclaredFormat()).data)
     points, field = ordered(shuffled)
     export_map(exchanged(field_map(points, field)), name, path)
-    assert not agrees(import_map(path, Declared()).data)
+    assert not agrees(import_map(path, DeclaredFormat()).data)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -116,7 +116,7 @@ def mesh_file(path, labels=("x", "y", "z"), values=None, unit=1.0, attributes=No
 
 
 def imported(path, **declared):
-    return import_map(path, Declared(**declared)).data
+    return import_map(path, DeclaredFormat(**declared)).data
 
 
 def test_meshes_of_openpmd_beamphysics_are_read(tmp_path):
@@ -282,7 +282,7 @@ def test_rounded_coordinates_make_a_grid(tmp_path):
     """Off by 0.9e-3 of a step; beyond 1e-3 they are refused, above."""
     rounded = POINTS + np.where(np.arange(24) == 5, 0.9e-3, 0)[:, None] * [0, 0.005, 0]
     export_map(field_map(rounded, FIELD), "geant4", tmp_path / "map.TABLE")
-    points, field = ordered(import_map(tmp_path / "map.TABLE", Declared()).data)
+    points, field = ordered(import_map(tmp_path / "map.TABLE", DeclaredFormat()).data)
     np.testing.assert_allclose(points, POINTS, atol=1e-15)
     np.testing.assert_array_equal(field, FIELD)
 

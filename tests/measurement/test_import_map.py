@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import points_of, read_map, write_map
 from halbach_fe.measurement.formats import export_map, format_of, import_map
-from halbach_fe.measurement.formats.declared import Declared
-from halbach_fe.measurement.formats.units import in_si, symbol
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.units import in_si, unit_symbol
 
 AXES = [-0.01, 0.01], [0.0, 0.005, 0.01], [0.1, 0.2, 0.3, 0.4]
 POINTS = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -20,7 +20,7 @@ FIELD = np.round(np.column_stack([
 """Another along every axis and in every component, so that no exchange goes unnoticed."""
 
 MM_MT = "X [mm]", "Y [mm]", "Z [mm]", "Bx [mT]", "By [mT]", "Bz [mT]"
-DEFAULTS = Declared()
+DEFAULTS = DeclaredFormat()
 
 
 def rows(separator="  ", points=POINTS * 1000, field=FIELD * 1000, order=range(6)):
@@ -31,7 +31,7 @@ def rows(separator="  ", points=POINTS * 1000, field=FIELD * 1000, order=range(6
 def imported(tmp_path, text, name="", **declared):
     path = tmp_path / "hall.txt"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return import_map(path, Declared(**declared), name)
+    return import_map(path, DeclaredFormat(**declared), name)
 
 
 def same(found, points=POINTS, field=FIELD):
@@ -110,7 +110,7 @@ def test_units(tmp_path, length, field, metre, tesla):
     text = "x y z Bx By Bz\n" + rows(points=POINTS * metre, field=FIELD * tesla)
     found = imported(tmp_path, text, length_unit=length, field_unit=field)
     assert same(found)
-    wrong = Declared(length_unit="cm" if length != "cm" else "mm", field_unit=field)
+    wrong = DeclaredFormat(length_unit="cm" if length != "cm" else "mm", field_unit=field)
     try:
         assert not same(import_map(tmp_path / "hall.txt", wrong))
     except MeasurementError as error:  # or so wrong that it is refused
@@ -120,7 +120,7 @@ def test_units(tmp_path, length, field, metre, tesla):
 def test_a_power_of_ten_is_exact():
     values = np.array([0.1, 123.456, 7.0])
     assert in_si(values * 1000, "mm").tolist() == [0.1, 0.123456 * 1000, 7.0]
-    assert [symbol(text) for text in ("MT", "t", "M", "METRE", "Tesla", "kg", "")] == [
+    assert [unit_symbol(text) for text in ("MT", "t", "M", "METRE", "Tesla", "kg", "")] == [
         "", "", "m", "m", "T", "", ""]
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import field_map, points_of, read_map
-from halbach_fe.measurement.instrument import as_read
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes
 from halbach_fe.study.measurement import Instrument
 
 HEADER = "x_m,y_m,z_m,Bx_T,By_T,Bz_T\n"
@@ -35,16 +35,16 @@ def test_units_and_axes_are_put_right(generator):
     written = written.assign(time_s=right["time_s"])
     instrument = Instrument(length_unit_m=1e-3, flux_density_unit_T=1e-3,
                             position_axes=("z", "x", "-y"), field_axes=("-y", "x", "z"))
-    xr.testing.assert_allclose(as_read(instrument, written), right, rtol=1e-14)
+    xr.testing.assert_allclose(in_si_and_magnet_axes(instrument, written), right, rtol=1e-14)
     # the negative control: one sign less
     wrong = instrument.with_(field_axes=("y", "x", "z"))
     with pytest.raises(AssertionError):
-        xr.testing.assert_allclose(as_read(wrong, written), right, rtol=0.5)
+        xr.testing.assert_allclose(in_si_and_magnet_axes(wrong, written), right, rtol=0.5)
 
 
 def test_a_right_map_stays_as_it_is(generator):
     right = right_map(generator)
-    xr.testing.assert_identical(as_read(Instrument(), right), right)
+    xr.testing.assert_identical(in_si_and_magnet_axes(Instrument(), right), right)
 
 
 @pytest.mark.parametrize(("row", "said", "unit"), [
@@ -57,6 +57,6 @@ def test_a_map_in_another_unit_is_refused(tmp_path, row, said, unit):
     path.write_text(HEADER + row + "\n", encoding="utf-8")
     data = read_map(path)
     with pytest.raises(MeasurementError, match=said) as caught:
-        as_read(Instrument(), data)
+        in_si_and_magnet_axes(Instrument(), data)
     assert str(path) in str(caught.value)
-    as_read(Instrument(**unit), data)
+    in_si_and_magnet_axes(Instrument(**unit), data)

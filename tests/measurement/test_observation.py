@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.observation import held_out, observe, together
+from halbach_fe.measurement.observation import concatenate, held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.solver.vacuum_field import field_of
@@ -228,7 +228,7 @@ def test_point_noise_propagates_to_fourier_coefficients(dipole, generator, equal
 def held_out_of(study, points, measured=None):
     points = np.asarray(points, float)
     measured = np.ones((len(points), 3), bool) if measured is None else measured
-    return held_out(study, observe(study, points, measured))
+    return held_out_readings(study, observe(study, points, measured))
 
 
 def test_held_out_windows(dipole):
@@ -282,14 +282,14 @@ def test_two_maps_together(dipole, generator):
     study = dipole(observation=FOURIER)
     points = circle(0.075)
     one = observe(study, points, np.ones((24, 3), bool))
-    both = together(one, one)
+    both = concatenate(one, one)
     fields = generator.standard_normal((2, 24, 3))
     np.testing.assert_allclose(both.apply(np.vstack(fields)),
                                np.concatenate([one.apply(field) for field in fields]))
     np.testing.assert_allclose(both.magnitude(np.vstack(fields)),
                                np.concatenate([one.magnitude(field) for field in fields]))
     points_too = observe(dipole(), points, np.ones((24, 3), bool))
-    mixed = together(one, points_too)
+    mixed = concatenate(one, points_too)
     np.testing.assert_allclose(mixed.magnitude(np.vstack(fields)), np.concatenate(
         [one.magnitude(fields[0]), np.repeat(np.linalg.norm(fields[1], axis=1), 3)]))
     assert mixed.components[len(one):] == ("x", "y", "z") * 24

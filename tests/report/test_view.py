@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report import view
-from halbach_fe.report.view import Colours, Known, magnet_view, prism, residuals
+from halbach_fe.report.view import BlockValues, Colours, magnet_view, prism, residual_points
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
@@ -25,7 +25,8 @@ def study_of(name):
 def known_of(study):
     blocks = build_magnet(study).blocks
     percent = np.linspace(-2, 2, len(blocks))
-    return Known(np.array([block.magnetization[:study.dimension] for block in blocks]), Colours(
+    magnetization = np.array([block.magnetization[:study.dimension] for block in blocks])
+    return BlockValues(magnetization, Colours(
         percent, "in %", [f"{one:+.2f} ± 0.40 %" for one in percent]))
 
 
@@ -89,7 +90,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     study = study_of("quadrupole")
     known = known_of(study)
     shown = page(
-        magnet_view(build_magnet(study), known, residuals(np.zeros((1, 3)), np.array([2.5]))))
+        magnet_view(build_magnet(study), known, residual_points(np.zeros((1, 3)), np.array([2.5]))))
     assert coloured(shown) > 20_000
     found = words(shown)
     own = [one for one in found if "ring 1, slot" in one]
@@ -118,16 +119,16 @@ def test_of_too_many_blocks_neighbouring_rings_are_one(short_dipole, monkeypatch
     blocks = build_magnet(study).blocks
     values = np.zeros(len(blocks))
     values[16 * 3 + 4], values[16 * 6 + 1] = -5.0, 2.0  # ring 4, slot 5; ring 7, slot 2
-    known = Known(np.array([block.magnetization for block in blocks]), Colours(
+    known = BlockValues(np.array([block.magnetization for block in blocks]), Colours(
         values, "change", [f"{one:g} %" for one in values]))
-    every, _ = view._few(build_magnet(study), known)
+    every, _ = view._merge_rings(build_magnet(study), known)
     assert len(every) == len(blocks)
     monkeypatch.setattr(view, "MOST_BLOCKS", 40)
-    few, shown = view._few(build_magnet(study), known)
+    few, shown = view._merge_rings(build_magnet(study), known)
     assert len(few) == len(shown.magnetization) == len(shown.colours.words) == 48  # rings by three
     assert shown.colours.values[16 + 4] == -5.0
-    assert shown.colours.words[16 + 4] == "most in ring 4: -5 %"
-    assert view._words(few[16 + 4], 2, shown, 16 + 4).startswith("rings 4 to 6, slot 5")
+    assert shown.colours.words[16 + 4] == "largest in ring 4: -5 %"
+    assert view._hover_text(few[16 + 4], 2, shown, 16 + 4).startswith("rings 4 to 6, slot 5")
     assert shown.colours.values[32 + 1] == 2.0
     assert (few[0].z_min, few[-1].z_max) == (blocks[0].z_min, blocks[-1].z_max)
     assert sum(block.volume for block in few) == pytest.approx(

@@ -11,7 +11,7 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.verification import verdict, write_verification
+from halbach_fe.report.verification import verification_verdict, write_verification
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
 from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
 from halbach_fe.solver.field import solve_nominal
@@ -102,7 +102,7 @@ def test_a_field_without_finite_elements(dipole, session, tmp_path):
     """In vacuum the reaction is nothing: no figure of convergence, and a verdict that says so."""
     study = dipole(array__recoil_permeability=1.0)
     found = verify(build_magnet(study), session)
-    assert "exact one of the blocks" in verdict(build_magnet(study), found)
+    assert "exact one of the blocks" in verification_verdict(build_magnet(study), found)
     write_verification(build_magnet(study), found, tmp_path, {})
     page(tmp_path / "verification.html")
     assert not (tmp_path / "verification_convergence.png").exists()

@@ -196,7 +196,7 @@ def test_other_numbering_is_noticed(
 
     monkeypatch.setattr(magnetostatics, "read_unknowns", shifted)
     monkeypatch.setattr("halbach_fe.solver.azimuthal_modes.read_unknowns", shifted)
-    with pytest.raises(GetDPError, match="numbered in another way"):
+    with pytest.raises(GetDPError, match="unknowns in another way"):
         finite_element_part(build_magnet(study), points, session, columns=False)
 
 

@@ -123,7 +123,7 @@ def test_missing_boundary_condition(getdp, staged):
 def test_region_missing_from_the_problem(getdp, staged):
     """A region that the problem forgets leaves a system of the wrong size."""
     folder, job = staged
-    edit(folder / job.problem, "Vol_All = Region[ {Vol_Air, Vol_Iron, Vol_Mag} ]",
+    edit(folder / "problem_data.pro", "Vol_All = Region[ {Vol_Air, Vol_Iron, Vol_Mag} ]",
          "Vol_All = Region[ {Vol_Iron, Vol_Mag} ]")
     with pytest.raises(GetDPError, match="a region is missing"):
         run(getdp, job, folder)

@@ -14,7 +14,7 @@ from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL, edge_elements
 from halbach_fe.solver.interpolation import locate, probes_of
-from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, fill_run_folder
+from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, RunRequest, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from tests.conftest import circle
 
@@ -30,8 +30,7 @@ def dumped(study, formulation, blocks, session):
     located = locate(mesh, POINTS)
     count = 1 + study.dimension * len(blocks)
     job = fill_run_folder(build_magnet(study), mesh, probes_of(mesh, located)[1], folder,
-                          formulation, blocks,
-                (0, count - 1))
+                          formulation, RunRequest(blocks, (0, count - 1)))
     job = dataclasses.replace(job, options=(
         *job.options, "-ksp_view_rhs", "binary:rhs.bin::append",
         "-ksp_view_mat", "binary:matrix.bin"))

@@ -9,7 +9,7 @@ from scipy import stats
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
-from halbach_fe.stats.noise import independent
+from halbach_fe.stats.noise import independent_noise
 
 
 def textbook(matrix, readings, noise, prior):
@@ -24,12 +24,12 @@ def problem(generator, n=12, m=5):
     root = np.eye(m) + 0.2 * generator.standard_normal((m, m))
     prior = Gaussian(generator.standard_normal(m), root)
     matrix, sigma = generator.standard_normal((n, m)), generator.uniform(0.1, 0.5, n)
-    return matrix, generator.standard_normal(n), independent(sigma), prior
+    return matrix, generator.standard_normal(n), independent_noise(sigma), prior
 
 
 def test_one_reading_of_one_parameter():
     """Prior 1 +- 2, reading 5 +- 1 of it: mean (1/4 + 5)/(1/4 + 1), variance 1/(1/4 + 1)."""
-    found = posterior(np.array([[1.0]]), np.array([5.0]), independent(np.ones(1)),
+    found = posterior(np.array([[1.0]]), np.array([5.0]), independent_noise(np.ones(1)),
                       Gaussian(np.array([1.0]), np.array([[2.0]])))
     assert found.mean == pytest.approx([5.25 / 1.25])
     assert found.sd == pytest.approx([1 / np.sqrt(1.25)])
@@ -54,7 +54,7 @@ def test_against_brute_force_sampling(generator):
     mean = weight @ draws
     spread = np.sqrt(weight @ (draws - mean) ** 2)
     effective = 1 / np.sum(weight**2)
-    found = posterior(matrix, readings, independent(sigma), prior)
+    found = posterior(matrix, readings, independent_noise(sigma), prior)
     assert effective > 10_000
     assert np.all(np.abs(mean - found.mean) < 5 * found.sd / np.sqrt(effective))
     assert spread == pytest.approx(found.sd, rel=5 / np.sqrt(effective))
@@ -67,9 +67,9 @@ def test_sound_where_the_textbook_formula_breaks(generator):
     prior = Gaussian(np.zeros(2), np.eye(2))
     matrix = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-7]])
     truth = np.array([0.3, -0.2])
-    found = posterior(matrix, matrix @ truth, independent(np.full(2, 1e-12)), prior)
+    found = posterior(matrix, matrix @ truth, independent_noise(np.full(2, 1e-12)), prior)
     np.testing.assert_allclose(found.mean, truth, atol=1e-5)
-    wrong, _ = textbook(matrix, matrix @ truth, independent(np.full(2, 1e-12)), prior)
+    wrong, _ = textbook(matrix, matrix @ truth, independent_noise(np.full(2, 1e-12)), prior)
     assert np.abs(wrong - truth).max() > 1e-5
 
 
@@ -78,14 +78,14 @@ def test_singular_prior_is_respected(generator):
     nominal = np.array([1.0, 0.0, 0.0, 2.0])
     prior = Gaussian(nominal, 0.1 * nominal[:, None])
     found = posterior(generator.standard_normal((3, 4)), generator.standard_normal(3),
-                      independent(np.ones(3)), prior)
+                      independent_noise(np.ones(3)), prior)
     assert found.root.shape == (4, 1)
     assert np.linalg.matrix_rank(np.column_stack([found.mean, nominal]), tol=1e-9) == 1
 
 
 def test_uninformative_data_leave_the_prior(generator):
     matrix, readings, noise, prior = problem(generator)
-    found = posterior(matrix, readings, independent(noise.sd * 1e9), prior)
+    found = posterior(matrix, readings, independent_noise(noise.sd * 1e9), prior)
     np.testing.assert_allclose(found.mean, prior.mean, atol=1e-6)
     np.testing.assert_allclose(found.covariance, prior.covariance, atol=1e-6)
 
@@ -126,7 +126,7 @@ def test_whitened_residuals(generator):
     # the same figure as the update's, which is tested against the dense formula
     readings = residual + matrix @ prior.mean
     assert np.mean(whitened(residual, noise, root.__getitem__, 5) ** 2) == pytest.approx(
-        update(matrix, readings, noise, prior).conflict)
+        update(matrix, readings, noise, prior).prior_conflict)
     draws = generator.multivariate_normal(np.zeros(12), covariance, 4000)
     white = np.array([whitened(draw, noise, root.__getitem__, 5) for draw in draws])
     # 4000 draws: each correlation has an sd of 1.6 %; 4 sigma
@@ -139,18 +139,18 @@ def test_prior_conflict_is_the_prior_predictive_distance(generator):
     covariance = matrix @ prior.covariance @ matrix.T + noise.covariance.toarray()
     residual = readings - matrix @ prior.mean
     expected = residual @ np.linalg.solve(covariance, residual) / len(readings)
-    assert update(matrix, readings, noise, prior).conflict == pytest.approx(expected)
+    assert update(matrix, readings, noise, prior).prior_conflict == pytest.approx(expected)
 
 
 def test_prior_conflict_sees_noise_that_was_understated(generator):
     """Even with more parameters than readings, where every fit is perfect."""
     matrix, _, _, prior = problem(generator, 40, 200)
-    noise = independent(np.full(40, 5.0))
+    noise = independent_noise(np.full(40, 5.0))
     truth = prior.sample(1, generator)[0]
     error = noise.sample(generator)
     # 40 readings: sd 0.22
-    assert update(matrix, matrix @ truth + error, noise, prior).conflict < 1.9
-    assert update(matrix, matrix @ truth + 10 * error, noise, prior).conflict > 1.9
+    assert update(matrix, matrix @ truth + error, noise, prior).prior_conflict < 1.9
+    assert update(matrix, matrix @ truth + 10 * error, noise, prior).prior_conflict > 1.9
 
 
 def test_evidence_and_parameters_learnt(generator):
@@ -161,11 +161,11 @@ def test_evidence_and_parameters_learnt(generator):
         matrix @ prior.mean, matrix @ prior.covariance @ matrix.T + noise.covariance.toarray())
     assert found.log_evidence == pytest.approx(predictive.logpdf(readings))
     learnt = np.trace(np.eye(5) - found.distribution.covariance @ np.linalg.inv(prior.covariance))
-    assert found.learnt == pytest.approx(learnt)
+    assert found.parameters_learnt == pytest.approx(learnt)
     # many vague readings teach little, exact ones everything
-    vague, exact = (independent(noise.sd * factor) for factor in (1e3, 1e-3))
-    assert update(matrix, readings, vague, prior).learnt < 1e-2
-    assert update(matrix, readings, exact, prior).learnt == pytest.approx(5, abs=1e-4)
+    vague, exact = (independent_noise(noise.sd * factor) for factor in (1e3, 1e-3))
+    assert update(matrix, readings, vague, prior).parameters_learnt < 1e-2
+    assert update(matrix, readings, exact, prior).parameters_learnt == pytest.approx(5, abs=1e-4)
 
 
 def test_chunks_of_readings_add_up(generator, monkeypatch):
@@ -187,7 +187,7 @@ def test_both_ways_agree(generator, monkeypatch):
     other = update(*case)
     np.testing.assert_allclose(other.distribution.covariance, one.distribution.covariance,
                                rtol=1e-9)
-    assert other.learnt == pytest.approx(one.learnt)
+    assert other.parameters_learnt == pytest.approx(one.parameters_learnt)
     assert other.log_evidence == pytest.approx(one.log_evidence)
 
 
@@ -195,11 +195,11 @@ def test_rows_take_over_where_the_product_is_not_exact_enough(generator, monkeyp
     """Many readings that tell two parameters apart by 1e-7: with the product they do not."""
     matrix = np.tile([[1.0, 1.0], [1.0, 1.0 + 1e-7]], (25, 1))
     truth = np.array([0.3, -0.2])
-    case = (matrix, matrix @ truth, independent(np.full(50, 1e-12)),
+    case = (matrix, matrix @ truth, independent_noise(np.full(50, 1e-12)),
             Gaussian(np.zeros(2), np.eye(2)))
     found = update(*case)
     np.testing.assert_allclose(found.distribution.mean, truth, atol=1e-5)
-    assert 0 <= found.conflict < 1  # no noise was added
+    assert 0 <= found.prior_conflict < 1  # no noise was added
     monkeypatch.setattr(linear_gaussian, "WORST_CONDITION", np.inf)  # negative control
     assert np.abs(update(*case).distribution.mean - truth).max() > 1e-5
 

@@ -12,7 +12,7 @@ from scipy import stats
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import update, whitened
-from halbach_fe.stats.noise import NoiseCovariance, independent
+from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.stats.pcn import Posterior, laplace
 
 
@@ -44,37 +44,37 @@ def test_whitening_against_the_dense_matrix(noise, dense, generator):
     np.testing.assert_allclose(noise.whiten(values), white @ values)
     np.testing.assert_allclose(noise.whiten(values[:, 0]), white @ values[:, 0])
     np.testing.assert_allclose(noise.whiten(values, slice(3, 8)), (white @ values)[3:8])
-    assert noise.log_size == pytest.approx(np.linalg.slogdet(dense)[1] / 2)
+    assert noise.log_sqrt_determinant == pytest.approx(np.linalg.slogdet(dense)[1] / 2)
     np.testing.assert_allclose(noise.sd, np.sqrt(np.diag(dense)))
     # the control: without the correlations it is no whitening
-    apart = independent(noise.sd).whiten(np.eye(len(dense)))
+    apart = independent_noise(noise.sd).whiten(np.eye(len(dense)))
     assert np.abs(apart @ dense @ apart.T - np.eye(len(dense))).max() > 0.3
 
 
 def test_independent_noise(generator):
     sd = generator.uniform(0.5, 2, 6)
-    noise, values = independent(sd), generator.standard_normal((6, 3))
+    noise, values = independent_noise(sd), generator.standard_normal((6, 3))
     assert noise.independent
     np.testing.assert_allclose(noise.whiten(values), values / sd[:, None])
     np.testing.assert_allclose(noise.whiten(values[:, 1], slice(2, 4)), (values[:, 1] / sd)[2:4])
-    assert noise.log_size == pytest.approx(np.log(sd).sum())
-    assert noise.finest == pytest.approx(sd.min())
+    assert noise.log_sqrt_determinant == pytest.approx(np.log(sd).sum())
+    assert noise.uniform_error_scale == pytest.approx(sd.min())
 
 
 def test_finest_bounds_what_an_offset_of_all_readings_does(noise, generator):
     """For the worst signs it is reached."""
     rows = noise.whiten(np.eye(len(noise)))
     worst = np.sign(rows[np.argmax(np.abs(rows).sum(axis=1))])
-    assert np.abs(noise.whiten(noise.finest * worst)).max() == pytest.approx(1)
+    assert np.abs(noise.whiten(noise.uniform_error_scale * worst)).max() == pytest.approx(1)
     for _ in range(100):
         signs = generator.choice([-1.0, 1.0], len(noise))
-        assert np.abs(noise.whiten(noise.finest * signs)).max() < 1 + 1e-12
+        assert np.abs(noise.whiten(noise.uniform_error_scale * signs)).max() < 1 + 1e-12
 
 
 def test_parts_and_sums(noise, dense):
     some = np.arange(len(dense)) % 3 > 0
-    np.testing.assert_allclose(noise.part(some).covariance.toarray(), dense[np.ix_(some, some)])
-    more = noise.plus(np.arange(len(dense)) / 10)
+    np.testing.assert_allclose(noise.subset(some).covariance.toarray(), dense[np.ix_(some, some)])
+    more = noise.with_independent_errors(np.arange(len(dense)) / 10)
     np.testing.assert_allclose(more.covariance.toarray(),
                                dense + np.diag((np.arange(len(dense)) / 10) ** 2))
 
@@ -100,20 +100,20 @@ def test_posterior_with_correlated_noise(noise, dense, generator):
     predictive = stats.multivariate_normal(
         matrix @ prior.mean, matrix @ prior.covariance @ matrix.T + dense)
     assert found.log_evidence == pytest.approx(predictive.logpdf(readings))
-    apart = update(matrix, readings, independent(noise.sd), prior).distribution
+    apart = update(matrix, readings, independent_noise(noise.sd), prior).distribution
     assert np.abs(apart.mean - mean).max() > 0.1 * np.sqrt(np.diag(covariance)).max()
 
 
 def test_noise_that_others_foretell(dense, noise):
     """Against the dense regression; what is left is independent of the seen."""
     seen = np.arange(len(dense)) % 2 == 0
-    told, left = noise.given(~seen, seen)
+    told, left = noise.conditional(~seen, seen)
     cross = dense[np.ix_(~seen, seen)]
     expected = cross @ np.linalg.inv(dense[np.ix_(seen, seen)])
     np.testing.assert_allclose(told.toarray(), expected, atol=1e-12)
     np.testing.assert_allclose(left.covariance.toarray(),
                                dense[np.ix_(~seen, ~seen)] - expected @ cross.T, atol=1e-12)
-    assert not independent(noise.sd).given(~seen, seen)[0].nnz
+    assert not independent_noise(noise.sd).conditional(~seen, seen)[0].nnz
 
 
 def test_prediction_of_readings_whose_noise_was_seen_in_others(generator):
@@ -126,15 +126,15 @@ def test_prediction_of_readings_whose_noise_was_seen_in_others(generator):
     prior = Gaussian(np.zeros(6), np.eye(6))
     noise = NoiseCovariance(sparse.csr_array(np.kron(np.eye(20), [[1.0, 0.9], [0.9, 1.0]])))
     seen = np.arange(40) % 2 == 0
-    told, left = noise.given(~seen, seen)
+    told, left = noise.conditional(~seen, seen)
     right, wrong = [], []
     for truth in prior.sample(400, generator):
         readings = matrix @ truth + noise.sample(generator)
-        after = update(matrix[seen], readings[seen], noise.part(seen), prior).distribution
+        after = update(matrix[seen], readings[seen], noise.subset(seen), prior).distribution
         residual, root = readings - matrix @ after.mean, matrix @ after.root
         given = root[~seen] - told @ root[seen]
         right.append(whitened(residual[~seen] - told @ residual[seen], left, given.__getitem__, 6))
-        wrong.append(whitened(residual[~seen], noise.part(~seen), root[~seen].__getitem__, 6))
+        wrong.append(whitened(residual[~seen], noise.subset(~seen), root[~seen].__getitem__, 6))
     # 8000 independent values: the rms of a standard normal is 1 +- 0.008; 5 sigma
     assert np.sqrt(np.mean(np.square(right))) == pytest.approx(1.0, abs=0.04)
     assert np.sqrt(np.mean(np.square(wrong))) != pytest.approx(1.0, abs=0.08)
@@ -188,4 +188,4 @@ def test_covariances_that_are_none(dense, change, said):
 @pytest.mark.parametrize("wrong", [-1e-4, 0.0, np.nan, np.inf])
 def test_standard_deviations_that_are_none(wrong):
     with pytest.raises(MeasurementError, match="standard deviation of reading 2 of the noise"):
-        independent(np.array([1e-4, wrong]))
+        independent_noise(np.array([1e-4, wrong]))

@@ -9,7 +9,7 @@ from halbach_fe.core.errors import SamplingError
 from halbach_fe.stats.convergence import assess_convergence, require_convergence
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import update
-from halbach_fe.stats.noise import independent
+from halbach_fe.stats.noise import independent_noise
 from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
 from halbach_fe.stats.sbc import ranks, uniformity
 
@@ -20,7 +20,8 @@ def linear_problem(generator, sigma=0.5):
     matrix = generator.standard_normal((6, SIZE))
     prior = Gaussian(np.array([3.0, -2.0, 1.0]), np.diag([1.0, 0.5, 2.0]))
     readings = matrix @ prior.sample(1, generator)[0] + sigma * generator.standard_normal(6)
-    posterior = Posterior(lambda p: matrix @ p, readings, independent(np.full(6, sigma)), prior)
+    noise = independent_noise(np.full(6, sigma))
+    posterior = Posterior(lambda p: matrix @ p, readings, noise, prior)
     return posterior, matrix
 
 
@@ -35,7 +36,7 @@ def bent_problem(generator):
         return np.array([[1.0, p[1]], [0.0, 1.0]])
 
     readings = np.array([1.5, 0.6])
-    return Posterior(model, readings, independent(np.array([0.3, 1.0])), prior), jacobian
+    return Posterior(model, readings, independent_noise(np.array([0.3, 1.0])), prior), jacobian
 
 
 def run(posterior, reference, step, count, generator, start=None, **options):
@@ -56,7 +57,7 @@ def printed_pcn(prior, step, count, generator):
 def test_pcn_leaves_the_prior_invariant(generator):
     """With the likelihood switched off; centred on the prior's mean, which is not zero."""
     prior = Gaussian(np.array([3.0, -2.0]), np.array([[1.0, 0.0], [0.4, 0.5]]))
-    flat = Posterior(lambda p: np.zeros(1), np.zeros(1), independent(np.ones(1)), prior)
+    flat = Posterior(lambda p: np.zeros(1), np.zeros(1), independent_noise(np.ones(1)), prior)
     chain = run(flat, prior_reference(prior), 0.8, 20_000, generator)
     assert chain.accepted == 1.0
     # autocorrelation 0.6 a step: 1/4 of the samples count; 5 sigma
@@ -157,7 +158,8 @@ def test_a_short_chain_is_refused(generator):
 
 def test_mode_that_is_not_there_is_said():
     prior = Gaussian(np.zeros(1), np.eye(1))
-    nowhere = Posterior(lambda p: np.sign(p), np.array([0.5]), independent(np.array([1e-3])), prior)
+    noise = independent_noise(np.array([1e-3]))
+    nowhere = Posterior(lambda p: np.sign(p), np.array([0.5]), noise, prior)
     with pytest.raises(SamplingError, match="mode was not found"):
         laplace(nowhere, lambda p: np.array([[1.0]]))
 

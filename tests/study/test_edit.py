@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.study import edit
-from halbach_fe.study.edit import LOST, edited_text
+from halbach_fe.study.edit import REWRITTEN_NOTE, edited_text
 from halbach_fe.study.magnet import IronRing, SteelCurve
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import ROOT
@@ -68,7 +68,7 @@ def with_effects(study, names, generator):
         if not places:
             continue
         place = places[generator.integers(len(places))]
-        values = [1.0] if effect.certain else [
+        values = [1.0] if effect.is_binary else [
             parameter.sd * float(generator.standard_normal()) for parameter in effect.parameters]
         try:
             now = effect.apply(study, place, values)
@@ -94,7 +94,7 @@ def test_files_read_back_to_the_study(layout, names, seed):
     for before, (after, note) in zip([study, *(one for one, _ in steps)], steps, strict=False):
         assert before == after or note in changed
     if layout not in ("in pieces", "out of order", "dotted"):  # tables in several pieces
-        assert LOST not in changed
+        assert REWRITTEN_NOTE not in changed
         for line in text.splitlines():
             assert line.partition("#")[2].strip() in changed
 
@@ -154,10 +154,10 @@ def test_a_file_that_cannot_be_changed_is_written_anew(monkeypatch):
     """Negative control: if setting keys did nothing, that would show."""
     study = parse_study(tomllib.loads(PLAIN))
     (step,) = with_effects(study, ["gain_x"], np.random.default_rng(1))
-    assert LOST not in edited_text(PLAIN, [step])
+    assert REWRITTEN_NOTE not in edited_text(PLAIN, [step])
     monkeypatch.setattr(edit, "_set", lambda *_: None)
     changed = edited_text(PLAIN, [step])
-    assert changed.startswith(f"# {LOST}\n# {step[1]}\n")
+    assert changed.startswith(f"# {REWRITTEN_NOTE}\n# {step[1]}\n")
     assert parse_study(tomllib.loads(changed)) == step[0]
 
 

@@ -13,7 +13,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.field import finite_element_part, solve_nominal
 from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.synthetic import extras, magpylib_field
-from halbach_fe.synthetic.bodies import Part, magnet_of, vector
+from halbach_fe.synthetic.bodies import BodyPart, magnet_of, vector
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
 from halbach_fe.synthetic.simulate import true_field as full_field
@@ -122,7 +122,7 @@ def test_parts_add_up(short_dipole, shape):
     pieces = [((0.0, 0.3), (-1.0, 0.2)), ((0.3, 1.0), (-1.0, 0.2)),
               ((0.0, 0.3), (0.2, 1.0)), ((0.3, 1.0), (0.2, 1.0))]
     assert sum(body.shape.share(u, v) for u, v in pieces) == pytest.approx(1.0)
-    changed = replace(body, parts=tuple(Part(u, v, 0.7) for u, v in pieces))
+    changed = replace(body, parts=tuple(BodyPart(u, v, 0.7) for u, v in pieces))
     assert changed.mean_factor == pytest.approx(0.7)
     whole = vacuum_field([body], POINTS)
     np.testing.assert_allclose(vacuum_field([changed], POINTS), 0.7 * whole, atol=1e-9)
@@ -274,4 +274,4 @@ def test_programs_that_are_not_installed(monkeypatch):
     """One sentence that says what to install."""
     monkeypatch.setitem(__import__("sys").modules, "magpylib", None)
     with pytest.raises(ExtraMissingError, match=r"pip install halbach-fe\[campaign\]"):
-        extras.needed("magpylib")
+        extras.import_extra("magpylib")

@@ -18,9 +18,9 @@ from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
-    chosen,
+    choose_effects,
     instrument_with,
-    wanted,
+    parse_hidden_effect,
     with_effects,
 )
 from halbach_fe.synthetic.hidden_effects.kinds import ChosenEffect, site_of
@@ -107,7 +107,8 @@ def test_every_effect_changes_the_map(plain, name):
     for seed in range(1 if name in BY_NGSOLVE else 2):
         values = effect.draw(site, np.random.default_rng(seed))
         assert len(values) == len(effect.parameters)
-        chosen(site, [(effect, values)], 0, np.random.default_rng(0))  # as it may be asked for
+        # as it may be asked for
+        choose_effects(site, [(effect, values)], 0, np.random.default_rng(0))
         points, readings = observed(study, (name, *values))
         before, nominal = of(plain, name)
         change = np.abs(readings - nominal).max()
@@ -527,7 +528,7 @@ def test_an_effect_changes_nothing_else():
     """The same seed draws the same blocks, the same coil and the same noise."""
     study = parse_study(RINGS)
     one, other = simulate_campaign(study, 3), simulate_campaign(
-        study, 3, hide=[wanted("background=0,0,1e-3")])
+        study, 3, hide=[parse_hidden_effect("background=0,0,1e-3")])
     np.testing.assert_array_equal(one.blocks.moment, other.blocks.moment)
     assert one.truth["blocks"] == other.truth["blocks"]
     for before, after in ((one.readings, other.readings), (one.held_out, other.held_out)):
@@ -542,7 +543,8 @@ def test_random_effects():
     site = site_of(study, magnet_of(study))
     seen = set()
     for seed in range(40):
-        names = [one.effect.name for one in chosen(site, [], 3, np.random.default_rng(seed))]
+        names = [one.effect.name
+                 for one in choose_effects(site, [], 3, np.random.default_rng(seed))]
         assert len(set(names)) == 3
         seen |= set(names)
     assert len(seen) > 25
@@ -550,9 +552,9 @@ def test_random_effects():
     section = parse_study(changed(SECTION, observation__components=["x"]))
     site = site_of(section, magnet_of(section))
     with pytest.raises(StudyError, match="at most"):
-        chosen(site, [], 60, np.random.default_rng(0))
+        choose_effects(site, [], 60, np.random.default_rng(0))
     for seed in range(40):
-        for one in chosen(site, [], 2, np.random.default_rng(seed)):
+        for one in choose_effects(site, [], 2, np.random.default_rng(seed)):
             assert one.effect.name not in ("z_scale", "gain_y", "ring_gap", "misalignment_xz")
 
 
@@ -560,7 +562,7 @@ def test_random_effects():
     "gain_w", "gain_x=", "gain_x=1,2", "gain_x=much", "gain_x=nan", "ring_gap=1", "millitesla=1"])
 def test_effects_that_cannot_be_read(text):
     with pytest.raises(ValueError, match=r"needs|no effect"):
-        wanted(text)
+        parse_hidden_effect(text)
     with pytest.raises(SystemExit) as stop:
         main(["simulate-measurement", "study.toml", "-o", "out", "--hide", text])
     assert stop.value.code == 2
@@ -572,7 +574,7 @@ def test_effects_that_cannot_be_read(text):
     "sign_flipped_axis=4"])
 def test_effects_on_blocks_that_are_not_there(text):
     with pytest.raises(StudyError, match=r"whole number|one of them 0"):
-        simulate_campaign(parse_study(RINGS), 1, hide=[wanted(text)])
+        simulate_campaign(parse_study(RINGS), 1, hide=[parse_hidden_effect(text)])
 
 
 def test_effects_that_a_study_cannot_have():
@@ -580,17 +582,18 @@ def test_effects_that_a_study_cannot_have():
             RINGS, observation__components=["x"])), ("iron_ring", changed(RINGS, iron_ring={
                 "inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 100.0}))):
         with pytest.raises(StudyError, match="needs:"):
-            simulate_campaign(parse_study(document), 1, hide=[wanted(text)])
+            simulate_campaign(parse_study(document), 1, hide=[parse_hidden_effect(text)])
     with pytest.raises(StudyError, match="in air"):
-        simulate_campaign(parse_study(RINGS), 1, hide=[wanted("wrong_radius=0.05")])
+        simulate_campaign(parse_study(RINGS), 1, hide=[parse_hidden_effect("wrong_radius=0.05")])
 
 
 def test_the_coil_sees_what_single_blocks_have():
     """Thinner blocks have less moment; a warm magnet was measured cold."""
     study = parse_study(RINGS)
     plain = simulate_campaign(study, 2, coil_sd=1e-9).blocks.moment
-    thin = simulate_campaign(study, 2, 1e-9, [wanted("azimuthal_gap=1e-3")]).blocks.moment
-    warm = simulate_campaign(study, 2, 1e-9, [wanted("temperature=10,-1e-3")]).blocks.moment
+    thin, warm = (
+        simulate_campaign(study, 2, 1e-9, [parse_hidden_effect(text)]).blocks.moment
+        for text in ("azimuthal_gap=1e-3", "temperature=10,-1e-3"))
     share = 1e-3 / (0.14525 * 2 * np.pi / 8)
     np.testing.assert_allclose(thin, (1 - share) * plain, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(warm, plain, rtol=1e-6, atol=1e-6)

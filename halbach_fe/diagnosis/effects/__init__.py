@@ -1,7 +1,8 @@
-"""The catalogue of effects that a model may lack, each in a file of its own.
+"""The catalogue of effects that the diagnosis searches for, each in a file of its own.
 
-A package adds its own by the entry point group ``halbach_fe.effects``, whose entries name
-a sequence of `Effect` objects.
+An effect is a deviation of the real magnet or mapper from the study: a displaced block, a gain
+error of a sensor, an iron ring that the study does not mention. Another package adds effects by
+entry points of the group ``halbach_fe.effects``; each entry names a sequence of `Effect` objects.
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ GROUP = "halbach_fe.effects"
 
 
 def catalogue() -> tuple[Effect, ...]:
-    """All effects, by name."""
+    """Return all effects, those of other packages included, sorted by name.
+
+    Raises
+    ------
+    StudyError
+        If an entry point does not name effects, or repeats the name of another effect.
+    """
     found: dict[str, Effect] = {}
     for module in pkgutil.iter_modules(__path__):
         loaded = importlib.import_module(f"{__name__}.{module.name}")

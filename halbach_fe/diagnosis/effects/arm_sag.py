@@ -1,4 +1,4 @@
-"""An arm that sags."""
+"""Sag of the arm that carries the probe."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from halbach_fe.study.measurement import Instrument
 
 
 class ArmSagEffect(InstrumentEffect):
-    """Sag towards -y of the far end, with the square of the distance from the near one."""
+    """The arm sags towards -y, with the square of the distance from its end at the smallest z.
+
+    The parameter is the sag at the largest z of the map.
+    """
 
     name = "arm_sag"
     title = "sag of the mapper's arm"
     parameters = (Parameter("sag", "m", 5e-4),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        z = scene.points[:, 2]
+        z = nominal.points[:, 2]
         shape = ((z - z.min()) / (np.ptp(z) or 1.0)) ** 2
-        return scene.displaced(np.outer(shape, [0.0, -1.0, 0.0]))[None]
+        return nominal.change_at_displaced_points(np.outer(shape, [0.0, -1.0, 0.0]))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""Glue between neighbouring blocks."""
+"""Gaps between neighbouring blocks, such as layers of glue."""
 
 from __future__ import annotations
 
@@ -20,17 +20,20 @@ from halbach_fe.study.model import Study
 
 
 class AzimuthalGapEffect(Effect):
-    """Blocks narrower than nominal, at their mean radius, by the same gap between all."""
+    """All blocks are narrower than nominal, which leaves the same gap between all neighbours.
+
+    The gap is measured at the mean radius of the blocks.
+    """
 
     name = "azimuthal_gap"
     title = "gaps between neighbouring blocks"
     kind = "field"
     parameters = (Parameter("gap", "m", 2e-4),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        step = 1e-4  # the field is linear in so small a gap
-        return (changed(scene, self.apply(scene.study, place, [step])) / step)[None]
+        step = 1e-4  # small enough for the field to be linear in the gap
+        return (changed(nominal, self.apply(nominal.study, place, [step])) / step)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

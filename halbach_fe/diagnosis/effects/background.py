@@ -1,4 +1,4 @@
-"""A field that is not the magnet's."""
+"""A uniform magnetic field from outside the magnet."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from halbach_fe.study.model import Study
 
 
 class BackgroundEffect(Effect):
-    """Uniform field, as the earth's."""
+    """A uniform field is added to that of the magnet, such as that of the earth."""
 
     name = "background"
     title = "uniform background field"
@@ -21,9 +21,9 @@ class BackgroundEffect(Effect):
     parameters = (
         Parameter("x", "T", 0.0001), Parameter("y", "T", 0.0001), Parameter("z", "T", 0.0001),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.tile(np.eye(3)[:, None], (1, len(scene.points), 1))
+        return np.tile(np.eye(3)[:, None], (1, len(nominal.points), 1))
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

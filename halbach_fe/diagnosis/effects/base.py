@@ -1,4 +1,9 @@
-"""What every effect has: a name, parameters with priors, a signature, and its way into a study."""
+"""Base classes of effects, and functions that several effects share.
+
+Every effect has a name, parameters with priors, the places where it can occur, a signature (the
+change of the readings per unit of each parameter, to first order) and a method that applies it to a
+study in full.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +25,37 @@ from halbach_fe.study.types import COMPONENTS
 
 @dataclass(frozen=True)
 class Parameter:
-    """An amplitude of an effect: its name, unit, prior standard deviation about 0, and the smallest
-    one that there can be.
+    """An amplitude of an effect.
+
+    Attributes
+    ----------
+    name : str
+    unit : str
+        SI unit; ``"1"`` for a pure number.
+    sd : float
+        Prior standard deviation about 0.
+    minimum : float
+        Smallest amplitude that is physically possible, such as 0 for a gap that cannot be negative.
     """
 
     name: str
     unit: str
     sd: float
-    least: float = -np.inf
+    minimum: float = -np.inf
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where an effect may be: a ring, a slot of it (0 is all), coordinates or lengths in m;
-    ``other`` is the ring and slot of a second block.
+    """Where an effect acts.
+
+    Attributes
+    ----------
+    ring, slot : int
+        Ring and slot of a block, both counted from 1; 0 stands for all of them.
+    at_m : tuple of float
+        Coordinates or lengths in m, whose meaning depends on the effect.
+    other : (int, int)
+        Ring and slot of the second block of effects that concern two; (0, 0) for others.
     """
 
     ring: int = 0
@@ -43,37 +65,44 @@ class Place:
 
     @property
     def name(self) -> str:
-        """Label in reports."""
+        """The label of the place in reports; empty if the effect has a single place."""
         ring, slot = (f"{letter}{number:02d}" if number else ""
                       for letter, number in (("r", self.ring), ("s", self.slot)))
         if self.at_m:
-            places = (round(one, 6) + 0.0 for one in self.at_m)  # no -0, no 1e-18
-            return f"at {', '.join(f'{one:.4g}' for one in places)} m"
+            lengths = (round(length, 6) + 0.0 for length in self.at_m)  # no -0, no 1e-18
+            return f"at {', '.join(f'{length:.4g}' for length in lengths)} m"
         if self.other[0]:
             return f"{ring}{slot}, r{self.other[0]:02d}s{self.other[1]:02d}"
         return ring + slot
 
 
 class Effect(ABC):
-    """Something that a model may lack.
+    """A deviation of the real magnet or mapper from the study.
 
     Attributes
     ----------
     name : str
-        Standard name.
+        Identifier in tables, files and options.
     title : str
-        In words, for a report.
+        Name in words, for reports.
     kind : str
-        ``field``: the magnet or what is around it; ``instrument``: the mapper.
+        ``field`` if it changes the magnet or its surroundings, ``instrument`` if it changes the
+        mapper.
     parameters : tuple of Parameter
+        Amplitudes that are estimated together, one signature each.
     refinements : tuple of Parameter
-        More of them, that are looked for once the effect is in the model.
-    certain : bool
-        Whether it is there with amplitude 1 or not at all, as a block upside down.
-    only : bool
-        Whether it is in one place at most, as an iron ring.
-    discrete : bool
-        Whether `apply` puts all of it into a study, whatever its amplitude.
+        Further amplitudes, which are estimated only after the effect has been found and applied to
+        the study; see `refine`.
+    is_binary : bool
+        Whether the effect is either absent or present with amplitude 1, as a missing block. No
+        amplitude is then estimated: the evidence compares exactly 1 with exactly 0.
+    unique : bool
+        Whether the effect can occur at one place at most, as an iron ring; several blocks, on the
+        other hand, can be displaced.
+    applied_in_full : bool
+        Whether `apply` puts the whole effect into a study and ignores the first amplitude, since no
+        study can contain, for instance, half an iron ring. With such an effect in the model, its
+        signature is the difference between the study with it and without it.
     """
 
     name: ClassVar[str]
@@ -81,45 +110,55 @@ class Effect(ABC):
     kind: ClassVar[Literal["field", "instrument"]]
     parameters: tuple[Parameter, ...]
     refinements: ClassVar[tuple[Parameter, ...]] = ()
-    certain: ClassVar[bool] = False
-    only: ClassVar[bool] = False
-    discrete: ClassVar[bool] = False
+    is_binary: ClassVar[bool] = False
+    unique: ClassVar[bool] = False
+    applied_in_full: ClassVar[bool] = False
 
     def places(self, study: Study) -> Sequence[Place]:
-        """Where in a study it may be; none if the study rules it out."""
+        """Return the places where the effect can occur; none if the study rules it out."""
         return [Place()]
 
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
     ) -> Sequence[Place]:
-        """The places worth a look, where there are too many for a signature of each.
+        """Return the places whose signatures are to be computed, by default all of `places`.
+
+        An effect that has too many places for that ranks them here by a cheaper estimate.
 
         Parameters
         ----------
+        study : Study
         mean : ndarray, shape (m,), in A/m
-            Of the prior of the magnetizations.
+            Prior mean of the magnetizations.
         information, score : ndarray, shape (m, m) and (m,)
-            H' S^-1 H and H' S^-1 r, see `halbach_fe.diagnosis.evidence`.
+            H' S^-1 H and H' S^-1 r of the response matrix H of the magnetizations and the residual
+            r, with the blocks integrated out; see `halbach_fe.diagnosis.evidence`.
         """
         return self.places(study)
 
     @abstractmethod
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
-        """Change of the readings of a map, (k, n, 3) in T per unit of each parameter."""
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters."""
 
-    def refine(self, scene: NominalFields, place: Place, values: Sequence[float]) -> Floats:
-        """Change of the readings of a map, (r, n, 3) in T per unit of each refinement, at values of
-        all parameters, in a scene without the effect.
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """Return the change of the readings (r, n, 3) in T per unit of each of the r refinements.
+
+        The derivative is taken at ``values``, which are those of all parameters followed by those
+        of the refinements. ``nominal`` does not contain the effect.
         """
-        return np.empty((0, *scene.points.shape))
+        return np.empty((0, *nominal.points.shape))
 
     @abstractmethod
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        """The study with the effect, in full, its amplitudes (k,) added to what is there."""
+        """Return the study with the effect applied in full, not only to first order.
+
+        The amplitudes ``values`` add to those that the study has already. ``values`` can include
+        those of the refinements.
+        """
 
 
 class InstrumentEffect(Effect):
-    """An effect of the mapper: a change of the study's instrument."""
+    """An effect of the mapper, which changes the study's instrument."""
 
     kind = "instrument"
 
@@ -131,51 +170,54 @@ class InstrumentEffect(Effect):
 
     @abstractmethod
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
-        """The instrument's keys that change, with their new values."""
+        """Return the keys of the instrument that change, with their new values."""
 
 
 def added(values: Sequence[float], change: Sequence[float]) -> tuple[float, ...]:
-    """Sum of two vectors, for a key of a study."""
-    return tuple(float(one) + float(other) for one, other in zip(values, change, strict=True))
+    """Return the sum of two vectors as a tuple, for a key of a study."""
+    return tuple(float(value) + float(more) for value, more in zip(values, change, strict=True))
 
 
 def along(axis: str, value: float) -> tuple[float, float, float]:
-    """A vector along x, y or z."""
+    """Return a vector along ``axis``, which is x, y or z, with the component ``value``."""
     x, y, z = (value if name == axis else 0.0 for name in COMPONENTS)
     return x, y, z
 
 
 def with_exceptions(study: Study, exceptions: Sequence[BlockException]) -> Study:
-    """The study with more exceptions to its blocks."""
+    """Return the study with further block exceptions after those it has."""
     array = study.array.with_(exceptions=(*study.array.exceptions, *exceptions))
     return study.with_(array=array)
 
 
 def with_array(study: Study, **keys: Any) -> Study:
-    """The study with other keys of its array."""
+    """Return the study with some keys of its array replaced."""
     return study.with_(array=study.array.with_(**keys))
 
 
-def blocks_at(scene: NominalFields, place: Place) -> list[int]:
-    """Numbers of the blocks of a place."""
-    return [number for number, block in enumerate(scene.blocks)
+def blocks_at(nominal: NominalFields, place: Place) -> list[int]:
+    """Return the numbers of the blocks at a place, counted from 0."""
+    return [number for number, block in enumerate(nominal.blocks)
             if place.ring in (0, block.ring) and place.slot in (0, block.slot)]
 
 
 def each_block(study: Study) -> list[Place]:
-    """A place for every block."""
+    """Return a place for every block."""
     array = study.array
     return [Place(ring, slot) for ring in range(1, array.rings + 1)
             for slot in range(1, array.blocks_per_ring + 1)]
 
 
 def each_ring(study: Study) -> list[Place]:
-    """A place for every ring; none in a cross-section."""
+    """Return a place for every ring; none in two dimensions."""
     return [] if study.dimension == 2 else [Place(ring) for ring in range(1, study.array.rings + 1)]
 
 
 def with_remanence(study: Study) -> Study:
-    """The study with its remanence in place of a moment, which would change with the blocks."""
+    """Return the study with the remanence of its blocks in place of their moment.
+
+    With a moment given, a change of the blocks' volume would change their remanence as well.
+    """
     if study.array.remanence_T is not None:
         return study
     bare = with_array(study, exceptions=())
@@ -183,7 +225,7 @@ def with_remanence(study: Study) -> Study:
                       remanence_T=build_magnet(bare).blocks[0].remanence)
 
 
-def changed(scene: NominalFields, study: Study) -> Floats:
-    """How B (n, 3) in T of the nominal blocks differs in another study."""
-    return np.asarray(scene.block_fields_of(study).sum(axis=0)
-                      - scene.block_fields.sum(axis=0))
+def changed(nominal: NominalFields, study: Study) -> Floats:
+    """Return B (n, 3) in T of the nominal blocks of ``study``, less that of ``nominal``."""
+    return np.asarray(nominal.block_fields_of(study).sum(axis=0)
+                      - nominal.block_fields.sum(axis=0))

@@ -1,4 +1,4 @@
-"""A block that has lost magnetization."""
+"""A block that has lost part of its magnetization."""
 
 from __future__ import annotations
 
@@ -22,7 +22,11 @@ from halbach_fe.study.model import Study
 
 
 class BlockDemagnetizedEffect(Effect):
-    """One block weaker by far more than its own tolerance."""
+    """One block has lost a fraction of its magnetization.
+
+    The prior standard deviation is far larger than a block's own tolerance, which belongs to the
+    prior of the magnetizations.
+    """
 
     name = "block_demagnetized"
     title = "demagnetized block"
@@ -33,12 +37,13 @@ class BlockDemagnetizedEffect(Effect):
         """See `Effect.places`."""
         return each_block(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        (number,) = blocks_at(scene, place)
-        block = scene.blocks[number]
-        whole = as_meant(scene.magnet).blocks[number].remanence  # whatever it has lost already
-        return -whole * (scene.unit_fields[number] @ np.array(block.easy_axis))[None]
+        (number,) = blocks_at(nominal, place)
+        block = nominal.blocks[number]
+        # relative to the intact block, even if the study contains a loss already
+        intact = as_meant(nominal.magnet).blocks[number].remanence
+        return -intact * (nominal.unit_fields[number] @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A block that is not where it should be."""
+"""A block that is displaced from its nominal position."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from halbach_fe.study.model import Study
 
 
 class BlockDisplacedEffect(Effect):
-    """Displacement of one block along its own axes."""
+    """One block is displaced along its own axes: radially, azimuthally and axially."""
 
     name = "block_displaced"
     title = "displacement of a block"
@@ -36,12 +36,12 @@ class BlockDisplacedEffect(Effect):
         """See `Effect.places`."""
         return each_block(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        (block,) = blocks_at(scene, place)
+        (block,) = blocks_at(nominal, place)
         axes = rotation_matrix(
-            (0.0, 0.0, np.radians(position_angle_deg(scene.study.array, place.slot))))
-        return np.array([scene.moved(block, axis) for axis in axes.T])
+            (0.0, 0.0, np.radians(position_angle_deg(nominal.study.array, place.slot))))
+        return np.array([nominal.block_translation_derivative(block, axis) for axis in axes.T])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

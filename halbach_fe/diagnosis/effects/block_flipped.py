@@ -1,4 +1,4 @@
-"""A block that is upside down."""
+"""A block that was mounted upside down."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from halbach_fe.diagnosis.effects.block_missing import BlockMissingEffect
 
 
 class BlockFlippedEffect(BlockMissingEffect):
-    """One block magnetized the other way."""
+    """One block has the opposite magnetization."""
 
     name = "block_flipped"
     title = "block mounted upside down"

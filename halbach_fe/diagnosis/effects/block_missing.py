@@ -1,4 +1,4 @@
-"""A block that is not there."""
+"""A missing block."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from halbach_fe.study.model import Study
 
 
 class BlockMissingEffect(Effect):
-    """One block missing."""
+    """One block is missing."""
 
     name = "block_missing"
     title = "missing block"
     kind = "field"
     parameters = (Parameter("there", "1", 1.0),)
-    certain = True
-    discrete = True
-    factor = 0.0  # of the block's magnetization
+    is_binary = True
+    applied_in_full = True
+    factor = 0.0  # by which the block's magnetization is multiplied
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
         return each_block(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        (block,) = blocks_at(scene, place)
-        return (self.factor - 1) * scene.known_field(block)[None]
+        (block,) = blocks_at(nominal, place)
+        return (self.factor - 1) * nominal.measured_block_field(block)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A block that is turned."""
+"""A block that is rotated from its nominal orientation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from halbach_fe.study.model import Study
 
 
 class BlockTurnedEffect(Effect):
-    """Rotation of one block, with its magnetization, about its own axes through its middle."""
+    """One block is rotated with its magnetization, about its own axes through its centre."""
 
     name = "block_turned"
     title = "rotation of a block"
@@ -36,13 +36,13 @@ class BlockTurnedEffect(Effect):
         """See `Effect.places`."""
         return each_block(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        (block,) = blocks_at(scene, place)
+        (block,) = blocks_at(nominal, place)
         axes = rotation_matrix(
-            (0.0, 0.0, np.radians(position_angle_deg(scene.study.array, place.slot))))
-        middle = scene.blocks[block].middle
-        return np.array([scene.turned(block, axis, middle) for axis in axes.T])
+            (0.0, 0.0, np.radians(position_angle_deg(nominal.study.array, place.slot))))
+        middle = nominal.blocks[block].middle
+        return np.array([nominal.block_rotation_derivative(block, axis, middle) for axis in axes.T])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""Two blocks that changed places."""
+"""Two blocks that were mounted in each other's places."""
 
 from __future__ import annotations
 
@@ -16,21 +16,27 @@ from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
 
 SHORTLIST = 40
-"""Pairs that are looked at closely, of tens of thousands."""
+"""Number of pairs whose signatures are computed.
+
+All pairs, of which there can be tens of thousands, are ranked by an estimate of their evidence.
+"""
 
 
 class BlocksSwappedEffect(Effect):
-    """Each block mounted, in its own axes, where the other should be."""
+    """Two blocks are exchanged, and each keeps its magnetization in its own axes.
+
+    The magnetization thus turns by the angle between the two slots.
+    """
 
     name = "blocks_swapped"
     title = "two blocks that changed places"
     kind = "field"
     parameters = (Parameter("there", "1", 1.0),)
-    certain = True
-    discrete = True
+    is_binary = True
+    applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
-        """See `Effect.places`: neighbours, as examples of what `shortlist` chooses from."""
+        """Return pairs of neighbours, as examples; the search uses `shortlist`."""
         array = study.array
         return [Place(ring, slot, other=(ring, slot % array.blocks_per_ring + 1))
                 for ring in range(1, array.rings + 1)
@@ -39,8 +45,11 @@ class BlocksSwappedEffect(Effect):
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
     ) -> Sequence[Place]:
-        """See `Effect.shortlist`: the exchange of two blocks is a change of their magnetizations,
-        whose evidence is a quadratic form of that of all blocks.
+        """Return the pairs of the largest estimated evidence, see `Effect.shortlist`.
+
+        The exchange of two blocks changes the magnetizations by a known vector c, so that the log
+        evidence of the exchange is c' score - c' information c / 2. Both terms follow for all pairs
+        at once from the entries of the two blocks.
         """
         blocks, size = build_magnet(study).blocks, study.dimension
         angles = np.radians([position_angle_deg(study.array, block.slot) for block in blocks])
@@ -48,28 +57,29 @@ class BlocksSwappedEffect(Effect):
         own = np.array([rotation_about_z(-angle)[:size, :size] @ vector
                         for angle, vector in zip(angles, vectors, strict=True)])
         turns = np.array([rotation_about_z(angle)[:size, :size] for angle in angles])
-        change = np.einsum("iab,jb->ija", turns, own) - vectors[:, None]  # at i, of the block of j
+        # change of the magnetization at place i when it receives the block of place j
+        change = np.einsum("iab,jb->ija", turns, own) - vectors[:, None]
         weights = information.reshape(len(blocks), size, len(blocks), size)
         here = np.einsum("ija,iaib,ijb->ij", change, weights, change, optimize=True)
         cross = np.einsum("ija,iajb,jib->ij", change, weights, change, optimize=True)
         gain = np.einsum("ija,ia->ij", change, score.reshape(len(blocks), size))
         evidence = gain + gain.T - (here + here.T + 2 * cross) / 2
-        one, other = np.triu_indices(len(blocks), 1)
-        best = np.argsort(-evidence[one, other])[:SHORTLIST]
+        first, second = np.triu_indices(len(blocks), 1)
+        best = np.argsort(-evidence[first, second])[:SHORTLIST]
         return [Place(blocks[i].ring, blocks[i].slot, other=(blocks[j].ring, blocks[j].slot))
-                for i, j in zip(one[best], other[best], strict=True)]
+                for i, j in zip(first[best], second[best], strict=True)]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        where = [(block.ring, block.slot) for block in scene.blocks]
+        where = [(block.ring, block.slot) for block in nominal.blocks]
         here, there = where.index((place.ring, place.slot)), where.index(place.other)
-        size, array = scene.study.dimension, scene.study.array
-        total = np.zeros_like(scene.points)
+        size, array = nominal.study.dimension, nominal.study.array
+        total = np.zeros_like(nominal.points)
         for to, source in ((here, there), (there, here)):
             turn = rotation_about_z(np.radians(position_angle_deg(array, where[to][1])
                                           - position_angle_deg(array, where[source][1])))
-            total += scene.field_with(to, turn[:size, :size] @ scene.magnetizations[source]
-                                      - scene.magnetizations[to])
+            total += nominal.field_with(to, turn[:size, :size] @ nominal.magnetizations[source]
+                                      - nominal.magnetizations[to])
         return total[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -1,4 +1,4 @@
-"""Blocks whose corners at the bore are demagnetized."""
+"""Demagnetized corners of the blocks at the bore."""
 
 from __future__ import annotations
 
@@ -12,23 +12,29 @@ from halbach_fe.study.model import Study
 
 
 class CornersDemagnetizedEffect(Effect):
-    """Loss of the inner corners of all blocks."""
+    """Both inner corners of all blocks have lost a fraction of their magnetization.
+
+    The study's ``inner_corner_loss`` defines the size of a corner.
+    """
 
     name = "corners_demagnetized"
     title = "demagnetized corners at the bore"
     kind = "field"
     parameters = (Parameter("loss", "1", 0.1),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return changed(scene, self.apply(scene.study, place, [0.5]))[None] / 0.5
+        return changed(nominal, self.apply(nominal.study, place, [0.5]))[None] / 0.5
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        there = next((one.inner_corner_loss for one in reversed(study.array.exceptions)
-                      if one.inner_corner_loss is not None and not (one.ring or one.slot)), 0.0)
+        # the last exception that applies to all blocks sets the loss the study has already
+        present = next((exception.inner_corner_loss
+                        for exception in reversed(study.array.exceptions)
+                        if exception.inner_corner_loss is not None
+                        and not (exception.ring or exception.slot)), 0.0)
         return with_exceptions(study, [BlockException(
-            inner_corner_loss=there + float(values[0]))])
+            inner_corner_loss=present + float(values[0]))])
 
 
 EFFECTS = (CornersDemagnetizedEffect(),)

@@ -1,4 +1,4 @@
-"""A zero that drifts during the mapping."""
+"""Drift of the sensors' offsets while the map is taken."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from halbach_fe.study.measurement import Instrument
 
 
 class DriftEffect(InstrumentEffect):
-    """Linear drift of the zeros, over the whole map."""
+    """The offset of each sensor grows linearly in time.
+
+    The parameters are the changes from the first to the last reading of the map.
+    """
 
     name = "drift"
     title = "drift of the zeros in time"
     parameters = (
         Parameter("x", "T", 1e-4), Parameter("y", "T", 1e-4), Parameter("z", "T", 1e-4),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(np.eye(3)[:, None, :] * scene.time[None, :, None])
+        return np.asarray(np.eye(3)[:, None, :] * nominal.time[None, :, None])
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""Circles whose radius varies once around."""
+"""Circles whose radius varies once per turn, while the angles are right."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place, added
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.measurement.instrument import run_out
+from halbach_fe.measurement.instrument import eccentricity_shift
 from halbach_fe.study.measurement import Instrument
 
 
 class EccentricCircleEffect(InstrumentEffect):
-    """The radius is larger by ``x cos phi + y sin phi``, while the angle is right: half of what a
-    translation of the mapper does.
+    """The radius at the angle phi is larger by ``x cos phi + y sin phi``.
+
+    A translation of the mapper by (x, y) has the same effect on the radius, and a further one on
+    the angle, which is right here.
     """
 
     name = "eccentric_circle"
     title = "eccentric circles"
     parameters = (Parameter("x", "m", 1e-3), Parameter("y", "m", 1e-3))
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.array([scene.displaced(one) for one in run_out(scene.points)])
+        return np.array([nominal.change_at_displaced_points(shift)
+                         for shift in eccentricity_shift(nominal.points)])
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

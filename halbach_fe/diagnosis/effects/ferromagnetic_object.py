@@ -1,4 +1,4 @@
-"""A piece of iron near by."""
+"""A ferromagnetic object near the magnet."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from halbach_fe.study.magnet import PointDipole
 from halbach_fe.study.model import Study
 
 BEYOND_M = (0.03, 0.08, 0.15, 0.25)
-"""Distances from the magnet's ends."""
+"""Distances of the candidate places from the magnet's ends."""
 
 
 class FerromagneticObjectEffect(Effect):
-    """A small magnetized object, as a point dipole."""
+    """A small magnetized object, modelled as a point dipole."""
 
     name = "ferromagnetic_object"
     title = "ferromagnetic object near the bore"
@@ -41,10 +41,10 @@ class FerromagneticObjectEffect(Effect):
         return axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
                        for r, z in ends + outside for a in angles]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         position = np.array(place.at_m)
-        return np.array([dipole_field(position, moment, scene.points) for moment in np.eye(3)])
+        return np.array([dipole_field(position, moment, nominal.points) for moment in np.eye(3)])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A sensor whose sensitivity is off."""
+"""Gain error of a sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class GainEffect(InstrumentEffect):
-    """Relative error of one axis."""
+    """The sensor of one component has a relative error of its sensitivity."""
 
     title = "sensitivity of a sensor"
     parameters = (Parameter("gain", "1", 3e-3),)
@@ -24,9 +24,9 @@ class GainEffect(InstrumentEffect):
         self.axis = axis
         self.name = f"gain_{axis}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(scene.field * along(self.axis, 1.0))[None]
+        return np.asarray(nominal.field * along(self.axis, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""A bore that is wider or narrower."""
+"""A bore that is wider or narrower than nominal."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from halbach_fe.study.model import Study
 
 
 class InnerRadiusEffect(Effect):
-    """Inner radius of all blocks."""
+    """The inner radius of all blocks differs, while their outer radius is nominal."""
 
     name = "inner_radius"
     title = "inner radius of the blocks"
     kind = "field"
     parameters = (Parameter("difference", "m", 3e-4),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         step = 1e-4
-        return (changed(scene, self.apply(scene.study, place, [step])) / step)[None]
+        return (changed(nominal, self.apply(nominal.study, place, [step])) / step)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""Iron around the magnet."""
+"""An iron ring around the magnet that the study does not contain."""
 
 from __future__ import annotations
 
@@ -14,22 +14,28 @@ from halbach_fe.study.magnet import IronRing
 from halbach_fe.study.model import Study
 
 PERMEABILITY = 1000.0
-"""Of iron that is not saturated, which thickness can stand for: what counts of a thin shield is
-their product."""
+"""Relative permeability that every candidate ring is given.
+
+It is typical of iron that is not saturated. No other value is tried, because a thin shield acts by
+the product of permeability and thickness, and the thickness is varied.
+"""
 
 CLEARANCE_M = 2e-4
-"""Between blocks and iron, at least."""
+"""Smallest distance between blocks and iron."""
 
 THINNEST_M = 5e-4
+"""Smallest thickness of a ring."""
 
 STEP_M = 5e-4
-"""For derivatives."""
+"""Step of the finite differences with respect to the refinements."""
 
 
 class IronRingEffect(Effect):
-    """A coaxial tube of soft iron as long as the magnet; the place is its inner and outer radius,
-    from which those that fit best are looked for. It is linear: for one that saturates a
-    thicker tube farther out is found, and no saturating one is looked for.
+    """A coaxial tube of soft iron as long as the magnet surrounds it.
+
+    A place is a pair of inner and outer radius, and the refinements adjust both. The iron is
+    linear: iron that saturates is not a candidate, and is identified as a linear tube that is
+    thicker and farther out.
     """
 
     name = "iron_ring"
@@ -37,8 +43,8 @@ class IronRingEffect(Effect):
     kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
-    only = True
-    discrete = True
+    unique = True
+    applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
@@ -49,14 +55,15 @@ class IronRingEffect(Effect):
                 for gap, thickness in ((0.004, 0.002), (0.004, 0.01), (0.004, 0.025),
                                        (0.02, 0.01))]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return (scene.solve(self.apply(scene.study, place, [1.0])) - scene.solved)[None]
+        with_ring = nominal.solve(self.apply(nominal.study, place, [1.0]))
+        return (with_ring - nominal.finite_element_field)[None]
 
-    def refine(self, scene: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""
-        here = scene.solve(self.apply(scene.study, place, values))
-        return np.array([(scene.solve(self.apply(scene.study, place, np.add(
+        here = nominal.solve(self.apply(nominal.study, place, values))
+        return np.array([(nominal.solve(self.apply(nominal.study, place, np.add(
             values, STEP_M * step).tolist())) - here) / STEP_M for step in np.eye(3)[1:]])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

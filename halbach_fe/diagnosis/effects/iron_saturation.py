@@ -1,4 +1,4 @@
-"""Iron that saturates."""
+"""Saturation of an iron ring that the study describes as linear."""
 
 from __future__ import annotations
 
@@ -11,31 +11,34 @@ from halbach_fe.study.magnet import IronRing, SteelCurve
 from halbach_fe.study.model import Study
 
 STEEL = "aisi_1010"
+"""Steel whose H(B) curve stands for that of structural steels."""
 
 SOLID = "scalar_potential"
-"""The route of iron that saturates."""
+"""Solver route of iron that saturates."""
 
 
 class IronSaturationEffect(Effect):
-    """The H(B) curve of a structural steel in place of a constant permeability."""
+    """The iron follows the H(B) curve of a structural steel, not a constant permeability."""
 
     name = "iron_saturation"
     title = "saturation of the iron ring"
     kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
-    certain = True
-    discrete = True
+    is_binary = True
+    applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
         ring = study.iron_ring
         return [Place()] if ring is not None and ring.curve is None else []
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
-        """See `Effect.signature`; both on the same mesh."""
-        solid = scene.study.solver.with_(route=SOLID)
-        before = scene.study if scene.study.dimension == 2 else scene.study.with_(solver=solid)
-        return (scene.solve(self.apply(before, place, [1.0])) - scene.solve(before))[None]
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        # linear iron by the same route, so that both fields have the same mesh
+        solid = nominal.study.solver.with_(route=SOLID)
+        study = nominal.study
+        before = study if study.dimension == 2 else study.with_(solver=solid)
+        return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A magnet that is longer or shorter."""
+"""A magnet that is longer or shorter than nominal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from halbach_fe.study.model import Study
 
 
 class LengthEffect(Effect):
-    """Length of the magnet, by that of its rings."""
+    """The length of the magnet differs, each ring by an equal share of the difference."""
 
     name = "length"
     title = "length of the magnet"
@@ -29,16 +29,16 @@ class LengthEffect(Effect):
         """See `Effect.places`."""
         return [Place()] if study.dimension == 3 else []
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         step = 1e-3
-        return (changed(scene, self.apply(scene.study, place, [step])) / step)[None]
+        return (changed(nominal, self.apply(nominal.study, place, [step])) / step)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         study = with_remanence(study)
         length = study.array.ring_length_m
-        assert length is not None  # of a magnet in 3D
+        assert length is not None  # in three dimensions a study has a ring length
         return with_array(study, ring_length_m=length + float(values[0]) / study.array.rings)
 
 

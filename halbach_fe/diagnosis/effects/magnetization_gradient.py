@@ -1,4 +1,4 @@
-"""Blocks magnetized unevenly."""
+"""A magnetization that varies along the thickness of the blocks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from halbach_fe.study.model import Study
 
 
 class MagnetizationGradientEffect(Effect):
-    """Outer halves stronger than inner ones, in all blocks or in one."""
+    """The outer half of the blocks is stronger than the inner one, in all blocks or in one.
+
+    The parameter is the difference as a fraction of the mean.
+    """
 
     name = "magnetization_gradient"
     title = "magnetization gradient inside the blocks"
@@ -32,11 +35,10 @@ class MagnetizationGradientEffect(Effect):
         """See `Effect.places`."""
         return [Place(), *each_block(study)]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        per_unit = scene.gradient_fields
-        chosen = blocks_at(scene, place)
-        return np.asarray(per_unit[chosen].sum(axis=0))[None]
+        per_unit = nominal.gradient_fields
+        return np.asarray(per_unit[blocks_at(nominal, place)].sum(axis=0))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A mapper that is turned."""
+"""Rotation of the mapper about an axis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from halbach_fe.study.measurement import Instrument
 
 
 class MapperRotationEffect(InstrumentEffect):
-    """Rotation of the mapper, points and sensors, about the magnet's middle."""
+    """The mapper is turned about the magnet's centre, its points and its sensors alike."""
 
     title = "mapper turned about an axis"
     parameters = (Parameter("angle", "rad", 2e-3),)
@@ -23,11 +23,11 @@ class MapperRotationEffect(InstrumentEffect):
         self.axis = axis
         self.name = name  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         axis = np.array(along(self.axis, 1.0))
-        moved = scene.displaced(np.cross(axis, scene.points))
-        return np.asarray(moved - np.cross(axis, scene.field))[None]  # the sensors turn too
+        moved = nominal.change_at_displaced_points(np.cross(axis, nominal.points))
+        return np.asarray(moved - np.cross(axis, nominal.field))[None]  # the sensors turn too
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""A mapper that is displaced."""
+"""Displacement of the mapper."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from halbach_fe.study.measurement import Instrument
 
 
 class MapperTranslationEffect(InstrumentEffect):
-    """Displacement of the mapper's origin from the magnet's."""
+    """The origin of the mapper is displaced from that of the magnet."""
 
     name = "mapper_translation"
     title = "displacement of the mapper"
     parameters = (
         Parameter("x", "m", 1e-3), Parameter("y", "m", 1e-3), Parameter("z", "m", 1e-3),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(np.moveaxis(scene.gradient, 2, 0))
+        return np.asarray(np.moveaxis(nominal.gradient, 2, 0))
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""Axes that are not perpendicular."""
+"""Sensors that are not perpendicular to each other."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class MisalignmentEffect(InstrumentEffect):
-    """One sensor sees a little of another component."""
+    """The sensor of one component picks up a small fraction of another component.
+
+    ``misalignment_zx`` is the fraction of Bx in the reading of the z sensor.
+    """
 
     title = "sensors that are not perpendicular"
     parameters = (Parameter("crosstalk", "rad", 2e-3),)
 
-    def __init__(self, seer: str, seen: str) -> None:
-        self.seer, self.seen = seer, seen
-        self.name = f"misalignment_{seer}{seen}"  # type: ignore[misc]
+    def __init__(self, sensor: str, component: str) -> None:
+        self.sensor, self.component = sensor, component
+        self.name = f"misalignment_{sensor}{component}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        seen = scene.field[:, COMPONENTS.index(self.seen)]
-        return np.asarray(seen[:, None] * along(self.seer, 1.0))[None]
+        picked_up = nominal.field[:, COMPONENTS.index(self.component)]
+        return np.asarray(picked_up[:, None] * along(self.sensor, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""
-        name = self.seer + self.seen
-        there = {str(key): value for key, value in instrument.crosstalk.items()}
-        return {"crosstalk": there | {name: there.get(name, 0.0) + values[0]}}
+        name = self.sensor + self.component
+        present = {str(key): value for key, value in instrument.crosstalk.items()}
+        return {"crosstalk": present | {name: present.get(name, 0.0) + values[0]}}
 
 
-EFFECTS = tuple(MisalignmentEffect(one, other) for one in COMPONENTS for other in COMPONENTS
-                if one != other)
+EFFECTS = tuple(MisalignmentEffect(sensor, component)
+                for sensor in COMPONENTS for component in COMPONENTS if sensor != component)

@@ -1,4 +1,4 @@
-"""Another magnet near by."""
+"""A neighbouring magnet of the same kind."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from halbach_fe.study.magnet import Neighbour
 from halbach_fe.study.model import Study
 
 GAPS_M = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
-"""Between the magnets."""
+"""Distances between the facing ends of the two magnets, one candidate place each."""
 
 STEP_M = 1e-4
-"""For the derivative."""
+"""Step of the finite difference with respect to the distance."""
 
 
 class NeighbourMagnetEffect(Effect):
-    """A magnet like this one on the same axis; the place says on which side and about how far away,
-    from which its distance and strength are refined.
+    """A magnet like this one stands on the same axis.
+
+    A place is the approximate position of its centre along z, on either side. The refinements
+    adjust its strength and its distance.
     """
 
     name = "neighbour_magnet"
@@ -31,8 +33,8 @@ class NeighbourMagnetEffect(Effect):
     kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
     refinements = (Parameter("stronger", "1", 0.5), Parameter("farther", "m", 0.05))
-    only = True
-    discrete = True
+    unique = True
+    applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
@@ -41,27 +43,28 @@ class NeighbourMagnetEffect(Effect):
         length = 2 * build_magnet(study).array_half_length
         return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return neighbour_field(scene.magnet, Neighbour(z_m=place.at_m[0]), scene.points,
+        return neighbour_field(nominal.magnet, Neighbour(z_m=place.at_m[0]), nominal.points,
                                order=4)[None]
 
-    def refine(self, scene: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""
         stronger, farther = values[1:]
-        here, beyond = (neighbour_field(scene.magnet, Neighbour(z_m=_middle(place, one)),
-                                        scene.points) for one in (farther, farther + STEP_M))
+        here, beyond = (neighbour_field(nominal.magnet, Neighbour(z_m=_centre(place, distance)),
+                                        nominal.points)
+                        for distance in (farther, farther + STEP_M))
         return np.array([here, (1 + stronger) * (beyond - here) / STEP_M])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         stronger, farther = values[1:] or (0.0, 0.0)
-        neighbour = Neighbour(z_m=_middle(place, farther), factor=1 + float(stronger))
+        neighbour = Neighbour(z_m=_centre(place, farther), factor=1 + float(stronger))
         return study.with_(external__neighbours=(*study.external.neighbours, neighbour))
 
 
-def _middle(place: Place, farther: float) -> float:
-    """Of the neighbour, in m along the axis."""
+def _centre(place: Place, farther: float) -> float:
+    """Return the z in m of the neighbour's centre, ``farther`` m beyond its place."""
     return float(place.at_m[0] + np.sign(place.at_m[0]) * farther)
 
 

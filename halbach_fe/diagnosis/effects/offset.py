@@ -1,4 +1,4 @@
-"""A sensor that shows a field where there is none."""
+"""Offset of a sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class OffsetEffect(InstrumentEffect):
-    """Zero of one axis."""
+    """The sensor of one component has a constant offset."""
 
     title = "zero of a sensor"
     parameters = (Parameter("offset", "T", 1e-4),)
@@ -24,9 +24,9 @@ class OffsetEffect(InstrumentEffect):
         self.axis = axis
         self.name = f"offset_{axis}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(np.ones_like(scene.field) * along(self.axis, 1.0))[None]
+        return np.asarray(np.ones_like(nominal.field) * along(self.axis, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""The planar Hall effect."""
+"""Planar Hall effect of a sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class PlanarHallEffect(InstrumentEffect):
-    """One axis sees the product of the other two components."""
+    """The reading of one sensor has an additional term in the product of the other components."""
 
     title = "planar Hall effect of a sensor"
     parameters = (Parameter("coefficient", "1/T", 5e-3),)
@@ -24,10 +24,10 @@ class PlanarHallEffect(InstrumentEffect):
         self.axis = axis
         self.name = f"planar_hall_{axis}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        one, other = (scene.field[:, j] for j in range(3) if COMPONENTS[j] != self.axis)
-        return np.asarray((one * other)[:, None] * along(self.axis, 1.0))[None]
+        first, second = (nominal.field[:, j] for j in range(3) if COMPONENTS[j] != self.axis)
+        return np.asarray((first * second)[:, None] * along(self.axis, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""A sensor with a quadratic term."""
+"""Quadratic non-linearity of a sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class QuadraticNonlinearityEffect(InstrumentEffect):
-    """One axis shows more by the square of what it sees."""
+    """The reading of one sensor has an additional term in the square of its field component."""
 
     title = "quadratic non-linearity of a sensor"
     parameters = (Parameter("coefficient", "1/T", 3e-3),)
@@ -24,9 +24,9 @@ class QuadraticNonlinearityEffect(InstrumentEffect):
         self.axis = axis
         self.name = f"quadratic_nonlinearity_{axis}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(scene.field**2 * along(self.axis, 1.0))[None]
+        return np.asarray(nominal.field**2 * along(self.axis, 1.0))[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

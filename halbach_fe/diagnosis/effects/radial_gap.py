@@ -1,4 +1,4 @@
-"""Blocks that stand too far out."""
+"""Blocks that are all too far from the axis."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from halbach_fe.study.model import Study
 
 
 class RadialGapEffect(Effect):
-    """Displacement of all blocks away from the axis."""
+    """All blocks are displaced radially outwards by the same distance."""
 
     name = "radial_gap"
     title = "common radial displacement of the blocks"
     kind = "field"
-    parameters = (Parameter("gap", "m", 2e-4, least=0.0),)  # inwards they would meet
+    parameters = (Parameter("gap", "m", 2e-4, minimum=0.0),)  # inwards the blocks would overlap
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        total = np.zeros_like(scene.points)
-        for number, block in enumerate(scene.blocks):
+        total = np.zeros_like(nominal.points)
+        for number, block in enumerate(nominal.blocks):
             outwards = block.middle * [1.0, 1.0, 0.0]
-            total += scene.moved(number, outwards / np.linalg.norm(outwards))
+            outwards /= np.linalg.norm(outwards)
+            total += nominal.block_translation_derivative(number, outwards)
         return total[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -1,4 +1,4 @@
-"""An arm that is too long."""
+"""Scale error of the mapper's radial distances."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from halbach_fe.study.measurement import Instrument
 
 
 class RadiusScaleEffect(InstrumentEffect):
-    """Relative error of the mapper's distances from the axis."""
+    """The mapper's distances from the axis have a relative error, as of an arm too long."""
 
     name = "radius_scale"
     title = "length of the mapper's arm"
     parameters = (Parameter("scale", "1", 5e-3),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return scene.displaced(scene.points * [1.0, 1.0, 0.0])[None]
+        return nominal.change_at_displaced_points(nominal.points * [1.0, 1.0, 0.0])[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

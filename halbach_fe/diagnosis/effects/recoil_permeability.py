@@ -1,4 +1,4 @@
-"""Blocks whose recoil permeability is another."""
+"""Blocks whose recoil permeability differs from the nominal one."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ from halbach_fe.study.model import Study
 
 
 class RecoilPermeabilityEffect(Effect):
-    """Of all blocks and all directions, or along the easy axis."""
+    """All blocks have another recoil permeability, and the same remanence.
+
+    It changes in all directions, or along the easy axis only if the study has a separate value
+    across the easy axis.
+    """
 
     name = "recoil_permeability"
     title = "recoil permeability of the blocks"
     kind = "field"
     parameters = (Parameter("difference", "1", 0.05),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        step = 0.02  # upwards: below 1 there is none
-        return ((scene.solve(self.apply(scene.study, place, [step])) - scene.solved) / step)[None]
+        step = 0.02  # upwards, since no recoil permeability is below 1
+        raised = nominal.solve(self.apply(nominal.study, place, [step]))
+        return ((raised - nominal.finite_element_field) / step)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

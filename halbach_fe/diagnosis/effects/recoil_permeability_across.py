@@ -1,4 +1,4 @@
-"""Blocks whose recoil permeability differs across the easy axis."""
+"""Blocks whose recoil permeability differs from the nominal one across the easy axis."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from halbach_fe.study.model import Study
 
 
 class RecoilPermeabilityAcrossEffect(RecoilPermeabilityEffect):
-    """Of all blocks, across their easy axes."""
+    """All blocks have another recoil permeability across their easy axes."""
 
     name = "recoil_permeability_across"
     title = "recoil permeability of the blocks across the easy axis"
@@ -18,8 +18,8 @@ class RecoilPermeabilityAcrossEffect(RecoilPermeabilityEffect):
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         array = study.array
-        there = array.recoil_permeability_across or array.recoil_permeability
-        return with_array(study, recoil_permeability_across=there + float(values[0]))
+        present = array.recoil_permeability_across or array.recoil_permeability
+        return with_array(study, recoil_permeability_across=present + float(values[0]))
 
 
 EFFECTS = (RecoilPermeabilityAcrossEffect(),)

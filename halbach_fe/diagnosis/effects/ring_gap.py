@@ -14,7 +14,7 @@ from halbach_fe.study.model import Study
 
 
 def _moves(rings: int, seam: int, ring: int) -> float:
-    """By how much of the gap above ring ``seam`` a ring moves."""
+    """Return the fraction of the gap above ring ``seam`` by which ring ``ring`` moves along z."""
     if 2 * seam == rings:
         return 0.5 if ring > seam else -0.5
     if 2 * seam > rings:
@@ -23,7 +23,11 @@ def _moves(rings: int, seam: int, ring: int) -> float:
 
 
 class RingGapEffect(Effect):
-    """A gap above a ring, which moves what is beyond it away from the magnet's middle."""
+    """A gap opens between the ring of the place and the next one at larger z.
+
+    The rings on the outer side of the gap move away from the magnet's centre; a gap in the middle
+    moves both halves by half of it.
+    """
 
     name = "ring_gap"
     title = "gap between two rings"
@@ -35,12 +39,12 @@ class RingGapEffect(Effect):
         rings = study.array.rings if study.dimension == 3 else 1
         return [Place(ring) for ring in range(1, rings)]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        total = np.zeros_like(scene.points)
-        for number, block in enumerate(scene.blocks):
-            total += scene.moved(number, np.array([0.0, 0.0, _moves(
-                scene.study.array.rings, place.ring, block.ring)]))
+        total = np.zeros_like(nominal.points)
+        for number, block in enumerate(nominal.blocks):
+            total += nominal.block_translation_derivative(number, np.array([0.0, 0.0, _moves(
+                nominal.study.array.rings, place.ring, block.ring)]))
         return total[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -1,4 +1,4 @@
-"""A ring that is off the axis."""
+"""A ring that is displaced across the axis."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from halbach_fe.study.model import Study
 
 
 class RingShiftedEffect(Effect):
-    """Displacement of one ring across the axis."""
+    """One ring is displaced along x and y."""
 
     name = "ring_shifted"
     title = "displacement of a ring across the axis"
@@ -32,9 +32,10 @@ class RingShiftedEffect(Effect):
         """See `Effect.places`."""
         return each_ring(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.array([sum(scene.moved(number, axis) for number in blocks_at(scene, place))
+        return np.array([sum(nominal.block_translation_derivative(number, axis)
+                             for number in blocks_at(nominal, place))
                          for axis in np.eye(3)[:2]])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -1,4 +1,4 @@
-"""A ring that is turned about the magnet's axis."""
+"""A ring that is rotated about the magnet's axis."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from halbach_fe.study.model import Study
 
 
 class RingTwistedEffect(Effect):
-    """Rotation of one ring about the magnet's axis."""
+    """One ring is rotated about the magnet's axis."""
 
     name = "ring_twisted"
     title = "rotation of a ring about the axis"
@@ -32,11 +32,11 @@ class RingTwistedEffect(Effect):
         """See `Effect.places`."""
         return each_ring(study)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         axis = np.array([0.0, 0.0, 1.0])
-        return np.asarray(sum(scene.turned(number, axis, np.zeros(3))
-                              for number in blocks_at(scene, place)))[None]
+        return np.asarray(sum(nominal.block_rotation_derivative(number, axis, np.zeros(3))
+                              for number in blocks_at(nominal, place)))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

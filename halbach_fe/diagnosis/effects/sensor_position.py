@@ -1,4 +1,4 @@
-"""A sensor that is not where the probe's middle is."""
+"""A sensor that is displaced from the probe's reference point."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from halbach_fe.study.types import COMPONENTS
 
 
 class SensorPositionEffect(InstrumentEffect):
-    """Position of one sensor from the probe's reference point."""
+    """The sensor of one component is displaced from the probe's reference point."""
 
     title = "position of a sensor in the probe"
     parameters = (
@@ -25,16 +25,16 @@ class SensorPositionEffect(InstrumentEffect):
         self.axis = axis
         self.name = f"sensor_position_{axis}"  # type: ignore[misc]
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        change = np.moveaxis(scene.gradient, 2, 0)  # by direction of the displacement
+        change = np.moveaxis(nominal.gradient, 2, 0)  # first axis: direction of displacement
         return np.asarray(change * along(self.axis, 1.0))
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""
-        positions = tuple(added(one, values) if name == self.axis else one
-                          for name, one in zip(COMPONENTS, instrument.sensor_position_m,
-                                               strict=True))
+        positions = tuple(added(position, values) if name == self.axis else position
+                          for name, position in zip(COMPONENTS, instrument.sensor_position_m,
+                                                    strict=True))
         return {"sensor_position_m": positions}
 
 

@@ -1,4 +1,4 @@
-"""A magnet warmer or colder than its reference."""
+"""A magnet that is warmer or colder than its reference temperature."""
 
 from __future__ import annotations
 
@@ -11,25 +11,28 @@ from halbach_fe.study.magnet import BlockException
 from halbach_fe.study.model import Study
 
 TYPICAL_COEFFICIENT_PER_K = -1e-3
-"""Of the remanence of NdFeB; SmCo has a third of it."""
+"""Temperature coefficient of the remanence of NdFeB; that of SmCo is about a third of it."""
 
 
 def coefficient(study: Study) -> float:
-    """Relative change of the remanence per kelvin."""
+    """Return the relative change of the remanence per kelvin.
+
+    That is the coefficient of the study's prior, or a typical one if the study has none.
+    """
     return study.prior.temperature_coefficient_per_K or TYPICAL_COEFFICIENT_PER_K
 
 
 class TemperatureEffect(Effect):
-    """Temperature of the whole magnet, by the coefficient of the study's prior."""
+    """The temperature of the whole magnet differs, which scales all magnetizations alike."""
 
     name = "temperature"
     title = "temperature of the magnet"
     kind = "field"
     parameters = (Parameter("difference", "K", 10.0),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return coefficient(scene.study) * scene.block_fields.sum(axis=0)[None]
+        return coefficient(nominal.study) * nominal.block_fields.sum(axis=0)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -1,4 +1,4 @@
-"""A magnet warmer on one side."""
+"""A magnet that is warmer on one side."""
 
 from __future__ import annotations
 
@@ -16,27 +16,30 @@ from halbach_fe.study.model import Study
 
 
 class TemperatureGradientEffect(Effect):
-    """Linear temperature across the magnet, from the middle to the outer radius."""
+    """The temperature varies linearly across the magnet.
+
+    The parameters are the differences between the axis and the outer radius, along x and y.
+    """
 
     name = "temperature_gradient"
     title = "temperature gradient across the magnet"
     kind = "field"
     parameters = (Parameter("x", "K", 3.0), Parameter("y", "K", 3.0),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        place_of = np.array([block.middle[:2] for block in scene.blocks])
-        weights = coefficient(scene.study) * place_of / scene.study.array.outer_radius_m
-        return np.einsum("bk,bnc->knc", weights, scene.block_fields)
+        centres = np.array([block.middle[:2] for block in nominal.blocks])
+        weights = coefficient(nominal.study) * centres / nominal.study.array.outer_radius_m
+        return np.einsum("bk,bnc->knc", weights, nominal.block_fields)
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        found = []
+        exceptions = []
         for slot in range(1, study.array.blocks_per_ring + 1):
             middle = build_magnet(study).blocks[slot - 1].middle[:2] / study.array.outer_radius_m
-            found.append(BlockException(slot=slot, magnetization_factor=float(
+            exceptions.append(BlockException(slot=slot, magnetization_factor=float(
                 1.0 + coefficient(study) * (middle @ np.asarray(values)))))
-        return with_exceptions(study, found)
+        return with_exceptions(study, exceptions)
 
 
 EFFECTS = (TemperatureGradientEffect(),)

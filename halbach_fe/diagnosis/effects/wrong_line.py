@@ -1,4 +1,4 @@
-"""A line of measurement, or a whole map, elsewhere than it says."""
+"""A line of measurement, or a whole map, that was taken far from where it claims."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from halbach_fe.study.measurement import Instrument
 
 
 class WrongLineEffect(InstrumentEffect):
-    """The displacement of `mapper_translation`, but no small one."""
+    """The mapper is displaced by centimetres, not by the millimetres of `mapper_translation`."""
 
     name = "wrong_line"
     title = "wrong line of measurement"
     parameters = (
         Parameter("x", "m", 2e-2), Parameter("y", "m", 2e-2), Parameter("z", "m", 2e-2))
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return np.asarray(np.moveaxis(scene.gradient, 2, 0))
+        return np.asarray(np.moveaxis(nominal.gradient, 2, 0))
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""A scale along z that is off."""
+"""Scale error of the mapper along z."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from halbach_fe.study.measurement import Instrument
 
 
 class ZScaleEffect(InstrumentEffect):
-    """Relative error of the mapper's distances along z."""
+    """The mapper's distances along z have a relative error."""
 
     name = "z_scale"
     title = "scale of the mapper along z"
     parameters = (Parameter("scale", "1", 5e-4),)
 
-    def signature(self, scene: NominalFields, place: Place) -> Floats:
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return scene.displaced(scene.points * [0.0, 0.0, 1.0])[None]
+        return nominal.change_at_displaced_points(nominal.points * [0.0, 0.0, 1.0])[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

@@ -1,4 +1,4 @@
-"""Maps in the formats of others: read as they come, and written for other programs."""
+"""Import of field maps in foreign formats, and export to the formats of other programs."""
 
 from __future__ import annotations
 
@@ -13,42 +13,56 @@ from halbach_fe.core.errors import OutputError, must_be, printable
 from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import check_readings, write_map
 from halbach_fe.measurement.formats import bdsim, columns, comsol, geant4, openpmd, opera
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
-from halbach_fe.measurement.formats.table import ForeignTable, Imported, to_map
+from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of
 
-READERS: dict[str, Callable[[bytes, Declared, str], ForeignTable]] = {
+READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = {
     "columns": columns.read, "opera": opera.read, "comsol": comsol.read, "openpmd": openpmd.read}
+"""Readers of foreign formats by name; each gets the file's content, the user's declarations and the
+file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
     "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim.lines(grid)),
     "geant4": lambda grid: _joined(geant4.lines(grid))}
+"""Writers of the formats that need a regular grid."""
 SUFFIXES = {"csv": ".csv", "vtu": ".vtu"}
+"""Suffixes of the formats that hold any points."""
 WRITERS = (*GRIDS, *SUFFIXES)
+"""Names of the formats to which a map can be exported."""
 MAX_NAME = 255
-"""Characters of a file's name."""
+"""Largest number of characters of a file name in the attributes of an imported map."""
 
 
 @dataclass(frozen=True)
 class ImportedFile:
-    """A map that was imported, and in which format it came."""
+    """An imported map and the name of the format of its file."""
 
-    imported: Imported
+    imported: ImportedMap
     format: str
 
     @property
     def data(self) -> xr.Dataset:
-        """The map."""
+        """The map, in m and T along the magnet's axes."""
         return self.imported.data
 
 
-def import_map(path: Path, declared: Declared, name: str = "") -> ImportedFile:
-    """Read a map of another format, which its structure tells if ``name`` does not.
+def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> ImportedFile:
+    """Read a map in a foreign format.
+
+    Parameters
+    ----------
+    path : Path
+    declared : DeclaredFormat
+        Statements of the user about the file.
+    name : str
+        Name of the format, one of `READERS`; by default it is recognized from the content.
 
     Raises
     ------
     MeasurementError
-        With one sentence that names the file, and what to do.
+        If the file cannot be read as a map. The message names the file, and says how to correct it
+        or which options to add.
     """
     where = f"map {path}"
     raw = file_bytes(path, where)
@@ -61,8 +75,8 @@ def import_map(path: Path, declared: Declared, name: str = "") -> ImportedFile:
     return ImportedFile(found, name)
 
 
-def format_of(raw: bytes, declared: Declared, where: str) -> str:
-    """Which of `READERS` a file is for, by how it begins."""
+def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
+    """Return the name in `READERS` of the format of a file, recognized by its first lines."""
     if raw.startswith(openpmd.SIGNATURE):
         return "openpmd"
     lines = lines_of(raw, declared, where)
@@ -72,14 +86,16 @@ def format_of(raw: bytes, declared: Declared, where: str) -> str:
 
 
 def export_map(data: xr.Dataset, name: str, path: Path) -> None:
-    """Write a map in one of `WRITERS`; the file appears whole or not at all.
+    """Write a map in one of the formats `WRITERS`.
+
+    The file is written atomically: it is either complete, or not there.
 
     Raises
     ------
     MeasurementError
-        If the format needs a regular grid and the map's points make none.
+        If the format needs a regular grid and the map's points do not form one.
     OutputError
-        If the file cannot be written, or has a suffix of another format.
+        If the file cannot be written, or has the suffix of another format.
     """
     if name in SUFFIXES:
         if path.suffix != SUFFIXES[name]:
@@ -94,4 +110,5 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
 
 
 def _joined(lines: Iterable[str]) -> bytes:
+    """Return lines of text as the content of a file."""
     return "\n".join([*lines, ""]).encode()

@@ -1,8 +1,9 @@
-"""Field maps for BDSIM, three-dimensional (``bdsim3d``).
+"""Export of three-dimensional field maps for BDSIM (``bdsim3d``).
 
-Keys ``nx> 5``, ``xmin> -2.0`` ..., a line ``! X Y Z Fx Fy Fz``, then rows in cm and T; x changes
-fastest, which is BDSIM's ``loopOrder> xyzt``. Source: BDSIM's manual, Field Map File Formats; its
-loader takes the grid from the keys and the values from their order alone.
+The file has keys ``nx> 5``, ``xmin> -2.0`` ..., a line ``! X Y Z Fx Fy Fz``, and rows in cm and T.
+The x coordinate changes fastest, which is BDSIM's ``loopOrder> xyzt``. BDSIM's loader takes the
+grid from the keys and assigns the values by the order of the rows. Source: BDSIM's manual, Field
+Map File Formats.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.study.types import COMPONENTS
 
 PER_M = 100.0
+"""Centimetres per metre."""
 
 
 def lines(grid: Grid) -> Iterator[str]:
-    """Lines of the file."""
+    """Yield the lines of the file."""
     for name, axis in zip(COMPONENTS, grid.axes, strict=True):
         yield f"n{name}> {len(axis)}"
         yield f"{name}min> {PER_M * float(axis[0])!r}"

@@ -1,8 +1,8 @@
-"""Tables of columns: commas, semicolons, tabs or spaces, with a header or without.
+"""Import of text tables with commas, semicolons, tabs or spaces, with or without a header.
 
-Lines before the first one of numbers, or mostly numbers, are preface. Its header is the last line
-there, commented or not, that has a name for each column and says what two of them are; a line of
-units may follow it.
+All lines before the first line of numbers, or mostly numbers, form the preface. The header is the
+last line of the preface, commented or not, that has a name for each column and of which at least
+two names are recognized. A line of units may follow the header.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import names
-from halbach_fe.measurement.formats.declared import Declared
-from halbach_fe.measurement.formats.names import Name
-from halbach_fe.measurement.formats.table import ForeignTable, named
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.names import ColumnName
+from halbach_fe.measurement.formats.table import ForeignTable, with_units
 from halbach_fe.measurement.formats.text import (
     Line,
     cells_of,
@@ -27,10 +27,11 @@ from halbach_fe.measurement.formats.text import (
     uncommented,
 )
 
-RECOGNIZED = 2  # names; fewer may be words of a sentence
+RECOGNIZED = 2
+"""Smallest number of recognized names in a header. Fewer may be words of a sentence."""
 
 
-def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
+def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns.
 
     Raises
@@ -41,8 +42,8 @@ def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
     return read_lines(lines_of(raw, declared, where), declared, where)
 
 
-def read_lines(lines: Sequence[Line], declared: Declared, where: str) -> ForeignTable:
-    """As `read`, from lines."""
+def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read a table of columns from lines, as `read` does."""
     start = _first_numbers(lines, declared, where)
     delimiter = delimiter_of(lines[start][1], declared)
     count = len(cells_of(lines[start][1], delimiter))
@@ -52,9 +53,14 @@ def read_lines(lines: Sequence[Line], declared: Declared, where: str) -> Foreign
     return ForeignTable(columns, values, where, comments=comments_of(lines[:start]), texts=texts)
 
 
-def _first_numbers(lines: Sequence[Line], declared: Declared, where: str) -> int:
-    """Index of the first line of numbers, or mostly numbers if the next one is like it."""
-    before: tuple[int, int] | None = None  # a line of mostly numbers, and how many cells it has
+def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> int:
+    """Return the index of the first row of the table.
+
+    The first row contains only numbers, or mostly numbers if the next line does too and has as many
+    cells.
+    """
+    # index and number of cells of the previous line, if it contains mostly numbers
+    before: tuple[int, int] | None = None
     for index, (_, line) in enumerate(lines):
         if is_comment(line):
             continue
@@ -71,9 +77,12 @@ def _first_numbers(lines: Sequence[Line], declared: Declared, where: str) -> int
 
 
 def _refuse_lost_rows(
-    preface: Sequence[Line], count: int, delimiter: str | None, declared: Declared, where: str
+    preface: Sequence[Line], count: int, delimiter: str | None, declared: DeclaredFormat, where: str
 ) -> None:
-    """A line as long as a row, with some numbers, may be a reading and not a preface."""
+    """Raise MeasurementError for a line of the preface that may be a reading.
+
+    Such a line is not a comment, has as many cells as a row, and contains a number.
+    """
     for position, line in preface:
         cells = cells_of(line, delimiter)
         if not is_comment(line) and len(cells) == count and numbers_among(
@@ -85,10 +94,10 @@ def _refuse_lost_rows(
 
 def _header(
     preface: Sequence[Line], count: int, delimiter: str | None, where: str
-) -> tuple[Name, ...]:
-    """Names of the columns; empty ones if nothing names them."""
+) -> tuple[ColumnName, ...]:
+    """Return the names of the columns; they are empty if there is no header."""
     below: list[str] = []
-    plain: tuple[Name, ...] = ()
+    plain: tuple[ColumnName, ...] = ()
     for number, line in reversed(preface):
         for cells in _splits(line, delimiter):
             columns = tuple(names.parse(cell) for cell in cells)
@@ -97,23 +106,26 @@ def _header(
                 below = cells
                 break
             if len(cells) == count and known >= RECOGNIZED:
-                return named(columns, below) if below else columns
+                return with_units(columns, below) if below else columns
             if len(cells) == count and not plain and not is_comment(line):
                 plain = columns
         else:
             _refuse_other_length(line, number, count, delimiter, where)
-    return plain or (Name(""),) * count
+    return plain or (ColumnName(""),) * count
 
 
 def _splits(line: str, delimiter: str | None) -> list[list[str]]:
-    """Ways to cut a line into names; a header may be spaced where its rows have commas."""
+    """Return the possible splits of a line into names.
+
+    A header may be separated by spaces even if its rows are separated by commas.
+    """
     text = uncommented(line) if is_comment(line) else line.strip()
     spaced = _spaced(text)
     return [spaced] if delimiter is None else [cells_of(text, delimiter), spaced]
 
 
 def _spaced(text: str) -> list[str]:
-    """Names between spaces; a bracket with a unit is part of the name before it."""
+    """Split at spaces; a bracket with a unit belongs to the name before it."""
     found: list[str] = []
     depth = 0
     for word in text.split():
@@ -128,7 +140,7 @@ def _spaced(text: str) -> list[str]:
 def _refuse_other_length(
     line: str, number: int, count: int, delimiter: str | None, where: str
 ) -> None:
-    """A line that is clearly a header, but of another table, is no preface to pass over."""
+    """Raise MeasurementError for a header with another number of names than there are columns."""
     for cells in _splits(line, delimiter):
         known = [names.parse(cell).quantity for cell in cells]
         if not is_comment(line) and sum(map(bool, known)) > RECOGNIZED and len(cells) != count:

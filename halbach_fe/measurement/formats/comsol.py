@@ -1,11 +1,12 @@
-"""Text that COMSOL Multiphysics exports: spreadsheets, grids and sections.
+"""Import of text files that COMSOL Multiphysics exports: spreadsheets, grids and sections.
 
-All begin with lines ``% Key: value`` (Model, Version, Dimension, Nodes, Length unit ...). In a
-spreadsheet the last of them names the columns, ``% x y z mf.Bx (T)``. A grid has its coordinates
-below ``% Grid``, a row each for x, y and z, and below each ``% Data`` the values of an expression:
-along x in a row, rows by y, then by z. Sections have ``% Coordinates``, ``% Elements`` and
-``% Data``, in the order of the coordinates. The expression stands in brackets after Data or in the
-comment below it. Source: COMSOL's Programming Reference Manual, Data Formats, and files.
+All three begin with lines ``% Key: value`` (Model, Version, Dimension, Nodes, Length unit ...). In
+a spreadsheet the last of these comments names the columns, ``% x y z mf.Bx (T)``. A grid has three
+rows below ``% Grid``, the coordinates along x, y and z; below each ``% Data`` are the values of an
+expression, where a row runs along x, and the rows are ordered by y, then by z. A file of sections
+has the parts ``% Coordinates``, ``% Elements`` and ``% Data``, with the values in the order of the
+coordinates. The expression is in brackets after Data, or in the comment below it. Sources: COMSOL's
+Programming Reference Manual, Data Formats, and exported files.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import columns, names
-from halbach_fe.measurement.formats.declared import Declared
-from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
     Line,
@@ -35,25 +36,26 @@ from halbach_fe.measurement.formats.text import (
 KEY = re.compile(r"(Model|Version|Date|Dimension|Nodes|Expressions|Description|Length unit)"
                  r"\s*[:,]\s*(.*)")
 SECTION = re.compile(r"(Grid|Coordinates|Elements|Data)\b\s*(?:\((.*)\))?\s*")
-MAX_LINE = 2000  # of comments that are looked into
+MAX_LINE = 2000
+"""Number of characters of a comment that are searched."""
 
 
 def is_comsol(lines: Sequence[Line]) -> bool:
-    """Whether lines begin as such a file does."""
+    """Return whether the first lines are those of a COMSOL export."""
     said = [found[1] for _, line in lines[:20] if line.startswith("%")
             and (found := KEY.match(uncommented(line)[:MAX_LINE]))]
     return lines[0][1].startswith("%") and len({"Dimension", "Nodes", "Expressions", "Version",
                                                 "Length unit"} & set(said)) > 1
 
 
-def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
-    """Read any of the three.
+def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read a spreadsheet, a grid or a file of sections.
 
     Raises
     ------
     MeasurementError
-        If it holds several solutions, other than three coordinates in a grid or sections, or not
-        as many points as it says.
+        If the file holds several solutions, a grid or sections without exactly three coordinates,
+        or another number of points than it states.
     """
     lines = lines_of(raw, declared, where)
     keys = {found[1]: found[2].strip() for _, line in lines if line.startswith("%")
@@ -78,7 +80,7 @@ def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
 
 
 def _refuse_solutions(lines: Sequence[Line], where: str) -> None:
-    """Columns ``mf.Bx (T) @ t=0`` or ``@ freq=50`` are no static field."""
+    """Raise MeasurementError for columns of several solutions, such as ``mf.Bx (T) @ t=0``."""
     for position, line in lines:
         if line.startswith("%") and re.search(r"@ ?[\w.]{1,40} ?=", line[:MAX_LINE]):
             raise MeasurementError(must_be(
@@ -87,7 +89,7 @@ def _refuse_solutions(lines: Sequence[Line], where: str) -> None:
 
 
 def _sections(lines: Sequence[Line]) -> list[tuple[str, str, list[Line]]]:
-    """Kind, expression and lines of each section; none in a spreadsheet."""
+    """Return kind, expression and lines of each section; a spreadsheet has no sections."""
     found: list[tuple[str, str, list[Line]]] = []
     for position, line in lines:
         if not line.startswith("%"):
@@ -101,10 +103,12 @@ def _sections(lines: Sequence[Line]) -> list[tuple[str, str, list[Line]]]:
 
 
 def _grid_points(
-    lines: Sequence[Line], limit: int, declared: Declared, where: str
+    lines: Sequence[Line], limit: int, declared: DeclaredFormat, where: str
 ) -> Floats:
-    """Points (n, 3) of the rows of coordinates; x changes fastest. A file has fewer points than
-    characters, ``limit``, whatever its rows promise.
+    """Return the points (n, 3) of a grid from its rows of coordinates; x changes fastest.
+
+    ``limit`` is the number of characters of the file. A grid with more points is refused before
+    memory is allocated for it, since the file cannot hold their values.
     """
     axes = [_values([line], declared, where) for line in lines]
     if len(axes) != 3:
@@ -118,8 +122,9 @@ def _grid_points(
 
 
 def _listed_points(
-    lines: Sequence[Line], limit: int, declared: Declared, where: str
+    lines: Sequence[Line], limit: int, declared: DeclaredFormat, where: str
 ) -> Floats:
+    """Return the points (n, 3) that are listed in lines of three coordinates."""
     if not lines:
         raise _not_three(where, "none")
     count = len(_values(lines[:1], declared, where))
@@ -133,14 +138,17 @@ def _listed_points(
 
 
 def _not_three(where: str, received: str) -> MeasurementError:
+    """Return the error for points that have not exactly three coordinates."""
     return MeasurementError(must_be("coordinates", where, "x, y and z", received,
                                     "Export the spreadsheet format, which names its columns."))
 
 
 def _with_data(
-    points: Floats, sections: Sequence[tuple[str, str, list[Line]]], declared: Declared, where: str
+    points: Floats, sections: Sequence[tuple[str, str, list[Line]]], declared: DeclaredFormat,
+    where: str
 ) -> ForeignTable:
-    found = [Name(axis, axis) for axis in ("x", "y", "z")]
+    """Return the table of the points and of the values in all sections of data."""
+    found = [ColumnName(axis, axis) for axis in ("x", "y", "z")]
     values = list(points.T)
     for kind, expression, lines in sections[1:]:
         if kind != "Data":
@@ -155,8 +163,8 @@ def _with_data(
     return ForeignTable(tuple(found), np.column_stack(values), where)
 
 
-def _values(lines: Sequence[Line], declared: Declared, where: str) -> Floats:
-    """All numbers of some lines, in their order."""
+def _values(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> Floats:
+    """Return all numbers of some lines, in their order."""
     found: list[float] = []
     for position, line in lines:
         delimiter = delimiter_of(line, declared)

@@ -1,4 +1,4 @@
-"""What a user says of a file that does not say it itself."""
+"""Statements of the user about a file of another program that does not contain them itself."""
 
 from __future__ import annotations
 
@@ -6,25 +6,28 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Declared:
-    """Each is empty if the user says nothing; what file and user both say must agree.
+class DeclaredFormat:
+    """Statements of the user about the format of a file.
+
+    An empty value states nothing. A statement must agree with the file if the file contains the
+    same information.
 
     Attributes
     ----------
     length_unit, field_unit, angle_unit : str
-        Of all columns of the kind.
+        Unit of all columns of this kind.
     columns : tuple of str
-        What each column is, ``-`` for one to leave out.
+        Name of each column; ``-`` for a column to ignore.
     component : str
-        x, y or z: of a column that is just B.
+        Component x, y or z of a column that is named just B.
     at : mapping of str to float, in m
-        Coordinates that the file leaves out, since they are the same everywhere.
+        Constant coordinates, for which the file has no column.
     origin_m : tuple of float or None
-        Where the origin of the file is, along the magnet's axes.
+        Position of the file's origin, in m along the magnet's axes.
     decimal_comma : bool
-        Whether 0,5 is one half.
+        Whether numbers have a decimal comma (0,5 is one half).
     encoding : str
-        Of text.
+        Encoding of a text file.
     """
 
     length_unit: str = ""

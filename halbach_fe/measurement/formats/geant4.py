@@ -1,10 +1,10 @@
-"""Field maps for Geant4's PurgMagTabulatedField3D (examples/advanced/purging_magnet).
+"""Export of field maps for Geant4's PurgMagTabulatedField3D (examples/advanced/purging_magnet).
 
-A table of Opera in metres and tesla: a blank line, the three counts, a line for each column, and
-0; z changes fastest. The reader ends the header at the first line whose second character is 0,
-reads lines into 256 characters, and wants a seventh column, the permeability, which it ignores: it
-is that of vacuum everywhere. Units stand in the header for other readers. Source: its .cc file
-and PurgMag3D.TABLE.
+The file is an Opera table in metres and tesla: a blank line, the three counts, a line for each
+column, a line with 0, and rows in which z changes fastest. Geant4's reader ends the header at the
+first line whose second character is 0, and reads lines into a buffer of 256 characters. It expects
+a seventh column, the permeability, but ignores it; the export writes that of vacuum. The units in
+the header are for other readers. Source: the .cc file of this class, and PurgMag3D.TABLE.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ HEADER = (" 1 X [METRE]", " 2 Y [METRE]", " 3 Z [METRE]", " 4 BX [TESLA]", " 5 B
 
 
 def lines(grid: Grid) -> Iterator[str]:
-    """Lines of the file."""
+    """Yield the lines of the file."""
     yield ""
     nx, ny, nz = grid.shape
-    yield f" {nx} {ny} {nz} "  # without the last space the reader would look at an old line
+    yield f" {nx} {ny} {nz} "  # without the last space the reader would parse the previous line
     yield from HEADER
     xs, ys, zs = (axis.tolist() for axis in grid.axes)
     for i, x in enumerate(xs):

@@ -1,4 +1,4 @@
-"""Maps on regular grids, which grid formats need."""
+"""Regular grids of points, which some export formats need."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from halbach_fe.measurement.field_map import points_of
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3
-"""Of a step. Maps have rounded coordinates (1 um where steps are mm), and a point that is off by
-so much changes by as little of the difference to its neighbour, which is less than what linear
-interpolation between them errs by."""
+"""Largest deviation of a coordinate from the regular grid, relative to the grid step. Coordinates
+of maps are rounded (for example to 1 um with steps of 1 mm). The field error of such a deviation is
+1e-3 of the difference between neighbouring points, less than the error of the linear interpolation
+between them."""
 
 HINT = ('A study with observation positions kind = "grid" makes one (start_m, end_m, count), and '
         "halbach-fe solve its map.")
@@ -24,12 +25,12 @@ HINT = ('A study with observation positions kind = "grid" makes one (start_m, en
 
 @dataclass(frozen=True)
 class Grid:
-    """B on a regular grid.
+    """B on a regular grid of points.
 
     Attributes
     ----------
     axes : tuple of three ndarray, in m
-        Equally spaced coordinates along x, y and z, rising.
+        Equally spaced, increasing coordinates along x, y and z.
     field : ndarray, shape (nx, ny, nz, 3), in T
     """
 
@@ -38,23 +39,23 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Points along x, y and z."""
+        """Numbers of points along x, y and z."""
         return len(self.axes[0]), len(self.axes[1]), len(self.axes[2])
 
     @property
     def spacing(self) -> Floats:
-        """Steps along x, y and z (3,) in m."""
+        """Grid steps (3,) in m along x, y and z."""
         return np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in self.axes])
 
 
 def grid_of(data: xr.Dataset, where: str) -> Grid:
-    """The grid that a map's points make, in whatever order they come.
+    """Return the grid that the points of a map form; they may come in any order.
 
     Raises
     ------
     MeasurementError
-        If an axis has one coordinate only, or irregular ones; if points are missing or repeated;
-        if a component was not measured somewhere.
+        If an axis has a single coordinate or unequal steps, if points are missing or repeated, or
+        if a component was not measured at a point.
     """
     points, values = points_of(data), data["B_T"].values
     if np.isnan(values).any():
@@ -78,7 +79,7 @@ def grid_of(data: xr.Dataset, where: str) -> Grid:
 
 
 def _axis(values: Floats, name: str, where: str) -> tuple[Floats, NDArray[np.intp]]:
-    """Equally spaced coordinates and which of them each value is."""
+    """Return equally spaced coordinates, and the index of each value in them."""
     ordered = np.sort(values)
     gaps = np.diff(ordered)
     widest = gaps.max(initial=0.0)
@@ -86,7 +87,7 @@ def _axis(values: Floats, name: str, where: str) -> tuple[Floats, NDArray[np.int
         raise MeasurementError(must_be(f"{name} of the points", where,
                                        "of at least two different values, since programs "
                                        "interpolate between them", f"{values[0]:g} m alone", HINT))
-    # on a regular grid all gaps are a step or rounding
+    # on a regular grid each gap is either a step or rounding
     count = 1 + int((gaps > widest / 2).sum())
     axis = np.linspace(ordered[0], ordered[-1], count)
     step = (axis[-1] - axis[0]) / (count - 1)

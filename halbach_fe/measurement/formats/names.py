@@ -1,15 +1,16 @@
-"""What a column is, by its name: ``X [mm]``, ``x(mm)``, ``Bx/mT``, ``Bx_T``, ``mf.Bx (T)``."""
+"""Quantity and unit of a column from its name: ``X [mm]``, ``x(mm)``, ``Bx/mT``, ``mf.Bx (T)``."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
 
-from halbach_fe.measurement.formats.units import is_silent, symbol
+from halbach_fe.measurement.formats.units import states_no_unit, unit_symbol
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
 KNOWN = (*POSITIONS, *FIELDS, "B")
+"""Quantities of columns; B is a single component, or the magnitude beside its components."""
 
 ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
@@ -18,40 +19,51 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
 
 MAX_NAME = 60
 BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*")
-PREFIX = re.compile(r"[a-z]\w*\.")  # mf.Bx; of -mf.Bx the sign stays, and it is no Bx
+PREFIX = re.compile(r"[a-z]\w*\.")  # of mf.Bx; -mf.Bx keeps its sign and is not recognized as Bx
 
 
 @dataclass(frozen=True)
-class Name:
-    """A column: as the file names it, the quantity (of `KNOWN`, or nothing) and the unit's text."""
+class ColumnName:
+    """The name of a column.
+
+    Attributes
+    ----------
+    text : str
+        Name as the file spells it.
+    quantity : str
+        One of `KNOWN`; empty if the name is not recognized.
+    unit : str
+        Text of the unit as the file spells it; may be empty.
+    """
 
     text: str
     quantity: str = ""
     unit: str = ""
 
 
-def parse(text: str) -> Name:
-    """Tell quantity and unit of a name."""
+def parse(text: str) -> ColumnName:
+    """Return quantity and unit of the name of a column."""
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
-        return Name(f"{text[:MAX_NAME]}...")
+        return ColumnName(f"{text[:MAX_NAME]}...")
     base, unit = _split(text)
     key = re.sub(r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
-    return Name(text, ALIASES.get(key, ""), unit.strip())
+    return ColumnName(text, ALIASES.get(key, ""), unit.strip())
 
 
 def _split(text: str) -> tuple[str, str]:
+    """Split a name into the quantity and the unit, which is empty if the name has none."""
     if found := BRACKETS.fullmatch(text):
         return found[1], found[2]
     for mark in ("/", "_", ","):
         base, _, unit = text.rpartition(mark)
-        if base and symbol(unit):
+        if base and unit_symbol(unit):
             return base, unit
     return text, ""
 
 
 def is_units(cells: list[str]) -> bool:
-    """Whether a line has units and nothing else, as some have below their header."""
+    """Return whether all cells of a line are units, as in the line below some headers."""
     units = [cell.strip().strip("[]()") for cell in cells]
-    return any(symbol(unit) for unit in units) and all(
-        symbol(unit) or is_silent(unit) for unit in units)
+    return any(unit_symbol(unit) for unit in units) and all(
+        unit_symbol(unit) or states_no_unit(unit) for unit in units)

@@ -1,10 +1,11 @@
-"""Static magnetic field meshes of openPMD-beamphysics, in HDF5.
+"""Import and export of static magnetic field meshes of openPMD-beamphysics, in HDF5.
 
-Source: openPMD-standard, EXT_BeamPhysics, External Mesh Fields, and the package
-openpmd-beamphysics where that is silent: `axisLabels` is the order of the axes of the data (older
-files: `gridDataOrder` F, the reverse), and `gridSize`, `gridSpacing`, `gridOriginOffset` and
-`gridLowerBound` are of x, y, z whatever that order. Point i of an axis is at gridOriginOffset +
-(gridLowerBound + i) gridSpacing from the anchor. A component that is not in the file is zero.
+Sources: openPMD-standard, EXT_BeamPhysics, External Mesh Fields; and, where the standard leaves a
+point open, the package openpmd-beamphysics. `axisLabels` is the order of the axes of the data (in
+older files `gridDataOrder` F means the reversed order); `gridSize`, `gridSpacing`,
+`gridOriginOffset` and `gridLowerBound` are always in the order x, y, z. Point i of an axis is at
+gridOriginOffset + (gridLowerBound + i) gridSpacing from the anchor. A component that is not in the
+file is zero.
 """
 
 from __future__ import annotations
@@ -19,27 +20,29 @@ import numpy as np
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
-from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.study.types import COMPONENTS
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file."""
 TESLA = (0.0, 1.0, -2.0, -1.0, 0.0, 0.0, 0.0)
-"""Powers of m, kg, s, A, K, mol and cd."""
+"""Unit dimension of a flux density: powers of m, kg, s, A, K, mol and cd."""
 MAX_POINTS = 10_000_000
-"""A small file can promise any number."""
+"""Largest number of points that is read. A small file may state any number, for which memory would
+be allocated."""
 PATH = "/ExternalFieldMesh/%T/"
 
 
-def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
-    """Read the one field mesh of a file.
+def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read the single field mesh of a file.
 
     Raises
     ------
     MeasurementError
-        If there is none or more than one, or it is none of a static magnetic field on a
+        If the file has no mesh or several, or the mesh is not that of a static magnetic field on a
         rectangular grid.
     """
     try:
@@ -47,13 +50,13 @@ def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
             return _table(_only_mesh(file, where), where)
     except MeasurementError:
         raise
-    except Exception as error:  # h5py raises whatever a damaged file makes of it
+    except Exception as error:  # a damaged file makes h5py raise exceptions of any type
         raise MeasurementError(must_be("content", where, "a whole openPMD file",
                                        f"'{(str(error).splitlines() or [''])[0][:200]}'")) from None
 
 
 def content(grid: Grid) -> bytes:
-    """A file with a grid's field, anchored at the centre of the magnet."""
+    """Return the content of a file with the field of a grid, anchored at the magnet's centre."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         _describe(file, {"dataType": "openPMD", "openPMD": "2.0.0",
@@ -72,14 +75,14 @@ def content(grid: Grid) -> bytes:
 
 
 def _describe(node: Any, attributes: Mapping[str, Any]) -> None:
-    """Set attributes; text as bytes, as openpmd-beamphysics and Bmad write it."""
+    """Set attributes; text is stored as bytes, as openpmd-beamphysics and Bmad do."""
     for key, value in attributes.items():
         array = np.asarray(value)
         node.attrs[key] = array.astype(np.bytes_) if array.dtype.kind == "U" else value
 
 
 def _only_mesh(file: Any, where: str) -> Any:
-    """The group of the one mesh."""
+    """Return the group of the single field mesh."""
     if "externalFieldPath" not in file.attrs:
         raise MeasurementError(must_be("attribute", where, "`externalFieldPath`, of a field mesh "
                                        "of openPMD-beamphysics", "a file without it"))
@@ -92,6 +95,7 @@ def _only_mesh(file: Any, where: str) -> Any:
 
 
 def _table(mesh: Any, where: str) -> ForeignTable:
+    """Return positions and field of a mesh as a table."""
     attributes = {key: _text(value) for key, value in mesh.attrs.items()}
     _check(attributes, where)
     size = [int(count) for count in _vector(attributes, "gridSize", where)]
@@ -109,15 +113,15 @@ def _table(mesh: Any, where: str) -> ForeignTable:
         scale * _component(mesh["magneticField"], name, labels, size, where).ravel()
         for name in COMPONENTS])
     anchor = str(attributes["eleAnchorPt"])
-    columns = [Name(name, name, "m") for name in COMPONENTS] + [
-        Name(f"B{name}", f"B{name}", "T") for name in COMPONENTS]
+    columns = [ColumnName(name, name, "m") for name in COMPONENTS] + [
+        ColumnName(f"B{name}", f"B{name}", "T") for name in COMPONENTS]
     return ForeignTable(tuple(columns), np.hstack([points, field]), where,
                         anchor="" if anchor == "center"
                  else f"the '{anchor[:20]}' of the element, from which it counts,")
 
 
 def _check(attributes: Mapping[str, Any], where: str) -> None:
-    """Refuse what is no static field on a rectangular grid."""
+    """Raise MeasurementError unless the mesh is a static field on a rectangular grid."""
     needed = ("gridGeometry", "eleAnchorPt", "axisLabels", "gridSize", "gridSpacing",
               "gridOriginOffset", "gridLowerBound", "harmonic")
     for name in needed:
@@ -138,6 +142,7 @@ def _check(attributes: Mapping[str, Any], where: str) -> None:
 
 
 def _vector(attributes: Mapping[str, Any], name: str, where: str) -> Floats:
+    """Return an attribute of three finite numbers."""
     values = np.atleast_1d(np.asarray(attributes[name], float))
     if values.shape != (3,) or not (np.abs(values) < 1e12).all():
         raise MeasurementError(must_be(f"`{name}`", where, "three finite numbers",
@@ -148,7 +153,7 @@ def _vector(attributes: Mapping[str, Any], name: str, where: str) -> Floats:
 def _component(
     record: Any, name: str, labels: tuple[str, ...], size: list[int], where: str
 ) -> Floats:
-    """A component (nx, ny, nz) in T."""
+    """Return a component (nx, ny, nz) in T; zeros if the file does not have it."""
     if name not in record:
         return np.zeros(size)
     node = record[name]
@@ -177,14 +182,14 @@ def _component(
 
 
 def _text(value: Any) -> Any:
-    """An attribute with text in place of bytes, and a scalar in place of one number alone."""
+    """Return an attribute with bytes decoded to text, and arrays of size 1 turned into scalars."""
     if isinstance(value, bytes):
         return value.decode()
     if isinstance(value, np.ndarray):
         if value.dtype.kind == "S":
             value = np.char.decode(value)
         if value.dtype.kind == "O":
-            value = np.array([_text(one) for one in value.ravel()])
+            value = np.array([_text(item) for item in value.ravel()])
         if value.size == 1:
             return value.ravel()[0]
     return value

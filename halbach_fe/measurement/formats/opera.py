@@ -1,4 +1,4 @@
-"""Tables of Opera, as its TABLE command writes them.
+"""Import of field tables of Opera, as its TABLE command writes them.
 
 ::
 
@@ -9,9 +9,10 @@
      0                            the end of the header; [METRE] here is the unit of all lengths
      -0.55 -1.1 -0.01 0.5e-4 0.4e-5 -0.2e-2
 
-The first line may be blank; a list of points has its length three times in place of the counts.
-Units may be LENGU and FLUXU, which say nothing, or be missing. Layouts: the table of Geant4's
-example purging_magnet, those that OPAL (tests of SBend3D) and musrSim (its manual) read.
+The first line may be blank. A list of points has its length three times in place of the counts.
+Units may be missing, or LENGU and FLUXU, which state no unit. Sources of the layout: the table of
+Geant4's example purging_magnet, and the tables that OPAL (tests of SBend3D) and musrSim (its
+manual) read.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from collections.abc import Sequence
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import names
-from halbach_fe.measurement.formats.declared import Declared
-from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
 
@@ -30,21 +31,22 @@ COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
 COLUMN = re.compile(r"\s*([1-9]\d?)\s+([A-Za-z][^\s\[]*)\s*(?:\[([^\[\]]*)\])?\s*")
 END = re.compile(r"\s*0\s*(?:\[([^\[\]]*)\])?\s*")
 MAX_HEADER = 200
+"""Largest number of characters of a line of the header."""
 
 
 def is_opera(lines: Sequence[Line]) -> bool:
-    """Whether lines begin as such a table does."""
+    """Return whether the first lines are those of an Opera table."""
     first = [line for _, line in lines[:2] if len(line) <= MAX_HEADER]
     return len(first) == 2 and bool(COUNTS.fullmatch(first[0])) and bool(COLUMN.fullmatch(first[1]))
 
 
-def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
-    """Read such a table; points may come in any order.
+def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
+    """Read an Opera table; its points may come in any order.
 
     Raises
     ------
     MeasurementError
-        If the header is another, or not as many points follow as it says.
+        If the header is not that of an Opera table, or states another number of points than follow.
     """
     lines = lines_of(raw, declared, where)
     counts = COUNTS.fullmatch(lines[0][1][:MAX_HEADER])
@@ -62,9 +64,9 @@ def read(raw: bytes, declared: Declared, where: str) -> ForeignTable:
     return ForeignTable(columns, values, where, length_unit=length_unit, texts=texts)
 
 
-def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[Name, ...], str, int]:
-    """Columns, unit of length for all, and the index of the first row."""
-    columns: list[Name] = []
+def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[ColumnName, ...], str, int]:
+    """Return the columns, the unit of all lengths, and the index of the first row."""
+    columns: list[ColumnName] = []
     for index, (number, line) in enumerate(lines[1:], 1):
         line = line[:MAX_HEADER]
         if end := END.fullmatch(line):
@@ -77,6 +79,6 @@ def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[Name, ...], str, 
                 f"line {number}", where, f"column {len(columns) + 1} of the header (number, name, "
                 "[unit]), or its end, 0", f"'{line.strip()[:40]}'"))
         name = names.parse(column[2])
-        columns.append(Name(name.text, name.quantity, (column[3] or "").strip()))
+        columns.append(ColumnName(name.text, name.quantity, (column[3] or "").strip()))
     raise MeasurementError(must_be("header", where, "columns and a line 0 after them",
-                                   "none of that"))
+                                   "a header without them"))

@@ -1,6 +1,7 @@
-"""From columns as a file has them to a map in m and T along the magnet's axes.
+"""Conversion of a file's columns to a map in m and T along the magnet's axes.
 
-What is missing is asked for, all of it at once; nothing is guessed.
+Information that neither the file nor the user states is never guessed. A single error message lists
+all missing statements and the options that provide them.
 """
 
 from __future__ import annotations
@@ -15,40 +16,42 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map
 from halbach_fe.measurement.formats import names, units
-from halbach_fe.measurement.formats.declared import Declared
-from halbach_fe.measurement.formats.names import Name
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.text import Line, comma_hint
 from halbach_fe.study.types import MAX_LENGTH_M
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
            "field": "--field-unit T, mT, uT, G or kG", "angle": "--angle-unit deg or rad"}
 MAX_NUMBER = 1e30
-"""In any unit; larger ones stand for what is missing, or overflow."""
+"""Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
+would overflow."""
 KINDS = {"length": units.LENGTHS, "field": units.FIELDS, "angle": units.ANGLES}
 
 
 @dataclass(frozen=True)
 class ForeignTable:
-    """Columns of a file.
+    """The columns of a file in a foreign format, in the file's own units and axes.
 
     Attributes
     ----------
     columns : tuple of Name
-        Empty texts if the file does not name them.
+        Names of the columns, with empty texts if the file does not name them.
     values : ndarray, shape (n, columns)
-        In the file's units; NaN where nothing was measured.
+        In the file's units; NaN if a component was not measured, or a cell is no number.
     where : str
-        The file, for messages.
+        Name of the file in error messages.
     length_unit, field_unit : str
-        Of columns that have none of their own; nothing if the file does not say.
+        Units of columns that state no unit of their own; empty if the file does not state them.
     anchor : str
-        What the file counts its positions from, if that is not known to be the magnet's centre.
+        The point from which the file measures positions; empty if it is the magnet's centre.
     comments : str
+        Comments of the file, on a single line.
     texts : mapping of int to (int, str)
-        Columns that are not all numbers: line and text of the first that is none.
+        For each column that is not all numbers: line number and text of the first other cell.
     """
 
-    columns: tuple[Name, ...]
+    columns: tuple[ColumnName, ...]
     values: Floats
     where: str
     length_unit: str = ""
@@ -59,9 +62,19 @@ class ForeignTable:
 
 
 @dataclass(frozen=True)
-class Imported:
-    """A map, and how it was read: units, columns of the file that were left out, and how many
-    points had no reading.
+class ImportedMap:
+    """A map and a summary of how it was read.
+
+    Attributes
+    ----------
+    data : xarray.Dataset
+        The map, in m and T along the magnet's axes.
+    length_units, field_units : tuple of str
+        Units of the file's columns.
+    ignored : tuple of str
+        Columns of the file that are not in the map.
+    dropped : int
+        Number of points without any measured component, which are not in the map.
     """
 
     data: xr.Dataset
@@ -71,14 +84,14 @@ class Imported:
     dropped: int
 
 
-def to_map(table: ForeignTable, declared: Declared) -> Imported:
-    """Read a table as the file and the user say together.
+def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
+    """Convert a table to a map, by the statements of the file and the user together.
 
     Raises
     ------
     MeasurementError
-        If something is missing (with all that is), if file and user contradict each other, or if
-        the result cannot be a map of a permanent magnet.
+        If information is missing (the message lists all of it), if file and user contradict each
+        other, or if the values are too large for a map of a permanent magnet.
     """
     columns = _columns(table, declared)
     used = _used(columns, table, declared)
@@ -112,12 +125,12 @@ def to_map(table: ForeignTable, declared: Declared) -> Imported:
     fields = {unit for name, unit in unit_of.items() if unit in units.FIELDS}
     ignored = tuple(column.text for index, column in enumerate(columns)
                     if index not in used.values() and column.text)
-    return Imported(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
+    return ImportedMap(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
                     int(blank.sum()))
 
 
-def _columns(table: ForeignTable, declared: Declared) -> tuple[Name, ...]:
-    """The file's columns with what the user says of them."""
+def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
+    """Return the file's columns with the names and units that the user states."""
     if not declared.columns:
         return table.columns
     if len(declared.columns) != len(table.columns):
@@ -126,24 +139,27 @@ def _columns(table: ForeignTable, declared: Declared) -> tuple[Name, ...]:
             f"{len(declared.columns)}", "Name each; - leaves one out."))
     found = []
     for text, column in zip(declared.columns, table.columns, strict=True):
-        said = Name("") if text == "-" else names.parse(text)
-        if text != "-" and not said.quantity:
+        stated = ColumnName("") if text == "-" else names.parse(text)
+        if text != "-" and not stated.quantity:
             raise MeasurementError(must_be(
                 "--columns", table.where, f"made of {', '.join(names.KNOWN)} and -", f"'{text}'"))
-        if text != "-" and column.quantity not in ("", said.quantity) and not (
-                column.quantity == "B" and said.quantity in names.FIELDS):
+        if text != "-" and column.quantity not in ("", stated.quantity) and not (
+                column.quantity == "B" and stated.quantity in names.FIELDS):
             raise _contradiction(table, f"column '{column.text}'", column.quantity,
-                                 f"--columns {said.quantity}")
-        for_unit = (column.unit, said.unit)
-        if all(for_unit) and units.symbol(column.unit) != units.symbol(said.unit):
+                                 f"--columns {stated.quantity}")
+        if column.unit and stated.unit and (
+                units.unit_symbol(column.unit) != units.unit_symbol(stated.unit)):
             raise _contradiction(table, f"unit of column '{column.text}'", column.unit,
                                  f"--columns {text}")
-        found.append(Name(column.text or said.text, said.quantity, column.unit or said.unit))
+        found.append(ColumnName(column.text or stated.text, stated.quantity,
+                                column.unit or stated.unit))
     return tuple(found)
 
 
-def _used(columns: Sequence[Name], table: ForeignTable, declared: Declared) -> dict[str, int]:
-    """The column of each quantity that the map takes."""
+def _used(
+    columns: Sequence[ColumnName], table: ForeignTable, declared: DeclaredFormat
+) -> dict[str, int]:
+    """Return the index of the column of each quantity that the map uses."""
     used: dict[str, int] = {}
     for index, column in enumerate(columns):
         if not column.quantity:
@@ -162,7 +178,7 @@ def _used(columns: Sequence[Name], table: ForeignTable, declared: Declared) -> d
                                  f"--component {declared.component}")
         used[name] = used.pop("B")
     elif components:
-        used.pop("B", None)  # |B|, beside its components
+        used.pop("B", None)  # beside its components, B is the magnitude
     for name in declared.at:
         if name in used:
             raise _contradiction(table, "header", f"a column {name}", f"--at {name}=")
@@ -170,9 +186,10 @@ def _used(columns: Sequence[Name], table: ForeignTable, declared: Declared) -> d
 
 
 def _missing(
-    used: dict[str, int], columns: Sequence[Name], table: ForeignTable, declared: Declared
+    used: dict[str, int], columns: Sequence[ColumnName], table: ForeignTable,
+    declared: DeclaredFormat
 ) -> list[str]:
-    """What file and user leave open, except units."""
+    """Return descriptions of the information that file and user do not state, except units."""
     if not any(column.quantity for column in columns):
         shown = ", ".join(f"'{column.text}'" for column in columns if column.text)
         return [f"what its {len(columns)} columns {f'({shown}) ' if shown else ''}are "
@@ -198,26 +215,31 @@ def _missing(
 
 
 def _by_option(absent: Sequence[str]) -> str:
+    """Return the options that provide absent coordinates."""
     if "r" in absent or "phi" in absent:
         return "--columns"
     return f"--at {','.join(f'{name}=0' for name in absent)} in m, or --columns"
 
 
 def _units(
-    kind: str, used: dict[str, int], table: ForeignTable, declared: Declared, missing: list[str]
+    kind: str, used: dict[str, int], table: ForeignTable, declared: DeclaredFormat,
+    missing: list[str]
 ) -> dict[str, str]:
-    """The unit of each column of a kind; what has none is added to ``missing``."""
-    found, open_ = {}, []
+    """Return the unit of each column of a kind: length, field or angle.
+
+    Columns without a unit are added to the descriptions in ``missing``.
+    """
+    found, unknown = {}, []
     option = {"length": declared.length_unit, "field": declared.field_unit,
               "angle": declared.angle_unit}[kind]
     common = {"length": table.length_unit, "field": table.field_unit, "angle": ""}[kind]
     columns = _columns(table, declared)
     for name in (name for name in used if _kind(name) == kind):
         text = columns[used[name]].unit
-        if units.is_silent(text):
+        if units.states_no_unit(text):
             text = common
-        unit = units.symbol(text)
-        if not units.is_silent(text) and unit not in KINDS[kind]:
+        unit = units.unit_symbol(text)
+        if not units.states_no_unit(text) and unit not in KINDS[kind]:
             raise MeasurementError(must_be(
                 f"unit of {name}", table.where, f"one of {', '.join(KINDS[kind])}", f"'{text}'"))
         if unit and option and unit != option:
@@ -225,18 +247,19 @@ def _units(
         if unit or option:
             found[name] = unit or option
         else:
-            open_.append(name)
-    if open_:
-        missing.append(f"the unit of {', '.join(open_)} ({OPTIONS[kind]})")
+            unknown.append(name)
+    if unknown:
+        missing.append(f"the unit of {', '.join(unknown)} ({OPTIONS[kind]})")
     return found
 
 
 def _kind(name: str) -> str:
+    """Return the kind of unit of a quantity: length, field or angle."""
     return "angle" if name == "phi" else "length" if name in names.POSITIONS else "field"
 
 
 def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
-    """Points (n, 3) in m and B (n, 3) in T of columns in m, rad and T."""
+    """Return points (n, 3) in m and B (n, 3) in T from columns in m, rad and T."""
     if "r" in si:
         if {"x", "y"} & set(si):
             raise MeasurementError(must_be("positions", where, "either x, y, z or r, phi, z",
@@ -266,7 +289,7 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
 
 
 def _checked(points: Floats, flux_density: Floats, where: str) -> xr.Dataset:
-    """The map; MeasurementError if it is none of a permanent magnet."""
+    """Return the map; raise MeasurementError if its values are too large for a permanent magnet."""
     if not len(points):
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
     largest, farthest = float(np.nanmax(np.abs(flux_density))), float(np.abs(points).max())
@@ -280,12 +303,13 @@ def _checked(points: Floats, flux_density: Floats, where: str) -> xr.Dataset:
 
 
 def _contradiction(table: ForeignTable, what: str, file: str, user: str) -> MeasurementError:
+    """Return the error for a file and an option that state different things."""
     return MeasurementError(must_be(what, table.where, "the same in the file and the options",
                                     f"{file} in the file and {user}",
                                     "Correct the option, or the file."))
 
 
-def named(columns: Sequence[Name], units_below: Sequence[str]) -> tuple[Name, ...]:
-    """Columns with the units of a line below the header, where they have none of their own."""
+def with_units(columns: Sequence[ColumnName], units_below: Sequence[str]) -> tuple[ColumnName, ...]:
+    """Return columns without a unit of their own with the units of a line below the header."""
     return tuple(replace(column, unit=column.unit or unit.strip().strip("[]()"))
                  for column, unit in zip(columns, units_below, strict=True))

@@ -1,4 +1,4 @@
-"""Text of measured maps: lines, comments, cells and numbers."""
+"""Text files of field maps: lines, comments, cells and numbers."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAX_CELL
 from halbach_fe.core.numbers import parse_number as number_in
-from halbach_fe.measurement.formats.declared import Declared
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 COMMENTS = "#%!"
+"""Characters that begin a comment."""
 MAX_COMMENTS = 2000
+"""Largest number of characters of comments that are kept."""
 
 Line = tuple[int, str]
+"""Number, from 1, and text of a line."""
 
 
-def lines_of(raw: bytes, declared: Declared, where: str) -> list[Line]:
-    """Lines that are not blank, each with its number.
+def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
+    """Return the lines of a text file that are not blank, with their numbers.
 
     Raises
     ------
     MeasurementError
-        If it is no text in the encoding, or there is none.
+        If the content is not text in the declared encoding, or all lines are blank.
     """
     try:
         text = raw.decode(declared.encoding)
@@ -37,31 +40,33 @@ def lines_of(raw: bytes, declared: Declared, where: str) -> list[Line]:
         raise MeasurementError(must_be(
             "encoding", where, declared.encoding.removesuffix("-sig").upper(), "other bytes",
             "Is it text? Then name its encoding (--encoding latin-1, utf-16).")) from None
-    found = [(number_in_cell, line) for number_in_cell,
-             line in enumerate(text.splitlines(), 1) if line.strip()]
+    found = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not found:
         raise MeasurementError(must_be("content", where, "a table of readings", "blank lines"))
     return found
 
 
 def is_comment(line: str) -> bool:
-    """Whether a line starts with #, % or !."""
+    """Return whether a line starts with #, % or !."""
     return line.lstrip()[:1] in COMMENTS
 
 
 def uncommented(line: str) -> str:
-    """A comment without its marks."""
+    """Return a comment without the characters that begin it."""
     return line.strip().lstrip(COMMENTS).strip()
 
 
 def comments_of(lines: Sequence[Line]) -> str:
-    """What the comments say, on one line that any file can hold."""
+    """Return all comments as a single line of at most `MAX_COMMENTS` printable characters."""
     said = " | ".join(uncommented(line) for _, line in lines if is_comment(line))
     return "".join(c if c.isprintable() else " " for c in said)[:MAX_COMMENTS]
 
 
-def delimiter_of(line: str, declared: Declared) -> str | None:
-    """Semicolon, tab or comma, the first that occurs; None for spaces."""
+def delimiter_of(line: str, declared: DeclaredFormat) -> str | None:
+    """Return the delimiter of a line: the first of semicolon, tab and comma that occurs in it.
+
+    None stands for spaces. With a decimal comma, a comma is no delimiter.
+    """
     for mark in ";\t" if declared.decimal_comma else ";\t,":
         if mark in line:
             return mark
@@ -69,7 +74,7 @@ def delimiter_of(line: str, declared: Declared) -> str | None:
 
 
 def cells_of(line: str, delimiter: str | None) -> list[str]:
-    """Cells of a line; of one that is no CSV the line as a whole."""
+    """Return the cells of a line; a line that is not valid CSV is a single cell."""
     if delimiter is None:
         return line.split()
     try:
@@ -79,7 +84,7 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 
 
 def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
-    """The number in a cell, NaN for an empty one or NaN; ValueError for anything else."""
+    """Return the number in a cell, NaN if the cell is empty or ``nan``; else raise ValueError."""
     if decimal_comma:
         cell = cell.replace(",", ".")
     if not cell or cell.lower() == "nan":
@@ -88,13 +93,14 @@ def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
 
 
 def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:
-    """How many cells are numbers; all of them if the others are empty."""
+    """Return how many cells are numbers; empty cells count if all others are numbers."""
     values = [_number_or_none(cell, decimal_comma) for cell in cells]
     found = sum(value is not None and not np.isnan(value) for value in values)
     return len(cells) if found and None not in values else found
 
 
 def _number_or_none(cell: str, decimal_comma: bool) -> float | None:
+    """Return the number in a cell as `number_in_cell` does, or None for other text."""
     try:
         return number_in_cell(cell, decimal_comma)
     except ValueError:
@@ -102,17 +108,33 @@ def _number_or_none(cell: str, decimal_comma: bool) -> float | None:
 
 
 def rows_of(
-    lines: Sequence[Line], columns: int, delimiter: str | None, declared: Declared, where: str
+    lines: Sequence[Line], columns: int, delimiter: str | None, declared: DeclaredFormat, where: str
 ) -> tuple[Floats, dict[int, Line]]:
-    """Numbers (rows, columns) of lines, NaN for other text; comments among them are skipped.
+    """Return the numbers in the rows of a table; comments among the rows are skipped.
 
-    Also, of each column with other text (a time, the name of a scan), where it comes first: such
-    a column is of no use.
+    Parameters
+    ----------
+    lines : sequence of Line
+    columns : int
+        Number of cells that each row must have.
+    delimiter : str or None
+        See `delimiter_of`.
+    declared : DeclaredFormat
+    where : str
+        Name of the file in error messages.
+
+    Returns
+    -------
+    values : ndarray, shape (rows, columns)
+        NaN for empty cells and other text.
+    texts : dict of int to Line
+        For each column that contains other text (a time, the name of a scan), the line number and
+        the cell where it occurs first. These columns cannot be used as coordinates or components.
 
     Raises
     ------
     MeasurementError
-        With the first line that has another length.
+        If a row has another number of cells, or there are no rows.
     """
     rows: list[list[float]] = []
     texts: dict[int, Line] = {}
@@ -134,7 +156,7 @@ def rows_of(
 
 
 def comma_hint(cell: str) -> str:
-    """What to do about a number with a comma."""
+    """Return a hint for a cell that may be a number with a decimal comma, else an empty string."""
     if len(cell) <= MAX_CELL and re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", cell.strip()):
         return "If its comma is a decimal one, add --decimal-comma."
     return ""

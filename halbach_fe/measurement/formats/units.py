@@ -1,7 +1,7 @@
-"""Units as files and options spell them.
+"""Units of lengths, flux densities and angles, as files and options spell them.
 
-A unit counts only if it is spelt out; what cannot be told from its spelling is refused, and never
-guessed from the size of the numbers.
+A unit must be stated explicitly, in a known spelling. It is never guessed from the size of the
+numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ FIELDS = {"T": Fraction(1), "mT": Fraction(1, 1000), "uT": Fraction(1, 1_000_000
           "G": Fraction(1, 10_000), "kG": Fraction(1, 10)}
 ANGLES = ("deg", "rad")
 
-# Lower-case spellings. T and G are not here: mT is not MT, and t and g are tonne and gram.
+# Spellings in lower case; upper and lower case are equivalent. T and G are in EXACT instead, since
+# mT is not MT, and t and g are tonne and gram.
 WORDS = {
     "m": "m", "metre": "m", "metres": "m", "meter": "m", "meters": "m",
     "cm": "cm", "centimetre": "cm", "centimetres": "cm", "centimeter": "cm", "centimeters": "cm",
@@ -33,22 +34,28 @@ WORDS = {
 EXACT = {"T": "T", "mT": "mT", "uT": "uT", "µT": "uT", "μT": "uT", "G": "G", "kG": "kG"}
 
 SILENT = re.compile(r"(?i)-?|lengu|fluxu|[-+]?[\d.]+(e[-+]?\d+)?")
-"""What stands in the place of a unit and is none: Opera's LENGU and FLUXU, a factor."""
+"""Texts in the place of a unit that state none: Opera's LENGU and FLUXU, a dash, or a factor."""
 
 
-def symbol(text: str) -> str:
-    """The symbol of a spelling: m, cm, mm, um, inch, T, mT, uT, G, kG, deg or rad; or nothing."""
+def unit_symbol(text: str) -> str:
+    """Return the symbol of a unit from its spelling, or an empty string if it is unknown.
+
+    The symbols are m, cm, mm, um, inch, T, mT, uT, G, kG, deg and rad.
+    """
     text = text.strip()
     return EXACT.get(text) or WORDS.get(text.lower(), "")
 
 
-def is_silent(text: str) -> bool:
-    """Whether it says nothing of a unit."""
+def states_no_unit(text: str) -> bool:
+    """Return whether a text in the place of a unit states no unit; see `SILENT`."""
     return bool(SILENT.fullmatch(text.strip()))
 
 
 def in_si(values: Floats, unit: str) -> Floats:
-    """Values in m, T or rad; one rounding where the factor is a power of ten."""
+    """Convert values in a unit to m, T or rad.
+
+    If the factor is a power of ten, the result is rounded only once.
+    """
     if unit in ANGLES:
         return np.deg2rad(values) if unit == "deg" else values
     factor = LENGTHS[unit] if unit in LENGTHS else FIELDS[unit]

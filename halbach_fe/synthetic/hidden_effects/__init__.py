@@ -1,6 +1,6 @@
-"""Effects that a synthetic campaign can hide, each with its full application to the truth.
+"""Effects that a synthetic campaign can hide in its truth, each applied in full.
 
-They know nothing of what any diagnosis makes of a map.
+They share no code with the effects of `halbach_fe.diagnosis`, which are to find them.
 """
 
 from __future__ import annotations
@@ -20,105 +20,112 @@ EFFECTS: dict[str, HiddenEffect] = {
     effect.name: effect
     for effect in (*magnet.EFFECTS, *instrument.EFFECTS, *gross.EFFECTS)}
 
-Wanted = tuple[HiddenEffect, tuple[float, ...] | None]
-"""An effect, and its values unless they are to be drawn."""
+RequestedEffect = tuple[HiddenEffect, tuple[float, ...] | None]
+"""An effect and its values; None if these are to be drawn."""
 
 
 def signature(effect: HiddenEffect) -> str:
-    """The names of an effect's values, with their units."""
-    return ", ".join(f"{one.name}{f' in {one.unit}' if one.unit else ''}"
-                     for one in effect.parameters)
+    """Return the names of an effect's parameters with their units, as text."""
+    return ", ".join(f"{parameter.name}{f' in {parameter.unit}' if parameter.unit else ''}"
+                     for parameter in effect.parameters)
 
 
-def wanted(text: str) -> Wanted:
-    """Read ``NAME`` or ``NAME=value,value``.
+def parse_hidden_effect(text: str) -> RequestedEffect:
+    """Parse an effect of the form ``NAME`` or ``NAME=value,value``.
 
     Raises
     ------
     ValueError
-        With what is wrong with it.
+        If the name is unknown, or the values do not fit the effect.
     """
     name, equals, rest = text.partition("=")
     if name not in EFFECTS:
         near = get_close_matches(name, EFFECTS, 1, 0.5)
         raise ValueError(f"no effect is called '{name}'; " + (
-            f"did you mean {near[0]}?" if near else f"there are {', '.join(EFFECTS)}"))
+            f"did you mean {near[0]}?" if near else f"the effects are {', '.join(EFFECTS)}"))
     effect = EFFECTS[name]
     if not equals:
         return effect, None
-    needed = signature(effect)
+    parameters = signature(effect)
     try:
         values = tuple(float(value) for value in rest.split(",")) if rest else ()
     except ValueError:
-        raise ValueError(f"{name} needs numbers ({needed}), not '{rest}'") from None
+        raise ValueError(f"{name} needs numbers ({parameters}), not '{rest}'") from None
     if len(values) != len(effect.parameters) or not np.isfinite(values).all():
-        raise ValueError(f"{name} needs {len(effect.parameters)} finite values ({needed}), not "
+        raise ValueError(f"{name} needs {len(effect.parameters)} finite values ({parameters}), not "
                          f"'{rest}'")
     return effect, values
 
 
-def chosen(
-    site: Site, effects: Sequence[Wanted], at_random: int, generator: np.random.Generator
+def choose_effects(
+    site: Site, effects: Sequence[RequestedEffect], at_random: int, generator: np.random.Generator
 ) -> tuple[ChosenEffect, ...]:
-    """All effects to hide with their values: those wanted, and more at random.
+    """Return all effects to hide, with their values: the requested ones, and others at random.
 
-    Gross errors are hidden only where they are wanted.
+    Gross errors are hidden only on request, not at random.
 
     Raises
     ------
     StudyError
-        If the study cannot have one of them.
+        If the study cannot have one of the effects, has no block or ring at its place, or can have
+        fewer than ``at_random`` further effects.
     """
     for effect, _ in effects:
         lacking = [need for need in effect.needs if not site.has(need)]
         if lacking:
             raise StudyError(must_be(f"--hide {effect.name}", "the study",
-                                     "an effect that it can show",
-                                     f"one that needs: {', '.join(lacking)}"))
+                                     "an effect whose needs the study meets",
+                                     f"one that also needs: {', '.join(lacking)}",
+                                     "Choose another effect, or change the study."))
     others = [effect for effect in EFFECTS.values()
-              if effect.group != "gross" and effect not in [one for one, _ in effects]
+              if effect.group != "gross" and effect not in [requested for requested, _ in effects]
               and all(site.has(need) for need in effect.needs)]
     if at_random > len(others):
         raise StudyError(must_be("--hide-random", "the study", f"at most {len(others)}",
                                  str(at_random)))
     picked = generator.choice(len(others), at_random, replace=False)
-    found = [ChosenEffect(effect, values if values is not None else effect.draw(site, generator))
-             for effect, values in [*effects, *((others[n], None) for n in picked)]]
-    for one in found:
-        _check_place(site, one)
-    return tuple(found)
+    hidden = [ChosenEffect(effect, values if values is not None else effect.draw(site, generator))
+              for effect, values in [*effects, *((others[n], None) for n in picked)]]
+    for effect_with_values in hidden:
+        _check_place(site, effect_with_values)
+    return tuple(hidden)
 
 
 def _check_place(site: Site, hidden: ChosenEffect) -> None:
-    """Refuse blocks and seams that the magnet has not."""
-    least = 0 if hidden.effect.name == "magnetization_gradient" else 1
+    """Raise a StudyError if an effect is at a ring, slot, seam or axis that does not exist."""
+    # of a magnetization gradient, ring and slot 0 stand for all blocks
+    lowest = 0 if hidden.effect.name == "magnetization_gradient" else 1
     limits = {"ring": site.rings, "slot": site.slots, "other_ring": site.rings,
               "other_slot": site.slots, "seam": site.rings - 1, "axis": 3, "first": 3, "second": 3}
-    if least == 0 and (hidden.values[0] == 0) != (hidden.values[1] == 0):
+    if lowest == 0 and (hidden.values[0] == 0) != (hidden.values[1] == 0):
         raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
                                  "those of a block, or both 0 for all", "one of them 0"))
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
-        most = limits.get(parameter.name)
-        if most is not None and (value != int(value) or not least <= value <= most):
+        highest = limits.get(parameter.name)
+        if highest is not None and (value != int(value) or not lowest <= value <= highest):
             raise StudyError(must_be(f"{parameter.name} of --hide {hidden.effect.name}",
-                                     "the study", f"a whole number from {least} to {most}",
+                                     "the study", f"a whole number from {lowest} to {highest}",
                                      f"{value:g}"))
 
 
 def with_effects(
     magnet: TrueMagnet, site: Site, hidden: Sequence[ChosenEffect], single: bool = False
 ) -> TrueMagnet:
-    """The magnet with effects; of ``single`` blocks only those that they have before assembly."""
-    for one in hidden:
-        if one.effect.magnet is not None and (one.effect.of_blocks or not single):
-            magnet = one.effect.magnet(magnet, site, *one.values)
+    """Return the magnet with hidden effects.
+
+    With ``single`` only those are applied that the blocks have before they are mounted, which the
+    Helmholtz coil therefore measures.
+    """
+    for chosen in hidden:
+        if chosen.effect.magnet is not None and (chosen.effect.of_blocks or not single):
+            magnet = chosen.effect.magnet(magnet, site, *chosen.values)
     return magnet
 
 
 def instrument_with(site: Site, hidden: Sequence[ChosenEffect]) -> FaultyInstrument:
-    """The instrument with effects."""
+    """Return the instrument with hidden effects."""
     faulty = FaultyInstrument()
-    for one in hidden:
-        if one.effect.instrument is not None:
-            faulty = one.effect.instrument(faulty, site, *one.values)
+    for chosen in hidden:
+        if chosen.effect.instrument is not None:
+            faulty = chosen.effect.instrument(faulty, site, *chosen.values)
     return faulty

@@ -1,4 +1,4 @@
-"""Gross errors: of what was measured where, and of how it was written down."""
+"""Gross errors: a wrong magnet or place of measurement, or a wrongly recorded map."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from halbach_fe.synthetic.hidden_effects.kinds import (
 from halbach_fe.synthetic.instrument import FaultyInstrument
 
 NOTHING: tuple[float, ...] = ()
+"""Values of an effect without parameters."""
 
 
 def wrong_radius(instrument: FaultyInstrument, site: Site, more: float) -> FaultyInstrument:
-    """The probe goes round on another radius; a line on the axis is one beside it."""
+    """Let the probe run on another radius; a line on the axis becomes one beside it."""
     return replace(instrument, radius_error=instrument.radius_error + more)
 
 
 def swapped_axes(instrument: FaultyInstrument, site: Site, first: float,
                  second: float) -> FaultyInstrument:
-    """Two components are exchanged, counted from 1."""
+    """Exchange two components, counted from 1."""
     order = list(instrument.order)
     i, j = int(first) - 1, int(second) - 1
     order[i], order[j] = order[j], order[i]
@@ -39,7 +40,7 @@ def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
 
 
 def sign_flipped_axis(instrument: FaultyInstrument, site: Site, axis: float) -> FaultyInstrument:
-    """A component, counted from 1, has the wrong sign."""
+    """Record a component, counted from 1, with the wrong sign."""
     signs = np.array(instrument.signs)
     signs[int(axis) - 1] *= -1
     return replace(instrument, signs=vector(signs))
@@ -50,27 +51,27 @@ def _draw_axis(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
 
 
 def millimetres(instrument: FaultyInstrument, site: Site) -> FaultyInstrument:
-    """Positions are written down in mm."""
+    """Record positions in mm."""
     return replace(instrument, length_unit=1000.0)
 
 
 def millitesla(instrument: FaultyInstrument, site: Site) -> FaultyInstrument:
-    """Fields are written down in mT."""
+    """Record fields in mT."""
     return replace(instrument, field_unit=1000.0)
 
 
 def reversed_z(instrument: FaultyInstrument, site: Site) -> FaultyInstrument:
-    """The magnet was measured from its other end, with the axes of the probe as they should be."""
+    """Measure the magnet from its other end, with the probe's axes as they should be."""
     return replace(instrument, reversed_z=not instrument.reversed_z)
 
 
 def rotated_by_one_block(magnet: TrueMagnet, site: Site, blocks: float) -> TrueMagnet:
-    """The magnet is turned about its axis by one pitch, or several."""
+    """Turn the magnet about its axis by the angle of one block, or of several."""
     angle = blocks * 2 * np.pi / site.slots
     turn = Rotation.from_euler("z", angle)
 
     def turned(body: Body) -> Body:
-        """Its nominal place too: the mesh of what responds goes along."""
+        """Turn a body's nominal place as well, so that the mesh of the reaction turns too."""
         return replace(body, angle=body.angle + angle, centre=vector(turn.apply(body.centre)),
                        displacement=vector(turn.apply(body.displacement)),
                        rotation=vector(turn.apply(body.rotation)))
@@ -79,7 +80,7 @@ def rotated_by_one_block(magnet: TrueMagnet, site: Site, blocks: float) -> TrueM
 
 
 def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
-    """The magnet has rings more, like its last, or fewer, and stands with its middle at z = 0."""
+    """Add ``more`` rings like the last, or remove rings, and centre the magnet at z = 0."""
     last = [body for body in magnet.bodies if body.ring == site.rings]
     first = next(body for body in magnet.bodies if body.ring == 1)
     length = first.shape.length
@@ -98,23 +99,22 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
 
 EFFECTS = (
     HiddenEffect("wrong_radius", "gross", (HiddenParameter("change", "m"),),
-           lambda site, generator: (signed_log_uniform(generator, 0.05, 0.2) * (
-               site.radius if site.radius > 0 else site.inner),), instrument=wrong_radius),
+                 lambda site, generator: (signed_log_uniform(generator, 0.05, 0.2) * (
+                     site.radius if site.radius > 0 else site.inner),), instrument=wrong_radius),
     HiddenEffect("swapped_axes", "gross", (HiddenParameter("first"), HiddenParameter("second")),
-                 _draw_swap,
-           instrument=swapped_axes),
+                 _draw_swap, instrument=swapped_axes),
     HiddenEffect("sign_flipped_axis", "gross", (HiddenParameter("axis"),), _draw_axis,
-           instrument=sign_flipped_axis),
+                 instrument=sign_flipped_axis),
     HiddenEffect("millimetres", "gross", (), lambda site, generator: NOTHING,
                  instrument=millimetres),
     HiddenEffect("millitesla", "gross", (), lambda site, generator: NOTHING, instrument=millitesla),
     HiddenEffect("reversed_z", "gross", (), lambda site, generator: NOTHING, instrument=reversed_z,
-           needs=("3d",)),
+                 needs=("3d",)),
     HiddenEffect("rotated_by_one_block", "gross", (HiddenParameter("blocks"),),
-           lambda site, generator: (float(generator.choice([-1.0, 1.0])),),
-           rotated_by_one_block),
+                 lambda site, generator: (float(generator.choice([-1.0, 1.0])),),
+                 rotated_by_one_block),
     HiddenEffect("wrong_ring_count", "gross", (HiddenParameter("more"),),
-           lambda site, generator: (float(generator.choice([-1.0, 1.0]))
-                                    if site.rings > 1 else 1.0,), wrong_ring_count,
-           needs=("3d",)),
+                 lambda site, generator: (float(generator.choice([-1.0, 1.0]))
+                                          if site.rings > 1 else 1.0,),
+                 wrong_ring_count, needs=("3d",)),
 )

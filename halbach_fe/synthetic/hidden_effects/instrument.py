@@ -1,4 +1,4 @@
-"""Effects on the mapper and its probe."""
+"""Hidden effects of the mapper and its probe."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from halbach_fe.synthetic.instrument import FaultyInstrument
 
 
 def _with(values: Vector, index: int, more: float) -> Vector:
-    """Three numbers, one of them larger."""
+    """Return three numbers, of which that at ``index`` is increased by ``more``."""
     return vector(np.array(values) + more * np.eye(3)[index])
 
 
 def _turned(instrument: FaultyInstrument, rotation: tuple[float, ...]) -> FaultyInstrument:
-    """The mapper turned once more, about the origin."""
+    """Return the mapper turned by a further rotation vector about the origin."""
     turn = Rotation.from_rotvec(rotation)
     return replace(
         instrument, translation=vector(turn.apply(instrument.translation)),
@@ -37,25 +37,25 @@ def _turned(instrument: FaultyInstrument, rotation: tuple[float, ...]) -> Faulty
 
 
 def _gain(sensor: int, name: Component) -> HiddenEffect:
+    """Return the effect that a sensor has a relative error of its sensitivity."""
     def apply(instrument: FaultyInstrument, site: Site, fraction: float) -> FaultyInstrument:
         return replace(instrument, gain=_with(instrument.gain, sensor, fraction))
 
     return HiddenEffect(f"gain_{name}", "instrument", (HiddenParameter("fraction"),),
-                        draw_number(5e-4, 1e-2),
-                  instrument=apply, needs=(name,))
+                        draw_number(5e-4, 1e-2), instrument=apply, needs=(name,))
 
 
 def _offset(sensor: int, name: Component) -> HiddenEffect:
+    """Return the effect that a sensor has an offset."""
     def apply(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstrument:
         return replace(instrument, offset=_with(instrument.offset, sensor, value))
 
     return HiddenEffect(f"offset_{name}", "instrument", (HiddenParameter("value", "T"),),
-                        draw_number(5e-5, 1e-3),
-                  instrument=apply, needs=(name,))
+                        draw_number(5e-5, 1e-3), instrument=apply, needs=(name,))
 
 
 def _misalignment(sensor: int, other: int) -> HiddenEffect:
-    """The sensor picks up some of another component."""
+    """Return the effect that a sensor picks up a fraction of another component."""
     def apply(instrument: FaultyInstrument, site: Site, fraction: float) -> FaultyInstrument:
         axes = list(instrument.axes)
         axes[sensor] = _with(axes[sensor], other, fraction)
@@ -63,11 +63,12 @@ def _misalignment(sensor: int, other: int) -> HiddenEffect:
 
     name, of = COMPONENTS[sensor], COMPONENTS[other]
     return HiddenEffect(f"misalignment_{name}{of}", "instrument", (HiddenParameter("fraction"),),
-                  draw_number(1e-3, 1e-2), instrument=apply,
-                  needs=(name, "3d") if of == "z" else (name,))
+                        draw_number(1e-3, 1e-2), instrument=apply,
+                        needs=(name, "3d") if of == "z" else (name,))
 
 
 def _sensor_position(sensor: int, name: Component) -> HiddenEffect:
+    """Return the effect that a sensor is displaced in the probe."""
     def apply(instrument: FaultyInstrument, site: Site, x: float, y: float,
               z: float) -> FaultyInstrument:
         sensors = list(instrument.sensors)
@@ -75,11 +76,12 @@ def _sensor_position(sensor: int, name: Component) -> HiddenEffect:
         return replace(instrument, sensors=(sensors[0], sensors[1], sensors[2]))
 
     return HiddenEffect(f"sensor_position_{name}", "instrument",
-                  tuple(HiddenParameter(axis, "m") for axis in "xyz"), _draw_vector(3e-4, 3e-3),
-                  instrument=apply, needs=(name,))
+                        tuple(HiddenParameter(axis, "m") for axis in "xyz"),
+                        _draw_vector(3e-4, 3e-3), instrument=apply, needs=(name,))
 
 
 def _draw_vector(low: float, high: float) -> Draw:
+    """Return a function that draws a vector in m, its length between limits that are scaled."""
     def draw(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
         amount = site.scale * log_uniform(generator, low, high)
         return tuple(amount * value for value in draw_direction(generator, site.dimension))
@@ -88,78 +90,78 @@ def _draw_vector(low: float, high: float) -> Draw:
 
 
 def planar_hall(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstrument:
-    """Every sensor adds the product of the two components in its plane."""
+    """Add to every sensor the product of the two components in its plane."""
     return replace(instrument, planar_hall=instrument.planar_hall + value)
 
 
 def quadratic_nonlinearity(instrument: FaultyInstrument, site: Site,
                            value: float) -> FaultyInstrument:
-    """Every sensor adds the square of its reading."""
+    """Add to every sensor the square of its reading."""
     return replace(instrument, quadratic=instrument.quadratic + value)
 
 
 def cubic_nonlinearity(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstrument:
-    """Every sensor adds the third power of its reading."""
+    """Add to every sensor the third power of its reading."""
     return replace(instrument, cubic=instrument.cubic + value)
 
 
 def mapper_translation(
     instrument: FaultyInstrument, site: Site, x: float, y: float, z: float
 ) -> FaultyInstrument:
-    """The mapper stands elsewhere."""
+    """Displace the mapper."""
     return replace(instrument, translation=vector(np.add(instrument.translation, (x, y, z))))
 
 
 def mapper_roll(instrument: FaultyInstrument, site: Site, angle: float) -> FaultyInstrument:
-    """The mapper is turned about z, the probe with it."""
+    """Turn the mapper about z, together with the probe."""
     return _turned(instrument, (0.0, 0.0, angle))
 
 
 def mapper_tilt_x(instrument: FaultyInstrument, site: Site, angle: float) -> FaultyInstrument:
-    """The mapper is turned about x."""
+    """Turn the mapper about x, together with the probe."""
     return _turned(instrument, (angle, 0.0, 0.0))
 
 
 def mapper_tilt_y(instrument: FaultyInstrument, site: Site, angle: float) -> FaultyInstrument:
-    """The mapper is turned about y."""
+    """Turn the mapper about y, together with the probe."""
     return _turned(instrument, (0.0, angle, 0.0))
 
 
 def z_scale(instrument: FaultyInstrument, site: Site, fraction: float) -> FaultyInstrument:
-    """A metre along z is longer."""
+    """Increase all true z by a fraction."""
     return replace(instrument, z_scale=instrument.z_scale + fraction)
 
 
 def radius_scale(instrument: FaultyInstrument, site: Site, fraction: float) -> FaultyInstrument:
-    """Radii are larger."""
+    """Increase all true radii by a fraction."""
     return replace(instrument, radius_scale=instrument.radius_scale + fraction)
 
 
 def arm_sag(instrument: FaultyInstrument, site: Site, distance: float) -> FaultyInstrument:
-    """The arm hangs down at its far end, that of the largest z."""
+    """Let the arm sag at its far end, that of the largest z."""
     return replace(instrument, sag=(instrument.sag[0] + distance, site.z_min, site.z_max))
 
 
 def eccentric_circle(
     instrument: FaultyInstrument, site: Site, distance: float, angle: float
 ) -> FaultyInstrument:
-    """The radius is r + d cos(phi - angle), phi being right."""
+    """Let the radius be r + d cos(phi - angle), while phi is right; d is the ``distance``."""
     return replace(instrument, run_out=(distance, angle))
 
 
 def drift(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstrument:
-    """All readings grow with time, by this over the map."""
+    """Let all readings grow with time, by ``value`` in T over the map."""
     return replace(instrument, drift=instrument.drift + value)
 
 
 def vibration(instrument: FaultyInstrument, site: Site, distance: float) -> FaultyInstrument:
-    """The probe is elsewhere at each point."""
+    """Displace the probe at random at each point; ``distance`` is the standard deviation."""
     return replace(instrument, vibration=distance)
 
 
 def outliers(instrument: FaultyInstrument, site: Site, fraction: float,
              value: float) -> FaultyInstrument:
-    """Some readings are off, by half to one and a half of the value."""
+    """Change a fraction of the readings by 0.5 to 1.5 times ``value``, with either sign."""
     return replace(instrument, outliers=(fraction, value))
 
 
@@ -173,42 +175,39 @@ def _effects() -> Iterator[HiddenEffect]:
                 yield _misalignment(sensor, other)
     angle = (HiddenParameter("angle", "rad"),)
     yield HiddenEffect("planar_hall", "instrument", (HiddenParameter("value", "1/T"),),
-                       draw_number(1e-3, 1e-2),
-                 instrument=planar_hall, needs=("3d",))
+                       draw_number(1e-3, 1e-2), instrument=planar_hall, needs=("3d",))
     yield HiddenEffect("quadratic_nonlinearity", "instrument", (HiddenParameter("value", "1/T"),),
-                 draw_number(1e-3, 1e-2), instrument=quadratic_nonlinearity)
+                       draw_number(1e-3, 1e-2), instrument=quadratic_nonlinearity)
     yield HiddenEffect("cubic_nonlinearity", "instrument", (HiddenParameter("value", "1/T^2"),),
-                 draw_number(2e-3, 2e-2), instrument=cubic_nonlinearity)
+                       draw_number(2e-3, 2e-2), instrument=cubic_nonlinearity)
     yield HiddenEffect("mapper_translation", "instrument",
-                 tuple(HiddenParameter(axis, "m") for axis in "xyz"), _draw_vector(2e-4, 2e-3),
-                 instrument=mapper_translation)
+                       tuple(HiddenParameter(axis, "m") for axis in "xyz"),
+                       _draw_vector(2e-4, 2e-3), instrument=mapper_translation)
     yield HiddenEffect("mapper_roll", "instrument", angle, draw_number(5e-4, 5e-3),
                        instrument=mapper_roll)
     for name, tilt in (("x", mapper_tilt_x), ("y", mapper_tilt_y)):
         yield HiddenEffect(f"mapper_tilt_{name}", "instrument", angle, draw_number(5e-4, 5e-3),
-                     instrument=tilt, needs=("3d",))
+                           instrument=tilt, needs=("3d",))
     yield HiddenEffect("z_scale", "instrument", (HiddenParameter("fraction"),),
-                       draw_number(2e-4, 3e-3),
-                 instrument=z_scale, needs=("3d",))
+                       draw_number(2e-4, 3e-3), instrument=z_scale, needs=("3d",))
     yield HiddenEffect("radius_scale", "instrument", (HiddenParameter("fraction"),),
-                       draw_number(1e-3, 1e-2),
-                 instrument=radius_scale, needs=("circles",))
+                       draw_number(1e-3, 1e-2), instrument=radius_scale, needs=("circles",))
     yield HiddenEffect("arm_sag", "instrument", (HiddenParameter("distance", "m"),),
-                 draw_length(3e-4, 3e-3, False), instrument=arm_sag, needs=("3d",))
+                       draw_length(3e-4, 3e-3, False), instrument=arm_sag, needs=("3d",))
     yield HiddenEffect("eccentric_circle", "instrument",
-                 (HiddenParameter("distance", "m"), HiddenParameter("angle", "rad")),
-                 lambda site, generator: (site.scale * log_uniform(generator, 2e-4, 2e-3),
-                                          float(generator.uniform(-np.pi, np.pi))),
-                 instrument=eccentric_circle, needs=("circles",))
+                       (HiddenParameter("distance", "m"), HiddenParameter("angle", "rad")),
+                       lambda site, generator: (site.scale * log_uniform(generator, 2e-4, 2e-3),
+                                                float(generator.uniform(-np.pi, np.pi))),
+                       instrument=eccentric_circle, needs=("circles",))
     yield HiddenEffect("drift", "instrument", (HiddenParameter("value", "T"),),
-                       draw_number(1e-4, 1e-3),
-                 instrument=drift)
+                       draw_number(1e-4, 1e-3), instrument=drift)
     yield HiddenEffect("vibration", "instrument", (HiddenParameter("distance", "m"),),
-                 draw_length(5e-5, 5e-4, False), instrument=vibration)
+                       draw_length(5e-5, 5e-4, False), instrument=vibration)
     yield HiddenEffect("outliers", "instrument",
                        (HiddenParameter("fraction"), HiddenParameter("value", "T")),
-                 lambda site, generator: (log_uniform(generator, 3e-3, 2e-2),
-                                          log_uniform(generator, 1e-3, 1e-2)), instrument=outliers)
+                       lambda site, generator: (log_uniform(generator, 3e-3, 2e-2),
+                                                log_uniform(generator, 1e-3, 1e-2)),
+                       instrument=outliers)
 
 
 EFFECTS = tuple(_effects())

@@ -1,4 +1,4 @@
-"""Effects on the magnet: geometry, magnetization, materials, surroundings."""
+"""Hidden effects of the magnet: geometry, magnetization, materials, surroundings."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.synthetic.bodies import (
     Body,
-    Copy,
+    BodyPart,
     FroehlichLaw,
-    Part,
+    MagnetCopy,
     PrismBody,
     SectorBody,
     SoftSphere,
@@ -37,24 +37,29 @@ SMCO = -3.5e-4
 """Temperature coefficient of the remanence of Sm2Co17 in 1/K."""
 
 CORNER = (0.1, 0.2)
-"""The part of a block's thickness, from inside, and of its half width, from the sides, that its
-inner corners are."""
+"""Size of an inner corner of a block.
+
+It is the fraction of the block's thickness, counted from inside, and of its half width, counted
+from the side.
+"""
 
 Change = Callable[[Body], Body]
 
 
 def _bodies(magnet: TrueMagnet, change: Change,
-            chosen: Callable[[Body], bool] = bool) -> TrueMagnet:
-    """The magnet with some of its bodies changed."""
+            selected: Callable[[Body], bool] = bool) -> TrueMagnet:
+    """Return the magnet with some of its bodies changed, by default all."""
     return replace(magnet, bodies=tuple(
-        change(body) if chosen(body) else body for body in magnet.bodies))
+        change(body) if selected(body) else body for body in magnet.bodies))
 
 
 def _at(ring: float, slot: float) -> Callable[[Body], bool]:
+    """Return a function that tells whether a body is the block of a ring and slot."""
     return lambda body: (body.ring, body.slot) == (ring, slot)
 
 
 def _of_ring(ring: float) -> Callable[[Body], bool]:
+    """Return a function that tells whether a body belongs to a ring."""
     return lambda body: body.ring == ring
 
 
@@ -77,7 +82,7 @@ def iron_ring(
     magnet: TrueMagnet, site: Site, inner: float, outer: float, permeability: float,
     saturation: float
 ) -> TrueMagnet:
-    """An iron tube as long as the magnet, of a constant permeability if it has no saturation."""
+    """Add an iron tube as long as the magnet; without saturation its permeability is constant."""
     if outer <= inner or permeability == 1:
         return magnet
     law = FroehlichLaw(permeability, saturation) if saturation else permeability
@@ -85,27 +90,27 @@ def iron_ring(
 
 
 def _draw_iron(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
-    corner = site.outer / np.cos(np.pi / site.slots)  # of trapezoids
+    corner = site.outer / np.cos(np.pi / site.slots)  # outermost radius of trapezoids
     inner = corner + site.scale * log_uniform(generator, 0.002, 0.02)
     return (inner, inner + site.scale * log_uniform(generator, 0.003, 0.02),
             log_uniform(generator, 200, 3000), float(generator.uniform(1.6, 2.2)))
 
 
 def recoil_permeability(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
-    """All blocks have it in all directions, and the same remanence."""
+    """Raise the recoil permeability of all blocks in all directions, at the same remanence."""
     return _bodies(magnet, lambda body: replace(body, along=body.along + more,
                                                 across=body.across + more))
 
 
 def recoil_permeability_across(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
-    """All blocks have it across their easy axes, and the same remanence."""
+    """Raise the recoil permeability of all blocks across their easy axes only."""
     return _bodies(magnet, lambda body: replace(body, across=body.across + more))
 
 
 def _draw_recoil(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
-    least = 1 - site.permeability  # no magnet has less than 1
-    return (
-        max((signed_log_uniform if least < -0.01 else log_uniform)(generator, 0.01, 0.06), least),)
+    lowest = 1 - site.permeability  # no magnet has a recoil permeability below 1
+    draw = signed_log_uniform if lowest < -0.01 else log_uniform
+    return (max(draw(generator, 0.01, 0.06), lowest),)
 
 
 # --- geometry ----------------------------------------------------------------------------------
@@ -113,14 +118,14 @@ def _draw_recoil(site: Site, generator: np.random.Generator) -> tuple[float, ...
 
 def block_displaced(magnet: TrueMagnet, site: Site, ring: float, slot: float, radial: float,
                     azimuthal: float, z: float) -> TrueMagnet:
-    """One block displaced along its own axes."""
+    """Displace one block along its own axes."""
     return _bodies(magnet, lambda body: _moved_along_its_axes(body, (radial, azimuthal, z)),
                    _at(ring, slot))
 
 
 def block_turned(magnet: TrueMagnet, site: Site, ring: float, slot: float, radial: float,
                  azimuthal: float, z: float) -> TrueMagnet:
-    """One block turned about its middle, by a rotation vector along its own axes."""
+    """Turn one block about its middle by a rotation vector along its own axes."""
     def turned(body: Body) -> Body:
         turn = Rotation.from_rotvec(
             Rotation.from_euler("z", body.angle).apply([radial, azimuthal, z]))
@@ -131,13 +136,15 @@ def block_turned(magnet: TrueMagnet, site: Site, ring: float, slot: float, radia
 
 
 def radial_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
-    """All blocks moved outwards."""
+    """Move all blocks outwards."""
     return _bodies(magnet, lambda body: _moved_along_its_axes(body, (distance, 0.0, 0.0)))
 
 
 def azimuthal_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
-    """All blocks thinner by it, half on each side; their places stay. Sectors lose an angle, that
-    of the distance at their mean radius.
+    """Make all blocks narrower by ``distance``, half of it on each side.
+
+    The positions of the blocks stay. Sectors lose the angle that corresponds to the distance at
+    their mean radius.
     """
     def thinner(body: Body) -> Body:
         shape = body.shape
@@ -147,19 +154,19 @@ def azimuthal_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet
         else:
             less = replace(shape, inner_width=shape.inner_width - distance,
                            outer_width=shape.outer_width - distance)
-        return replace(body, shape=less, room=body.room or shape)
+        return replace(body, shape=less, meshed_shape=body.meshed_shape or shape)
 
     return _bodies(magnet, thinner)
 
 
 def ring_gap(magnet: TrueMagnet, site: Site, seam: float, distance: float) -> TrueMagnet:
-    """All rings beyond a seam, from 1 between the first two, moved along z."""
+    """Move all rings beyond a seam along z; seam 1 is between the first two rings."""
     return _bodies(magnet, lambda body: _moved(body, (0.0, 0.0, distance)),
                    lambda body: body.ring > seam)
 
 
 def ring_twisted(magnet: TrueMagnet, site: Site, ring: float, angle: float) -> TrueMagnet:
-    """One ring turned about the z axis."""
+    """Turn one ring about the z axis."""
     turn = Rotation.from_euler("z", angle)
 
     def twisted(body: Body) -> Body:
@@ -171,12 +178,12 @@ def ring_twisted(magnet: TrueMagnet, site: Site, ring: float, angle: float) -> T
 
 
 def ring_shifted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float) -> TrueMagnet:
-    """One ring moved across the axis."""
+    """Displace one ring across the axis."""
     return _bodies(magnet, lambda body: _moved(body, (x, y, 0.0)), _of_ring(ring))
 
 
 def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
-    """All blocks begin further outside."""
+    """Increase the inner radius of all blocks by ``more``; their outer faces stay."""
     def shorter(body: Body) -> Body:
         shape = body.shape
         if isinstance(shape, SectorBody):
@@ -192,7 +199,7 @@ def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
 
 
 def magnet_length(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet:
-    """All rings longer by a fraction, and as much further apart."""
+    """Make all rings, and the distances between them, longer by a fraction."""
     def longer(body: Body) -> Body:
         x, y, z = body.centre
         return replace(body, centre=(x, y, z * (1 + fraction)),
@@ -206,25 +213,25 @@ def magnet_length(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet
 
 def blocks_swapped(magnet: TrueMagnet, site: Site, ring: float, slot: float, other_ring: float,
                    other_slot: float) -> TrueMagnet:
-    """Two blocks in each other's places: each keeps its magnetization in its own axes."""
-    found = {(float(body.ring), float(body.slot)): body for body in magnet.bodies}
-    one, two = (ring, slot), (other_ring, other_slot)
+    """Exchange two blocks; each keeps its magnetization in its own axes."""
+    bodies = {(float(body.ring), float(body.slot)): body for body in magnet.bodies}
+    first, second = (ring, slot), (other_ring, other_slot)
 
     def as_other(body: Body) -> Body:
-        other = found[two if (body.ring, body.slot) == one else one]
+        other = bodies[second if (body.ring, body.slot) == first else first]
         return replace(body, remanence=other.remanence, easy_axis=other.easy_axis,
                        along=other.along, across=other.across, parts=other.parts)
 
-    return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in (one, two))
+    return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in (first, second))
 
 
 def block_flipped(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> TrueMagnet:
-    """One block magnetized the other way."""
+    """Reverse the magnetization of one block."""
     return _bodies(magnet, lambda body: _scaled(body, -1.0), _at(ring, slot))
 
 
 def block_missing(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> TrueMagnet:
-    """One block is not there."""
+    """Remove one block."""
     return _bodies(magnet, lambda body: replace(_scaled(body, 0.0), along=1.0, across=1.0),
                    _at(ring, slot))
 
@@ -232,26 +239,27 @@ def block_missing(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> T
 def block_demagnetized(
     magnet: TrueMagnet, site: Site, ring: float, slot: float, fraction: float
 ) -> TrueMagnet:
-    """One block has lost a fraction of its magnetization."""
+    """Take a fraction off the magnetization of one block."""
     return _bodies(magnet, lambda body: _scaled(body, 1 - fraction), _at(ring, slot))
 
 
 def corners_demagnetized(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet:
-    """The two inner corners of all blocks, see `CORNER`, have lost a fraction of theirs."""
+    """Take a fraction off the magnetization of both inner corners (`CORNER`) of all blocks."""
     depth, width = CORNER
-    parts = (Part((0.0, depth), (-1.0, width - 1.0), 1 - fraction),
-             Part((0.0, depth), (1.0 - width, 1.0), 1 - fraction))
+    parts = (BodyPart((0.0, depth), (-1.0, width - 1.0), 1 - fraction),
+             BodyPart((0.0, depth), (1.0 - width, 1.0), 1 - fraction))
     return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)))
 
 
 def magnetization_gradient(
     magnet: TrueMagnet, site: Site, ring: float, slot: float, fraction: float
 ) -> TrueMagnet:
-    """The inner half of a block's thickness is weaker by a fraction, the outer stronger; ring and
-    slot 0 are all blocks.
+    """Make the inner half of a block's thickness weaker by a fraction, and the outer one stronger.
+
+    Ring and slot 0 stand for all blocks.
     """
-    parts = (Part((0.0, 0.5), (-1.0, 1.0), 1 - fraction),
-             Part((0.5, 1.0), (-1.0, 1.0), 1 + fraction))
+    parts = (BodyPart((0.0, 0.5), (-1.0, 1.0), 1 - fraction),
+             BodyPart((0.5, 1.0), (-1.0, 1.0), 1 + fraction))
     return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)),
                    bool if (ring, slot) == (0, 0) else _at(ring, slot))
 
@@ -263,13 +271,13 @@ def _draw_gradient(site: Site, generator: np.random.Generator) -> tuple[float, .
 
 
 def temperature(magnet: TrueMagnet, site: Site, change: float, coefficient: float) -> TrueMagnet:
-    """The whole magnet at another temperature."""
+    """Change the temperature of the whole magnet."""
     return _bodies(magnet, lambda body: _scaled(body, 1 + coefficient * change))
 
 
 def temperature_gradient(magnet: TrueMagnet, site: Site, change: float,
                          coefficient: float) -> TrueMagnet:
-    """Temperature rises along y, by ``change`` from one side of the magnet to the other."""
+    """Let the temperature rise along y by ``change`` from one side of the magnet to the other."""
     return _bodies(magnet, lambda body: _scaled(
         body, 1 + coefficient * change * body.position[1] / (2 * site.outer)))
 
@@ -278,18 +286,21 @@ def temperature_gradient(magnet: TrueMagnet, site: Site, change: float,
 
 
 def background(magnet: TrueMagnet, site: Site, x: float, y: float, z: float) -> TrueMagnet:
-    """A uniform field."""
+    """Add a uniform field."""
     return replace(magnet, background=vector(np.add(magnet.background, (x, y, z))))
 
 
 def neighbour_magnet(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet:
-    """A copy of the magnet on its axis, face to face at a distance, at lower z if negative."""
+    """Add a copy of the magnet on its axis, with ``distance`` between the facing ends.
+
+    A negative distance puts the copy at lower z.
+    """
     shift = np.sign(distance) * (2 * site.half_length + abs(distance))
-    return replace(magnet, copies=(*magnet.copies, Copy(float(shift))))
+    return replace(magnet, copies=(*magnet.copies, MagnetCopy(float(shift))))
 
 
 def _draw_neighbour(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
-    """Beyond the map: no probe is moved into another magnet."""
+    """Draw a distance that keeps the neighbour beyond the points of the map."""
     gap = signed_log_uniform(generator, 0.5, 2.0) * site.outer
     end = site.z_max if gap > 0 else -site.z_min
     return (float(gap + np.sign(gap) * max(end - site.half_length, 0.0)),)
@@ -298,17 +309,20 @@ def _draw_neighbour(site: Site, generator: np.random.Generator) -> tuple[float, 
 def ferromagnetic_object(
     magnet: TrueMagnet, site: Site, x: float, y: float, z: float, volume: float
 ) -> TrueMagnet:
-    """A small sphere of soft iron, magnetized by the field where it is."""
+    """Add a small sphere of soft iron, which the field at its place magnetizes."""
     return replace(magnet, objects=(*magnet.objects, SoftSphere((x, y, z), volume)))
 
 
 def _draw_object(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
-    """In the bore between probe and blocks, or beyond an end if there is no room."""
+    """Draw a sphere in the bore between probe and blocks, or outside the array if it has no room.
+
+    Its volume is such that it changes the field at the nearest probe by a small fraction.
+    """
     radius = (site.radius + site.inner) / 2 if site.radius < site.inner else 2 * site.outer
     angle = generator.uniform(0, 2 * np.pi)
     z = generator.uniform(max(site.z_min, -site.half_length), min(site.z_max, site.half_length))
     room = abs(site.inner - site.radius) / 2
-    # a dipole of moment 3 V B / mu_0 at a distance d adds up to 6 V / (4 pi d^3) of B
+    # a dipole of moment 3 V B / mu_0 changes the field at a distance d by up to 6 V B / (4 pi d^3)
     volume = log_uniform(generator, 5e-4, 5e-3) * 4 * np.pi / 6 * room**3
     return (float(radius * np.cos(angle)), float(radius * np.sin(angle)),
             float(z) if site.dimension == 3 else 0.0, volume)
@@ -344,73 +358,67 @@ M, RAD, PER_K = "m", "rad", "1/K"
 OWN_AXES = ("radial", "azimuthal", "z")
 
 EFFECTS = (
-    HiddenEffect("iron_ring", "field", (
-        HiddenParameter("inner_radius", M), HiddenParameter("outer_radius", M),
-        HiddenParameter("relative_permeability"), HiddenParameter("saturation_polarization", "T")),
-        _draw_iron, iron_ring, needs=("no iron",)),
+    HiddenEffect("iron_ring", "field",
+                 (HiddenParameter("inner_radius", M), HiddenParameter("outer_radius", M),
+                  HiddenParameter("relative_permeability"),
+                  HiddenParameter("saturation_polarization", "T")), _draw_iron, iron_ring,
+                 needs=("no iron",)),
     HiddenEffect("recoil_permeability", "field", (HiddenParameter("change"),), _draw_recoil,
-           recoil_permeability, of_blocks=True),
+                 recoil_permeability, of_blocks=True),
     HiddenEffect("recoil_permeability_across", "field", (HiddenParameter("change"),),
-           draw_number(0.03, 0.15, False), recoil_permeability_across, of_blocks=True),
+                 draw_number(0.03, 0.15, False), recoil_permeability_across, of_blocks=True),
     HiddenEffect("block_displaced", "field",
-                 (*BLOCK, *(HiddenParameter(name, M) for name in OWN_AXES)),
-           _draw_displacement, block_displaced),
+                 (*BLOCK, *(HiddenParameter(name, M) for name in OWN_AXES)), _draw_displacement,
+                 block_displaced),
     HiddenEffect("block_turned", "field",
-                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)),
-           _draw_turn, block_turned),
+                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)), _draw_turn,
+                 block_turned),
     HiddenEffect("radial_gap", "field", (HiddenParameter("distance", M),),
-                 draw_length(5e-5, 4e-4, False),
-           radial_gap),
+                 draw_length(5e-5, 4e-4, False), radial_gap),
     HiddenEffect("azimuthal_gap", "field", (HiddenParameter("distance", M),),
-                 draw_length(5e-5, 4e-4, False),
-           azimuthal_gap, of_blocks=True),
+                 draw_length(5e-5, 4e-4, False), azimuthal_gap, of_blocks=True),
     HiddenEffect("ring_gap", "field", (HiddenParameter("seam"), HiddenParameter("distance", M)),
-           lambda site, generator: (float(generator.integers(1, site.rings)),
-                                    site.scale * log_uniform(generator, 5e-5, 5e-4)),
-           ring_gap, needs=("3d", "rings")),
+                 lambda site, generator: (float(generator.integers(1, site.rings)),
+                                          site.scale * log_uniform(generator, 5e-5, 5e-4)),
+                 ring_gap, needs=("3d", "rings")),
     HiddenEffect("ring_twisted", "field", (HiddenParameter("ring"), HiddenParameter("angle", RAD)),
-           lambda site, generator: (draw_place(site, generator)[0],
-                                    signed_log_uniform(generator, 1e-3, 1e-2)),
-           ring_twisted, needs=("3d", "rings")),
+                 lambda site, generator: (draw_place(site, generator)[0],
+                                          signed_log_uniform(generator, 1e-3, 1e-2)), ring_twisted,
+                 needs=("3d", "rings")),
     HiddenEffect("ring_shifted", "field",
                  (HiddenParameter("ring"), HiddenParameter("x", M), HiddenParameter("y", M)),
-           _draw_shift, ring_shifted, needs=("3d", "rings")),
+                 _draw_shift, ring_shifted, needs=("3d", "rings")),
     HiddenEffect("blocks_swapped", "field",
-           (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
+                 (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
                  blocks_swapped),
     HiddenEffect("block_flipped", "field", BLOCK, draw_place, block_flipped),
     HiddenEffect("block_missing", "field", BLOCK, draw_place, block_missing),
     HiddenEffect("block_demagnetized", "field", (*BLOCK, HiddenParameter("fraction")),
-           lambda site,
-                 generator: (*draw_place(site, generator), log_uniform(generator, 0.04, 0.3)),
-           block_demagnetized),
+                 lambda site, generator: (*draw_place(site, generator),
+                                          log_uniform(generator, 0.04, 0.3)),
+                 block_demagnetized),
     HiddenEffect("corners_demagnetized", "field", (HiddenParameter("fraction"),),
-                 draw_number(0.03, 0.3, False),
-           corners_demagnetized),
+                 draw_number(0.03, 0.3, False), corners_demagnetized),
     HiddenEffect("magnetization_gradient", "field", (*BLOCK, HiddenParameter("fraction")),
-                 _draw_gradient,
-           magnetization_gradient, of_blocks=True),
+                 _draw_gradient, magnetization_gradient, of_blocks=True),
     HiddenEffect("temperature", "field",
                  (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
-           lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
+                 lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
     HiddenEffect("temperature_gradient", "field",
-           (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
-           lambda site, generator: (signed_log_uniform(generator, 3, 15), SMCO),
+                 (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
+                 lambda site, generator: (signed_log_uniform(generator, 3, 15), SMCO),
                  temperature_gradient),
     HiddenEffect("inner_radius", "field", (HiddenParameter("change", M),), draw_length(1e-4, 6e-4),
-                 inner_radius,
-           of_blocks=True),
+                 inner_radius, of_blocks=True),
     HiddenEffect("length", "field", (HiddenParameter("fraction"),), draw_number(5e-4, 4e-3),
-                 magnet_length,
-           needs=("3d",), of_blocks=True),
+                 magnet_length, needs=("3d",), of_blocks=True),
     HiddenEffect("background", "field", tuple(HiddenParameter(name, "T") for name in "xyz"),
-           lambda site, generator: tuple(
-               float(value) for value in log_uniform(generator, 5e-5, 5e-4)
-               * np.array(draw_direction(generator, site.dimension))), background),
-    HiddenEffect("neighbour_magnet", "field", (HiddenParameter("distance", M),),
-           _draw_neighbour, neighbour_magnet, needs=("3d",)),
+                 lambda site, generator: tuple(
+                     float(value) for value in log_uniform(generator, 5e-5, 5e-4)
+                     * np.array(draw_direction(generator, site.dimension))), background),
+    HiddenEffect("neighbour_magnet", "field", (HiddenParameter("distance", M),), _draw_neighbour,
+                 neighbour_magnet, needs=("3d",)),
     HiddenEffect("ferromagnetic_object", "field",
-           (*(HiddenParameter(name, M) for name in "xyz"), HiddenParameter("volume", "m^3")),
-                 _draw_object,
-           ferromagnetic_object, needs=("3d",)),
+                 (*(HiddenParameter(name, M) for name in "xyz"), HiddenParameter("volume", "m^3")),
+                 _draw_object, ferromagnetic_object, needs=("3d",)),
 )

@@ -1,0 +1,132 @@
+"""What a notebook shows of a result: its main figure, or a table."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Mapping, Sequence
+from functools import singledispatch
+
+from matplotlib.figure import Figure
+
+from halbach_fe.api import MultipoleTables
+from halbach_fe.design.demagnetization import DemagnetizationMap
+from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.design.shimming import Shim
+from halbach_fe.design.sorting import SortedBlocks
+from halbach_fe.design.tolerance import Tolerance
+from halbach_fe.diagnosis.result import Diagnosis
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.result import InferenceResult
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.demagnetization import worst_block_table
+from halbach_fe.report.diagnosis import change_table, found_table, verdict
+from halbach_fe.report.multipoles import multipole_figure
+from halbach_fe.report.page import geometry_figure
+from halbach_fe.report.plan import plan_summary
+from halbach_fe.report.prediction import prediction_profile_figure
+from halbach_fe.report.shimming import move_table
+from halbach_fe.report.solution import field_figure
+from halbach_fe.report.sorting import order_table
+from halbach_fe.report.tolerance import quantile_table
+from halbach_fe.report.verification import difference_table
+from halbach_fe.response.mesh_convergence import Verification
+from halbach_fe.response.solution import Solution
+from halbach_fe.synthetic.simulate import SimulatedCampaign
+
+DOTS_PER_INCH = 100
+
+
+@singledispatch
+def html_of(result: object) -> str:
+    """Return the main figure or table of a result as HTML, complete without other files."""
+    raise TypeError(f"a {type(result).__name__} has no figure")
+
+
+@html_of.register
+def _(magnet: Magnet) -> str:
+    points = points_from(magnet.study.observation.positions)
+    return picture(geometry_figure(magnet, points), f"The magnet {magnet.name}, with the "
+                   "magnetization of its blocks and the positions of its study")
+
+
+@html_of.register
+def _(solution: Solution) -> str:
+    return picture(field_figure(solution), f"The field of {solution.magnet.name} at the study's "
+                   "positions, and the solver's error bar of each reading")
+
+
+@html_of.register
+def _(result: InferenceResult) -> str:
+    return picture(prediction_profile_figure(result), "Readings, and what the model predicts "
+                   "before and after the update")
+
+
+@html_of.register
+def _(diagnosis: Diagnosis) -> str:
+    words = f"<p>{html.escape(' '.join(verdict(diagnosis)))}</p>"
+    return words + table(found_table(diagnosis)) + table(change_table(diagnosis))
+
+
+@html_of.register
+def _(found: MultipoleTables) -> str:
+    return "".join(picture(multipole_figure(known, None), "Multipoles in units of 1e-4")
+                   for _, known in found.tables)
+
+
+@html_of.register
+def _(found: Verification) -> str:
+    return table(difference_table(found))
+
+
+@html_of.register
+def _(plan: MeasurementPlan) -> str:
+    return table([{"figure": name, "value": str(value)}
+                  for name, value in plan_summary(plan).items()])
+
+
+@html_of.register
+def _(shim: Shim) -> str:
+    return table(move_table(shim))
+
+
+@html_of.register
+def _(found: SortedBlocks) -> str:
+    return table(order_table(found))
+
+
+@html_of.register
+def _(found: Tolerance) -> str:
+    return table(quantile_table(found))
+
+
+@html_of.register
+def _(found: DemagnetizationMap) -> str:
+    return table(worst_block_table(found.by_block()))
+
+
+@html_of.register
+def _(campaign: SimulatedCampaign) -> str:
+    points = points_of(campaign.readings)
+    return table([{"study": campaign.study.name, "points": str(len(points)),
+                   "blocks": str(len(campaign.blocks))}])
+
+
+def picture(figure: Figure, text: str) -> str:
+    """Return a figure as an image element; ``text`` stands for it where it cannot be seen."""
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", dpi=DOTS_PER_INCH)
+    data = base64.b64encode(raw.getvalue()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return rows of text as an HTML table; nothing if there are none."""
+    if not rows:
+        return ""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(value)}</td>" for value in row.values())
+                   + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"

@@ -1,0 +1,140 @@
+"""The field of the nominal magnet at the study's positions, and its readings with error bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.tables import csv_text
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.observation import Observation, observe
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.solver.field import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.session import Session
+
+
+@dataclass(frozen=True)
+class Solution(ShownInNotebook):
+    """The solved field of a nominal magnet.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    points, flux_density : ndarray, shape (n, 3), in m and T
+        The study's positions and B there.
+    observation : Observation
+        How the study turns B into readings.
+    readings, errors : ndarray, shape (readings,), in T
+        The readings, and the error bar of the solver for each.
+    getdp : str
+        Version of GetDP.
+    """
+
+    magnet: Magnet
+    points: Floats
+    flux_density: Floats
+    observation: Observation
+    readings: Floats
+    errors: Floats
+    getdp: str
+
+    @property
+    def field_map(self) -> xr.Dataset:
+        """B at the study's positions as a labelled map, see `halbach_fe.measurement.field_map`."""
+        return field_map(self.points, self.flux_density, attributes={
+            "study": self.magnet.name, "halbach_fe": metadata.version("halbach-fe"),
+            "getdp": self.getdp, "method": self.magnet.study.solver.method})
+
+    def summary(self) -> dict[str, object]:
+        """Return the main figures for scripts: sizes of map and field, largest error bar."""
+        size = np.linalg.norm(self.flux_density, axis=1)
+        strongest = int(np.argmax(size))
+        return {
+            "study": self.magnet.name, "points": len(self.points),
+            "readings": len(self.readings), "method": self.magnet.study.solver.method,
+            "max_B_T": float(size.max()), "max_B_at_m": self.points[strongest].tolist(),
+            "min_B_T": float(size.min()), "largest_error_T": float(self.errors.max()),
+            "mean_B_T": self.flux_density.mean(axis=0).tolist()}
+
+
+def study_observation(magnet: Magnet) -> Observation:
+    """Return the study's observation of a map with all components at the study's positions.
+
+    Raises
+    ------
+    StudyError
+        If a position, or the place of a sensor there, is not in air.
+    """
+    points = points_from(magnet.study.observation.positions)
+    observation = observe(magnet.study, points, np.ones_like(points, bool))
+    check_points(magnet, _places(points, observation))
+    return observation
+
+
+def solve(magnet: Magnet, session: Session) -> Solution:
+    """Solve for the field of the nominal magnet at the study's positions.
+
+    Iron with an H(B) curve is solved by Newton's method. The run folders of GetDP are kept in the
+    session's folder, to be run by hand.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+
+    Returns
+    -------
+    Solution
+        Field, readings and their error bars.
+
+    Raises
+    ------
+    StudyError
+        If positions are not in air.
+    GetDPError
+        If GetDP fails, or its answer does not pass verification.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> solution = hf.solve(magnet, hf.Session.open("results"))
+    >>> round(float(solution.field_map["B_T"].sel(component="x").mean()), 3)
+    0.603
+    """
+    observation = study_observation(magnet)
+    points = observation.map_points
+    places = _places(points, observation)
+    part = finite_element_part(magnet, places, session, columns=False)
+    field = vacuum_part(magnet, places) + part.nominal
+    sensors = slice(-len(observation.points), None)
+    errors = reading_errors(magnet, observation, replace(
+        part, nominal=part.nominal[sensors],
+        error=None if part.error is None else part.error[sensors]), error_bar_session(session))
+    return Solution(magnet, points, field[:len(points)], observation,
+                    observation.apply(field[sensors]), errors, session.getdp.version)
+
+
+def write_solution(solution: Solution, folder: Path) -> None:
+    """Write field_map.h5, .csv and .vtu (for ParaView), and readings.csv."""
+    for suffix in (".h5", ".csv", ".vtu"):
+        write_map(solution.field_map, folder / f"field_map{suffix}")
+    x, y, z = solution.observation.positions.T
+    write_text(folder / "readings.csv", csv_text({
+        "label": solution.observation.labels, "x_m": x, "y_m": y, "z_m": z,
+        "value_T": solution.readings, "error_T": solution.errors}))
+
+
+def _places(points: Floats, observation: Observation) -> Floats:
+    """The points of the map, and behind them those of the sensors if these are elsewhere."""
+    elsewhere = not np.array_equal(observation.points, points)
+    return np.vstack([points, observation.points]) if elsewhere else points

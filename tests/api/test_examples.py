@@ -1,0 +1,122 @@
+"""The Python interface: its names, its examples, and how light it is to import."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tomlkit
+
+import halbach_fe as hf
+from tests.conftest import DIPOLE, changed
+
+MODULES = sorted(
+    module.name for module in pkgutil.walk_packages(hf.__path__, "halbach_fe.")
+    if not module.name.endswith("__main__"))
+FUNCTIONS = [name for name in hf.__all__ if inspect.isfunction(inspect.unwrap(getattr(hf, name)))
+             or inspect.isfunction(getattr(getattr(hf, name), "dispatch", None))]
+LIMIT_S = 0.7
+HEAVY = {"numpy", "scipy", "pydantic", "xarray", "matplotlib", "gmsh", "rich", "arviz", "plotly"}
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """A folder with the files that the examples name: a study, a map of it, its blocks."""
+    folder = tmp_path_factory.mktemp("examples")
+    study = changed(DIPOLE, array__recoil_permeability=1.0,
+                    noise={"regions": [{"name": "all", "sigma_T": 1e-5}]})
+    (folder / "dipole.toml").write_text(tomlkit.dumps(study))
+    hf.write_report(hf.simulate_measurement(hf.read_study(folder / "dipole.toml")), folder)
+    header, *rows = (folder / "blocks.csv").read_text().splitlines()
+    names = header.split(",")
+    place = [names.index(name) for name in ("serial", "ring", "slot")]
+    for row in rows[:2]:  # two more blocks of the first types
+        cells = row.split(",")
+        for number, value in zip(place, (f"spare-{cells[place[0]]}", "", ""), strict=True):
+            cells[number] = value
+        rows.append(",".join(cells))
+    (folder / "spares.csv").write_text("\n".join([header, *rows, ""]))
+    return folder
+
+
+def examples():
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    for name in ("halbach_fe", *MODULES):
+        for found in finder.find(importlib.import_module(name), name):
+            if found.examples:
+                yield pytest.param(found, id=found.name)
+
+
+@pytest.mark.parametrize("example", list(examples()))
+def test_examples_run(example, campaign, monkeypatch):
+    monkeypatch.chdir(campaign)
+    said = []
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    runner.run(example, out=said.append, clear_globs=False)
+    assert runner.failures == 0, "".join(said)
+
+
+def test_a_wrong_example_is_seen(campaign):
+    wrong = doctest.DocTestParser().get_doctest(">>> 1 + 1\n3\n", {}, "wrong", None, 0)
+    runner = doctest.DocTestRunner()
+    runner.run(wrong, out=lambda text: None)
+    assert runner.failures == 1
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_function_has_an_example(name):
+    assert ">>>" in (inspect.getdoc(getattr(hf, name)) or "")
+
+
+def test_the_functions_are_all_there():
+    assert len(FUNCTIONS) >= 16
+    assert set(hf.__all__) <= set(dir(hf))
+    with pytest.raises(AttributeError, match="no attribute"):
+        _ = hf.nothing_like_it
+
+
+def run(*command):
+    return subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True)
+
+
+@pytest.mark.parametrize("command", [
+    ("-c", "import halbach_fe"), ("-m", "halbach_fe", "--help"),
+    ("-m", "halbach_fe", "infer", "--help")], ids=["import", "help", "verb"])
+def test_nothing_heavy_is_imported_for_help(command):
+    done = run("-X", "importtime", *command)
+    imported = {line.rpartition("|")[2].strip().partition(".")[0]
+                for line in done.stderr.splitlines()}
+    assert "argparse" in imported or command[0] == "-c"  # the list is not empty
+    assert not imported & HEAVY
+
+
+def test_results_for_scripts_load_no_matplotlib(campaign):
+    """With --json a command that writes no page, and any --dry-run, does without pictures."""
+    code = ("import sys; from halbach_fe.cli import main; "
+            f"main(['solve', '{campaign}/dipole.toml', '-o', '{campaign}/none', '--dry-run', "
+            "'--json']); sys.exit('matplotlib' in sys.modules)")
+    run("-c", code)
+
+
+def test_a_notebook_shows_the_main_figure(campaign, session):
+    magnet = hf.build_magnet(hf.read_study(campaign / "dipole.toml"))
+    solution = hf.solve(magnet, session)
+    shown = solution._repr_html_()
+    assert "data:image/png;base64," in shown
+    assert "http" not in shown.replace("http://www.w3.org", "")
+    assert "dipole" in magnet._repr_html_()
+
+
+def test_labelled_arrays_come_out(campaign, session):
+    magnet = hf.build_magnet(hf.read_study(campaign / "dipole.toml"))
+    result = hf.infer(magnet, hf.read_map(campaign / "map.csv"), session)
+    one = result.magnetizations.sel(parameter="r01s05.Mx")
+    assert np.isfinite(float(one["posterior_mean"]))
+    assert float(one["posterior_sd"]) < float(one["prior_sd"])
+    assert result.predictions.sizes["reading"] == len(result.observation)
