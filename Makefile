@@ -74,11 +74,7 @@ docs: setup-test
 
 lint: setup-test
 	.venv/bin/ruff check .
-	@# mypy follows folders, not the package-dir mapping: show it the installed layout
-	rm -rf build/typed && mkdir -p build/typed
-	cp -rs "$(CURDIR)/halbach_fe" "$(CURDIR)/benchmarks" "$(CURDIR)/tests" build/typed/
-	for room in geo pro cli; do ln -s "$(CURDIR)/$$room" build/typed/halbach_fe/$$room; done
-	cd build/typed && ../../.venv/bin/mypy --config-file ../../pyproject.toml -p halbach_fe -p benchmarks
+	.venv/bin/python tools/check_types.py
 
 # The wheel, alone in a clean environment outside the checkout, solves a study.
 wheel-check: setup

@@ -10,7 +10,6 @@ from pathlib import Path
 import ngsolve
 import numpy as np
 
-from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
@@ -31,6 +30,7 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import FroehlichLaw, law_of
 from tests.oracles import dipole_of, ngsolve_model, ngsolve_nonlinear
+from tests.support.memory import Weighed, own_peak
 
 STUDIES = Path(__file__).parent.parent / "studies"
 STUDY, FASER_IRON = STUDIES / "sensitivity" / "study.toml", STUDIES / "faser" / "iron.toml"

@@ -10,7 +10,6 @@ import magpylib
 import ngsolve
 import numpy as np
 
-from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.geometry.array_layout import position_angle_deg
@@ -31,6 +30,7 @@ from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import changed
 from tests.oracles import dipole_of
 from tests.oracles import ngsolve_model as oracle
+from tests.support.memory import Weighed, own_peak
 
 HERE = Path(__file__).parent
 CAMPAIGN = HERE.parent / "studies" / "faser" / "campaign.toml"

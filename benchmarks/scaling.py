@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from benchmarks.memory import Weighed, own_peak
 from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.cli import main as halbach_fe
@@ -42,6 +41,7 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed
 from tests.oracles.cuboids import cuboid_field, long_dipole
+from tests.support.memory import Weighed, own_peak
 
 POINTS = Path(__file__).parent / "scaling.json"
 FEW = 42  # circles of 8 points: 1008 readings

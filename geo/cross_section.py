@@ -195,7 +195,8 @@ def _surface(outline: Outline) -> int:
 def _set_sizes(magnet: Magnet) -> None:
     """Set the element sizes in Gmsh.
 
-    The size is constant in the bore and in the magnet, and grows linearly outside. The sizes are Gmsh fields, because a Python callback would swallow Ctrl-C during meshing.
+    The size is constant in the bore and in the magnet, and grows linearly outside. The sizes are
+    Gmsh fields, because a Python callback would swallow Ctrl-C during meshing.
     """
     block_size = magnet.study.mesh.block_size_m
     bore_size = magnet.study.mesh.bore_size_m or block_size

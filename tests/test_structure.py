@@ -196,3 +196,13 @@ def test_every_package_is_installed():
         "packages"])
     packages = {f"halbach_fe.{me}" for me, path in MODULES.items() if path.name == "__init__.py"}
     assert listed == packages - {"halbach_fe.__init__"} | {"halbach_fe"}
+
+
+def of_benchmarks(path):
+    return [name for name in imports(path) if name.partition(".")[0] == "benchmarks"]
+
+
+def test_tests_import_no_benchmarks():
+    """Benchmarks import the oracles and the support of the tests, never the other way round."""
+    assert not [path for path in (ROOT / "tests").rglob("*.py") if of_benchmarks(path)]
+    assert of_benchmarks(ROOT / "benchmarks" / "run.py")  # an import would be seen

@@ -57,9 +57,9 @@ class PointsOutsideError(MeshError):
     Attributes
     ----------
     study : str
-        Name of the study, or of what else was meshed.
+        Name of the study, or of the other object that was meshed.
     reason : str
-        Which points lie outside of what.
+        End of the sentence: the limits of the meshed region, and the points outside of it.
     """
 
     def __init__(self, study: str, reason: str) -> None:
@@ -88,7 +88,7 @@ class GetDPError(HalbachError):
     Attributes
     ----------
     log : Path or None
-        Log of the run. Whoever moves the run folder says here where the log is then.
+        Log of the run; code that moves the run folder has to update this path.
     """
 
     exit_code = 7
@@ -99,8 +99,10 @@ class GetDPError(HalbachError):
         self.log = log
 
     def __str__(self) -> str:
-        """The sentence, and where the log is."""
-        return self.sentence + ("" if self.log is None else f" Its log is {printable(self.log, MAX_QUOTED)}.")
+        """The sentence, followed by the place of the log if it is known."""
+        if self.log is None:
+            return self.sentence
+        return f"{self.sentence} Its log is {printable(self.log, MAX_QUOTED)}."
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling: the error travels from worker processes to the main process."""

@@ -62,6 +62,7 @@ from halbach_fe.study.model import Study
 
 MAX_ROUNDS = 8
 """Largest number of rounds, each of which solves the model once."""
+
 CONVERGENCE_TOLERANCE = 0.2
 """Largest change of an amplitude between rounds that counts as converged, in units of the
 amplitude's posterior standard deviation."""

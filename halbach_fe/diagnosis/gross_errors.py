@@ -20,11 +20,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from pydantic import ValidationError
 from scipy.optimize import least_squares, minimize_scalar
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachError, HalbachWarning
+from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError
 from halbach_fe.diagnosis.map_conventions import (
     ALL_AXES,
     FIELD_AXES_BY_ERROR_COUNT,
@@ -79,8 +78,8 @@ One block upside down in an array of 64 causes 4 to 6, and no gross error explai
 
 MIN_MISFIT_REDUCTION = 3.0
 """Factor by which correcting an error must reduce the misfit. The best wrong error reduces the
-misfit of an upside-down or missing block, or of sensors that are 6 mm apart, by no more than a
-factor of 2."""
+misfit of an upside-down or missing block, or of sensors displaced by 6 mm, by no more than a factor
+of 2."""
 
 MAX_REMAINING_MISFIT = 0.05
 """Largest misfit that may remain after the correction, relative to the map's rms."""
@@ -93,12 +92,14 @@ MAX_ERRORS = 3
 
 MIN_MISFIT_OF_SEVERAL_ERRORS = 0.15
 """Smallest misfit, relative to the map's rms, at which combinations of errors are tried."""
+
 MIN_MISFIT_OF_WRONG_UNIT = 0.5
 """Smallest misfit, relative to the map's rms, at which other units are tried."""
 
 MIN_RADIUS_CHANGE = 0.03
 """Smallest relative change of the radius that is a gross error. Smaller changes are effects of the
 catalogue."""
+
 MIN_SHIFT_M = 0.006
 """Smallest displacement of the points that is a gross error: six standard deviations of the effects
 in the catalogue."""
@@ -106,6 +107,7 @@ in the catalogue."""
 RADIUS_FACTORS = tuple(float(factor) for factor in np.geomspace(0.4, 2.5, 17)
                        if abs(factor - 1) > 0.01)
 """Factors of the radius from which the search for the best factor starts."""
+
 RADIUS_OFFSETS = tuple(float(offset) for offset in np.linspace(-0.5, 0.5, 11)
                        if abs(offset) > 0.01)
 """Offsets of the radius, relative to the bore's radius, from which the search for the best offset
@@ -264,7 +266,7 @@ class _Search:
             return False
         try:
             convention.apply(self.study)
-        except ValidationError:
+        except StudyError:
             return False
         return True
 
@@ -272,14 +274,14 @@ class _Search:
         """Yield all conventions with ``level`` errors of units, axes and magnet."""
         flat = self.study.dimension == 2
         singles = [
-            *(MapConvention(positions=one) for one in ALL_AXES if not (flat and one[2] != "z")
-              and 0 < len(axis_errors(one, IDENTITY_AXES)) <= min(level, 2)),
-            *(MapConvention(magnet=one) for one in self.other)]
+            *(MapConvention(positions=axes) for axes in ALL_AXES if not (flat and axes[2] != "z")
+              and 0 < len(axis_errors(axes, IDENTITY_AXES)) <= min(level, 2)),
+            *(MapConvention(magnet=variant) for variant in self.other)]
         for unit in self.lengths:
             yield from self.of_source(MapConvention(length_unit=unit), level)
-            for one in singles:
-                if unit == 1 or len(one.errors) < level:
-                    yield from self.of_source(replace(one, length_unit=unit), level)
+            for single in singles:
+                if unit == 1 or len(single.errors) < level:
+                    yield from self.of_source(replace(single, length_unit=unit), level)
 
     def of_source(self, source: MapConvention, level: int) -> Iterator[MapConvention]:
         """Yield all conventions with ``level`` errors for given coordinates and a given magnet."""
@@ -300,13 +302,13 @@ class _Search:
         size = self.study.array.inner_radius_m
         for unit in self.lengths if level > 1 else (1.0,):
             source = MapConvention(length_unit=unit)
-            families = [[replace(source, offset_m=size * one) for one in RADIUS_OFFSETS
-                         if unit * smallest + size * one > 0]]
+            families = [[replace(source, offset_m=size * offset) for offset in RADIUS_OFFSETS
+                         if unit * smallest + size * offset > 0]]
             if circles:
-                families.append([replace(source, radius=one) for one in RADIUS_FACTORS])
+                families.append([replace(source, radius=factor) for factor in RADIUS_FACTORS])
             for family in families:
-                tried = [one for start in family for one in self.of_source(start, level)]
-                best = min(tried, key=lambda one: self.misfit(one).standard, default=None)
+                tried = [each for start in family for each in self.of_source(start, level)]
+                best = min(tried, key=lambda each: self.misfit(each).standard, default=None)
                 if best:
                     yield from self.decided(self.refined(best))
         if level == 1:
@@ -345,7 +347,7 @@ class _Search:
             own = self.residual(convention(shift))
             return np.full(self.present, 1e3) if own is None else own[0]
 
-        best = min(starts, key=lambda one: self.misfit(convention(one)).standard)
+        best = min(starts, key=lambda shift: self.misfit(convention(shift)).standard)
         found = least_squares(residual, best, x_scale=size, diff_step=1e-4, max_nfev=8).x
         yield from self.decided(convention(found))
 
@@ -413,7 +415,7 @@ class _Search:
             study = convention.apply(self.study)
             with warnings.catch_warnings(action="ignore", category=HalbachWarning):
                 measured = prior_from_blocks(build_magnet(study), self.table).gaussian.mean
-        except (ValidationError, HalbachError):
+        except HalbachError:
             return nominal
         blocks = build_magnet(study).blocks
         mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
@@ -437,7 +439,7 @@ class _Search:
                     self.blocks[source.magnet] = build_magnet(study).blocks
                 self.computed[source] = _Nominal.of(
                     study, self.blocks[source.magnet], self.points)
-            except (ValidationError, HalbachError):
+            except HalbachError:
                 self.computed[source] = None
         return self.computed[source]
 

@@ -17,8 +17,10 @@ from halbach_fe.study.types import COMPONENTS, Axes
 
 LENGTH_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
 """Length units by their size in m."""
+
 FLUX_DENSITY_UNITS = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
 """Flux density units by their size in T."""
+
 MAX_RING_DIFFERENCE = 4
 """Largest difference between the numbers of rings of the true magnet and of the study's."""
 
@@ -26,6 +28,7 @@ ALL_AXES: tuple[Axes, ...] = tuple(
     tuple(sign + name for sign, name in zip(signs, names, strict=True))  # type: ignore[misc]
     for names in permutations(COMPONENTS) for signs in product(("", "-"), repeat=3))
 """All assignments of three columns to signed axes."""
+
 IDENTITY_AXES: Axes = ("x", "y", "z")
 """Columns along x, y and z."""
 
@@ -124,7 +127,7 @@ class MapConvention:
             If no valid study has this convention.
         """
         if self.magnet:
-            study = Study.model_validate(self.magnet.change(study).model_dump())
+            study = self.magnet.change(study)
         old = study.instrument
         changes = {
             "length_unit_m": old.length_unit_m * self.length_unit,

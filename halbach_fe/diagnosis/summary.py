@@ -41,6 +41,7 @@ DISPLAY_UNITS = {
 
 EMPTY_CELL = "–"
 """Text of a table's cell without an entry."""
+
 MAX_LISTED_ROWS = 10
 """Largest number of outliers that a report lists. The summary has all of them."""
 

@@ -68,7 +68,7 @@ def infer(
         Of the parameters in A/m, in place of both.
     linearized_only : bool
         Do not solve the updated magnet to see whether linearizing its iron was good enough.
-    unseen : Dataset, optional
+    validation_map : Dataset, optional
         Another map, which is only predicted; see `halbach_fe.measurement.observation.predicted_as`.
 
     Raises

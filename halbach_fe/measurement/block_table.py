@@ -168,7 +168,7 @@ def _check(table: BlockTable) -> None:
     given = np.abs(np.column_stack([table.moment, table.sigma]))
     for number in np.flatnonzero(~(given <= MAX_MOMENT).all(axis=1)).tolist():
         if not np.isfinite(given[number]).all():
-            refuse(number, "moment and sigma", "finite numbers", "an infinite or missing one")
+            refuse(number, "moment and sigma", "finite numbers", "an infinite or missing value")
         refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2",
                f"{given[number].max():g}")
     size = np.linalg.norm(table.moment, axis=1)
@@ -182,17 +182,17 @@ def _check(table: BlockTable) -> None:
             refuse(number, "volume_m3", "positive", f"{table.volume[number]:g}",
                    "Leave it empty if it is not known.")
         if np.isinf(table.volume[number]) or np.isinf(table.temperature[number]):
-            refuse(number, "volume and temperature", "finite numbers", "an infinite one")
+            refuse(number, "volume and temperature", "finite numbers", "an infinite value")
         if (table.ring[number] > 0) != (table.slot[number] > 0):
-            refuse(number, "place", "ring and slot together", "one of them alone",
+            refuse(number, "place", "ring and slot together", "only one of the two",
                    "Leave both empty if the place is not known.")
     serials: set[str] = set()
     blocks: dict[tuple[int, int], str] = {}
     for number, (serial, place) in enumerate(zip(table.serial, table.places, strict=True)):
         if serial in serials:
-            refuse(number, "serial", "that of one block", "the same again", "Remove a row.")
+            refuse(number, "serial", "unique to one block", "that of an earlier row", "Remove a row.")
         if place[0] and place in blocks:
-            refuse(number, "place", "that of one block",
+            refuse(number, "place", "unique to one block",
                    f"ring {place[0]}, slot {place[1]}, where block {blocks[place]} is")
         serials.add(serial)
         blocks[place] = serial

@@ -234,7 +234,7 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
     if np.isinf(values).any() or not np.isfinite(points).all():
         row = int(np.argmax(np.isinf(values).any(axis=1) | ~np.isfinite(points).all(axis=1)))
         raise MeasurementError(must_be(f"reading {row + 1}", where, "finite numbers",
-                                       "an infinite or missing one"))
+                                       "an infinite or missing value"))
     blank = np.isnan(values).all(axis=1)
     if blank.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
@@ -243,7 +243,7 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
         sigma = data["sigma_T"].values[~np.isnan(values)]
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
             raise MeasurementError(must_be("sigma", where, "positive for every reading",
-                                           "zero, a negative or a missing one"))
+                                           "a zero, negative or missing value"))
     if "scan" in data:
         _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)

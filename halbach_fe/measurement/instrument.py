@@ -211,7 +211,8 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
             return shown - rest
     raise MeasurementError(must_be(
         "`instrument`", "study", "a law of the sensors that can be undone",
-        "one that does not converge", "Make its terms smaller."))
+        "a law whose inversion does not converge",
+        "Make its nonlinear terms smaller."))
 
 
 def _check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:

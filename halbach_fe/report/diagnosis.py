@@ -79,7 +79,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.identified:
         fits = diagnosis.converged and after.prior_conflict <= after.conflict_limit
         start = "The map is explained by" if fits else (
-            "The best explanation from the catalogue, which leaves a misfit, is")
+            "The best explanation from the catalogue is")
         sentences.append(f"{start}: " + "; ".join(
             _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
         sentences += [

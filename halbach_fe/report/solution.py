@@ -40,7 +40,8 @@ def write_solution_report(
         "geometry.png": (geometry_figure(solution.magnet, solution.points), "The blocks of a ring "
                          "with their magnetization, the iron if there is any, and the study's "
                          "positions"),
-        "field.png": (field_figure(solution), "The field at the study's positions, and the solver's "
+        "field.png": (field_figure(solution),
+                      "The field at the study's positions, and the solver's "
                       "error bar of each reading")}
     multipoles: list[MultipoleTable] = [
         (model, {"nominal": known}) for model, known in solved_circles(

@@ -52,7 +52,7 @@ def dual(magnet: Magnet, route: str) -> Magnet:
 
 def error_bar_session(session: Session) -> Session:
     """The session with a folder of its own for error bars: the study's run folders are kept."""
-    return replace(session, folder=session.folder / "error-bar")
+    return session.within("error-bar")
 
 
 def reading_errors(
@@ -72,15 +72,17 @@ def reading_errors(
     nominal = parts.nominal
     if parts.error is not None:
         return observation.magnitude(parts.error)
-    if not nominal.any():  # nothing is left to finite elements
-        return np.zeros(len(observation))
+    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
+        return np.zeros(len(observation))  # nothing is left to finite elements
     route = choose_route(magnet, observation.points)
 
-    def change(variant: Magnet) -> Floats:
-        other = finite_element_part(variant, observation.points, session, columns=False).nominal
+    def change(variant: Magnet, purpose: str) -> Floats:
+        other = finite_element_part(
+            variant, observation.points, replace(session, purpose=f"error bars, {purpose}"),
+            columns=False).nominal
         return observation.magnitude(other - nominal)
 
     if route in DUAL:
-        return change(dual(magnet, route))
-    return change(refined(magnet, 1 / REFINEMENT)) + change(
-        farther(magnet, MESHES[route], REFINEMENT))
+        return change(dual(magnet, route), "dual route")
+    return change(refined(magnet, 1 / REFINEMENT), "coarser mesh") + change(
+        farther(magnet, MESHES[route], REFINEMENT), "farther boundary")

@@ -118,20 +118,16 @@ def verify(
     points = points_from(magnet.study.observation.positions)
     route = choose_route(magnet, points)
 
-    def solve(what: str, variant: Magnet) -> Floats:
-        say(what)
-        return solve_nominal(variant, points, session)
-
-    base = solve("the study's mesh", magnet)
-    coarse = solve("a coarser mesh", refined(magnet, 1 / REFINEMENT))
-    fine = solve("a finer mesh", refined(magnet, REFINEMENT))
-    far = solve("a farther boundary", farther(magnet, MESHES[route], REFINEMENT))
+    fields = {}
+    for purpose, variant in variants_to_compare(magnet, points).items():
+        say(purpose)
+        fields[purpose] = solve_nominal(variant, points, session)
+    base, coarse, fine, far, *others = fields.values()
     compare = _Comparison(magnet, points, base)
     pairs = {"coarser mesh to the study's": (coarse, base),
              "the study's mesh to a finer": (base, fine), "boundary farther away": (base, far)}
-    if route in DUAL:
-        pairs[f"dual route, {DUAL[route]}"] = (
-            base, solve(f"the dual route, {DUAL[route]}", dual(magnet, route)))
+    if others:
+        pairs[f"dual route, {DUAL[route]}"] = base, others[0]
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)
     steps = [compare(what, *pair) for what, pair in pairs.items()]
@@ -150,6 +146,20 @@ def verify(
                         else magnet.study.mesh.block_size_m),
         points=points, field=base, changes=np.array(
             [np.linalg.norm(one - other, axis=1) for one, other in pairs.values()]))
+
+
+def variants_to_compare(magnet: Magnet, points: Floats) -> dict[str, Magnet]:
+    """Return what `verify` solves at the points (n, 3) in m, by its purpose in words: the study's
+    mesh, a coarser and a finer one, a farther boundary, and the dual route if there is one.
+    """
+    route = choose_route(magnet, points)
+    found = {
+        "the study's mesh": magnet, "a coarser mesh": refined(magnet, 1 / REFINEMENT),
+        "a finer mesh": refined(magnet, REFINEMENT),
+        "a farther boundary": farther(magnet, MESHES[route], REFINEMENT)}
+    if route in DUAL:
+        found[f"the dual route, {DUAL[route]}"] = dual(magnet, route)
+    return found
 
 
 def observed_order(first: float, second: float) -> float:

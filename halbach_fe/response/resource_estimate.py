@@ -10,10 +10,9 @@ and OpenBLAS, one thread; seconds are in units of a factorization that is timed 
 
 from __future__ import annotations
 
-import math
 import os
 import time
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,34 +24,22 @@ from scipy.sparse.linalg import splu
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.geometry.array_layout import position_angle_deg
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import Symmetry, no_symmetry, symmetry_of, unique_points
+from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import LOADED_BYTES
-from halbach_fe.solver.azimuthal_modes import (
-    NOMINAL_SOURCES,
-    modes_needed,
-    nominal_waves,
-    spans_of,
-    unknowns_of,
-)
-from halbach_fe.solver.field import (
-    MESHES,
-    axisymmetric_stand_in,
-    check_points,
-    choose_route,
-    formulation_of,
-    uses_symmetry,
-)
-from halbach_fe.solver.magnetostatics import check_inside
-from halbach_fe.solver.mesh import Entities, meridian_size
+from halbach_fe.response.mesh_convergence import variants_to_compare
+from halbach_fe.solver.azimuthal_modes import mode_decay
+from halbach_fe.solver.field import MESHES, check_points, finite_element_part, formulation_of
+from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
+from halbach_fe.study.types import COMPONENTS
 
 GIB = 2.0**30
 EXACT_FIELD_ONLY = "exact_field_only"
+UPDATED_MAGNET = "the updated magnet"
 
 TIME_FACTOR = 3.0
 """Times are right within it: on nine studies the processor time of all GetDP runs was foretold
@@ -242,173 +229,95 @@ class Estimate:
                                "warning": self.warning}
 
 
-@dataclass(frozen=True)
-class CountedMesh:
-    """How many parts a mesh will have: elements, and what is off its boundary and on its axis."""
-
-    elements: int
-    inner: Entities
-    axis: Entities
-
-
 def estimate_solve(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
-    """What the field of the nominal array takes, with error bars."""
+    """Estimate what the field of the nominal array takes, with error bars."""
     check_points(magnet, observation.points)
-    problems = [*nominal(magnet, observation.points, jobs), *error_bars(magnet, observation, jobs)]
-    return _estimate(magnet, observation.points, len(observation), problems, jobs)
+    session = Session.counting(jobs)
+    few = decisive_points(magnet, observation.points)
+    parts = finite_element_part(magnet, few.points, session, columns=False)
+    reading_errors(magnet, few, parts, error_bar_session(session))
+    return _estimate(magnet, observation.points, len(observation), session, jobs)
 
 
 def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
-    """What the matrix H takes, with error bars, and the update."""
-    points = observation.points
-    check_points(magnet, points)
+    """Estimate what the response matrix takes, with error bars, and the update."""
+    check_points(magnet, observation.points)
+    session = Session.counting(jobs)
+    few = decisive_points(magnet, observation.points)
     try:
-        problems = field_of_blocks(magnet, points, jobs)
+        parts = finite_element_part(magnet, few.points, session)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
-    if axisymmetric_stand_in(magnet, choose_route(magnet, points), points) is None:
-        problems += error_bars(magnet, observation, jobs)
+    reading_errors(magnet, few, parts, error_bar_session(session))
     if magnet.is_nonlinear:  # is the iron linear enough?
-        problems += nominal(magnet, points, jobs, "the updated magnet")
-    return _estimate(magnet, points, len(observation), problems, jobs,
+        finite_element_part(magnet, few.points, replace(session, purpose=UPDATED_MAGNET),
+                            columns=False)
+    return _estimate(magnet, observation.points, len(observation), session, jobs,
                      magnet.dimension * len(magnet.blocks))
 
 
 def estimate_verify(magnet: Magnet, jobs: int) -> Estimate:
-    """What refinement, a farther boundary and the dual route take."""
+    """Estimate what refinement, a farther boundary and the dual route take."""
     points = points_from(magnet.study.observation.positions)
     check_points(magnet, points)
-    route = choose_route(magnet, points)
-    variants = {"the study's mesh": magnet, "a coarser mesh": refined(magnet, 1 / REFINEMENT),
-                "a finer mesh": refined(magnet, REFINEMENT),
-                "a farther boundary": farther(magnet, MESHES[route], REFINEMENT)}
-    if route in DUAL:
-        variants["the dual route"] = dual(magnet, route)
-    problems = [problem for what, variant in variants.items()
-                for problem in nominal(variant, points, jobs, what)]
-    return _estimate(magnet, points, 3 * len(points), problems, jobs)
+    session = Session.counting(jobs)
+    few = decisive_points(magnet, points)
+    for purpose, variant in variants_to_compare(magnet, points).items():
+        finite_element_part(variant, few.points, replace(session, purpose=purpose), columns=False)
+    return _estimate(magnet, points, 3 * len(points), session, jobs)
 
 
-def nominal(
-    magnet: Magnet, points: Floats, jobs: int, what: str = "the study's mesh"
-) -> list[Problem]:
-    """What `routes.finite_element_part` solves without single blocks."""
-    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
-        return []
-    return runs_of(magnet, choose_route(magnet, points), points, (), jobs, what)
-
-
-def field_of_blocks(magnet: Magnet, points: Floats, jobs: int) -> list[Problem]:
-    """What `routes.finite_element_part` solves with single blocks."""
-    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
-        return []
-    route = choose_route(magnet, points)
-    near = axisymmetric_stand_in(magnet, route, points)
-    if near is not None:
-        return field_of_blocks(near, points, jobs) + [
-            problem for one, what in ((magnet, "as it is"), (near, "simpler"))
-            for problem in runs_of(one, "scalar_potential", points, (), jobs, what)]
-    return runs_of(magnet, route, points, _symmetry(magnet).sources, jobs, "the study's mesh")
-
-
-def error_bars(magnet: Magnet, observation: Observation, jobs: int) -> list[Problem]:
-    """What `discretization.reading_errors` solves."""
-    route = choose_route(magnet, observation.points)
-    if route in DUAL:
-        return nominal(dual(magnet, route), observation.points, jobs, "error bars, dual route")
-    coarser, far = refined(magnet, 1 / REFINEMENT), farther(magnet, MESHES[route], REFINEMENT)
-    return [*nominal(coarser, observation.points, jobs, "error bars, coarser mesh"),
-            *nominal(far, observation.points, jobs, "error bars, farther boundary")]
-
-
-def runs_of(
-    magnet: Magnet, route: str, points: Floats, blocks: Sequence[int], jobs: int, what: str
-) -> list[Problem]:
-    """The runs for the nominal array, and for blocks with 1 T along each axis.
-
-    They are what `solve.solve_sources`, `solve_tangent`, `solve_samples` and
-    `azimuthal.solve_modes` start.
+def decisive_points(magnet: Magnet, points: Floats) -> Observation:
+    """Return an observation of the few points that decide which runs there are: those that need the
+    most azimuthal modes and that lie farthest out.
     """
-    kind = MESHES[route]
-    half = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
-    check_inside(magnet.name, boundary_radius(magnet, kind), half, points)
-    mesh = counted(magnet, kind)
-    variants = 1 if magnet.study.solver.method == "direct" else 2
-    sources = 1 + magnet.dimension * len(blocks)
+    decisive = np.unique([
+        np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,
+        np.argmax(np.hypot(points[:, 0], points[:, 1])), np.argmax(np.abs(points[:, 2]))])
+    few = points[decisive]
+    readings = sparse.csr_array(sparse.eye_array(3 * len(few)))
+    labels = tuple(f"B{name}" for name in COMPONENTS) * len(few)
+    return Observation(few, readings, readings, few, labels, np.repeat(few, 3, axis=0))
 
-    def problem(unknowns: int, law: CostLaw, processes: int, matrices: int, solves: int) -> Problem:
-        each = law.bytes_each + law.fill * unknowns ** (1 / 3)
-        seconds = (GETDP_SECONDS + matrices * law.matrix_s * unknowns**law.power
-                   + solves * law.solve_s * unknowns)
-        disk = mesh.elements * MESH_BYTES[kind] + unknowns * (
-            UNKNOWN_BYTES.get(route, OTHER_UNKNOWN_BYTES) + 8 * solves)
-        return Problem(what, route, mesh.elements, unknowns, processes, matrices, solves,
-                       (GETDP_BYTES + unknowns * each) / GIB, seconds, disk / GIB)
 
-    if route == "azimuthal_modes":
-        weights = nominal_waves(magnet, modes_needed(magnet, points))
-        rings = len({number // magnet.array.blocks_per_ring for number in blocks})
-        each = (NOMINAL_SOURCES - 1 + 3 * rings) * unknowns_of(mesh.inner, mesh.axis, 1)
-        spans = [(first, last - first + 1) for first, last in spans_of(
-            weights, bool(blocks), each)]
-        return [problem(unknowns_of(mesh.inner, mesh.axis, first), PLANE, variants, modes,
-                        modes * (NOMINAL_SOURCES + 3 * rings)) for first, modes in spans]
-    formulation = formulation_of(magnet, route)
-    unknowns = formulation.unknowns(mesh.inner)
-    law = PLANE if route == "cross_section" else EDGES[magnet.study.solver.edge_order]
-    if route == "scalar_potential":
-        law = FACTORIZED if unknowns <= formulation.factorized else ITERATED
-        if law is ITERATED and magnet.iron_ring is not None:
+def problems_of(magnet: Magnet, session: Session) -> list[Problem]:
+    """Return the runs that a session has counted, those that are alike together."""
+    assert session.counter is not None
+    return [_problem(magnet, purpose, size, count)
+            for purpose, sizes in session.counter.batches
+            for size, count in Counter(sizes).items()]
+
+
+def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Problem:
+    """What each of some runs takes, by the `CostLaw` of its route."""
+    formulation = formulation_of(magnet, size.route)
+    law = {"cross_section": PLANE, "azimuthal_modes": PLANE, "edge_elements": EDGES[
+        magnet.study.solver.edge_order]}.get(size.route, FACTORIZED)
+    if size.route == "scalar_potential" and size.unknowns > formulation.factorized:
+        law = ITERATED
+        if magnet.iron_ring is not None:
             law = replace(law, solve_s=IRON_ITERATIONS * law.solve_s)
-    if not magnet.is_nonlinear:
-        parts = min(sources, max(1, jobs // variants))
-        return [problem(unknowns, law, variants * parts, 1, math.ceil(sources / parts))]
-    linear = [problem(unknowns, law, 1, 1, sources)] if blocks and variants == 2 else []
-    if not blocks and unknowns > formulation.factorized_for_newton:
-        law = STEPPED
-    law = replace(law, bytes_each=law.bytes_each + NEWTON_BYTES)
-    return [problem(unknowns, law, 1 if blocks else variants, NEWTON_MATRICES * NEWTON_STEPS,
-                    NEWTON_STEPS + (sources if blocks else 0)), *linear]
-
-
-def _symmetry(magnet: Magnet) -> Symmetry:
-    return symmetry_of(magnet) if uses_symmetry(magnet) else no_symmetry(magnet)
-
-
-def counted(magnet: Magnet, kind: str) -> CountedMesh:
-    """Count the parts of a kind of mesh (a value of `routes.MESHES`), without making it."""
-    from halbach_fe import geo  # Gmsh loads only when something is meshed
-
-    if kind == "meridian":
-        columns, rows = geo.grid_size(magnet, meridian_size(magnet))
-        cells = (columns - 1) * (rows - 1)
-        nodes = (columns - 1) * (rows - 2)  # the outer boundary is three sides of the half-plane
-        return CountedMesh(cells, Entities(nodes, nodes, nodes + cells, cells),
-                           Entities(rows - 2, rows - 2, rows - 1, 0))
-    triangles, rim = (round(number) for number in geo.plane_size(magnet, kind))
-    # Euler: a disk of T triangles with R edges on its rim has E edges and V corners
-    edges = (3 * triangles + rim) // 2
-    corners = 1 + edges - triangles
-    none = Entities(0, 0, 0, 0)
-    if kind == "cross_section":
-        inner = Entities(corners + edges - 2 * rim, corners - rim, edges - rim, triangles)
-        return CountedMesh(triangles, inner, none)
-    # every prism on a triangle is cut into three, every rectangle on an edge into two
-    layers = len(geo.layers(magnet)) - 1
-    inner_corners = (corners - rim) * (layers - 1)
-    inner_edges = ((corners - rim) * layers + (edges - rim) * (layers - 1)  # upright, level
-                   + (edges - rim) * layers)  # and across the rectangles
-    inner_faces = triangles * (layers - 1) + 2 * (edges - rim) * layers + 2 * triangles * layers
-    return CountedMesh(3 * triangles * layers, Entities(
-        inner_corners + inner_edges, inner_corners, inner_edges, inner_faces), none)
+    matrices, solves = size.matrices, size.solves
+    if size.newton:
+        if not solves and size.unknowns > formulation.factorized_for_newton:
+            law = STEPPED
+        law = replace(law, bytes_each=law.bytes_each + NEWTON_BYTES)
+        matrices, solves = NEWTON_MATRICES * NEWTON_STEPS, solves + NEWTON_STEPS
+    each = law.bytes_each + law.fill * size.unknowns ** (1 / 3)
+    seconds = (GETDP_SECONDS + matrices * law.matrix_s * size.unknowns**law.power
+               + solves * law.solve_s * size.unknowns)
+    disk = size.elements * MESH_BYTES[MESHES[size.route]] + size.unknowns * (
+        UNKNOWN_BYTES.get(size.route, OTHER_UNKNOWN_BYTES) + 8 * solves)
+    return Problem(purpose, size.route, size.elements, size.unknowns, processes, matrices, solves,
+                   (GETDP_BYTES + size.unknowns * each) / GIB, seconds, disk / GIB)
 
 
 def _estimate(
-    magnet: Magnet, points: Floats, readings: int, problems: Sequence[Problem], jobs: int,
+    magnet: Magnet, points: Floats, readings: int, session: Session, jobs: int,
     parameters: int = 0,
 ) -> Estimate:
     """Add what this program itself takes: for elements, for fields of sources at points, for H."""
-    blocks, speed = magnet.blocks, machine_speed()
+    blocks, speed, problems = magnet.blocks, machine_speed(), problems_of(magnet, session)
     elements = max((one.elements for one in problems), default=0)
     matrix = readings * parameters
     places = 0.0 if magnet.study.solver.method == "direct" else _places(magnet, points)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from itertools import groupby
 from pathlib import Path
@@ -35,9 +36,16 @@ from halbach_fe.solver.interpolation import (
     probes_of,
 )
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, check_inside, render
-from halbach_fe.solver.mesh import Entities, VerifiedMesh, build_meridian, verify_mesh
+from halbach_fe.solver.mesh import (
+    CountedMesh,
+    Entities,
+    VerifiedMesh,
+    build_meridian,
+    count_mesh,
+    verify_mesh,
+)
 from halbach_fe.solver.runs import Task, run_tasks
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import RunSize, Session
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
@@ -73,6 +81,12 @@ def is_axisymmetric(magnet: Magnet, points: Floats) -> bool:
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
     """Highest mode that matters at any of the points (n, 3)."""
+    worst = float(np.clip(mode_decay(magnet, points).max(), 1e-9, 1 - 1e-9))
+    return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+
+
+def mode_decay(magnet: Magnet, points: Floats) -> Floats:
+    """Factor (n,) by which the field at each point falls from one mode to the next."""
     array = magnet.array
     r, z = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
     beyond = np.maximum(z - magnet.array_half_length, 0)
@@ -80,8 +94,7 @@ def modes_needed(magnet: Magnet, points: Floats) -> int:
     decay = np.where(r < array.inner_radius_m, r / array.inner_radius_m,
                      np.where(r > array.outer_radius_m, array.outer_radius_m / np.maximum(r, 1e-9),
                               np.exp(-beyond / array.outer_radius_m)))
-    worst = float(np.clip(decay.max(), 1e-9, 1 - 1e-9))
-    return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+    return np.asarray(decay)
 
 
 @dataclass(frozen=True)
@@ -105,19 +118,31 @@ class _Case:
         Of the nominal array, see `nominal_waves`.
     solved : tuple of int
         Rings, from 0, of the blocks that are solved for.
-    located, probes : Located
-        Where fields are wanted, and where GetDP prints some.
-    places : ndarray, shape (m, 3), in m
-        Of the probes.
+    meridian : ndarray, shape (m, 3), in m
+        Points (r, z, 0) of the half-plane where fields are wanted.
     """
 
     magnet: Magnet
-    mesh: VerifiedMesh
+    mesh: VerifiedMesh | CountedMesh
     weights: Floats
     solved: tuple[int, ...]
-    located: Located
-    probes: Located
-    places: Floats
+    meridian: Floats
+
+    @property
+    def real_mesh(self) -> VerifiedMesh:
+        """The mesh; one that is only counted cannot be solved on."""
+        assert isinstance(self.mesh, VerifiedMesh)
+        return self.mesh
+
+    @cached_property
+    def located(self) -> Located:
+        """Elements of the points."""
+        return locate(self.real_mesh, self.meridian)
+
+    @cached_property
+    def probes(self) -> tuple[Located, Floats]:
+        """Some of the points and their places, where GetDP prints what is compared."""
+        return probes_of(self.real_mesh, self.located)
 
     @property
     def last_source(self) -> int:
@@ -147,18 +172,23 @@ def solve_modes(
     r[r < AXIS_RADIUS * array.inner_radius_m] = 0.0
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
     highest = modes_needed(magnet, points)
-    mesh = verify_mesh(build_meridian(magnet, make_folder(session.folder)))
+    mesh: VerifiedMesh | CountedMesh
+    if session.counter is None:
+        mesh = verify_mesh(build_meridian(magnet, make_folder(session.folder)))
+    else:
+        mesh = count_mesh(magnet, "meridian")
     check_inside(magnet.name, mesh.radius, mesh.half_length, points)
-    located = locate(mesh, meridian)
     solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
     weights = nominal_waves(magnet, highest)
-    case = _Case(magnet, mesh, weights, solved, located, *probes_of(mesh, located))
+    case = _Case(magnet, mesh, weights, solved, meridian)
     spans = spans_of(weights, bool(blocks),
                      case.last_source * unknowns_of(mesh.inner, mesh.axis, 1))
     variants = [False] if magnet.study.solver.method == "direct" else [False, True]
     tasks = [_task(case, span, vacuum, session)
              for span in reversed(spans) for vacuum in variants]
     results = run_tasks(tasks, session)
+    if session.counter is not None:
+        return np.zeros((1 + 3 * len(blocks), len(points), 3))
     if len(variants) == 2:
         results = [real - vacuum for real, vacuum in zip(results[::2], results[1::2], strict=True)]
     modes = dict(zip([m for span in reversed(spans) for m in range(span[0], span[1] + 1)],
@@ -243,7 +273,10 @@ def _task(case: _Case, span: tuple[int, int], vacuum: bool, session: Session) ->
         return read_run(case, folder, modes, sources, printed)
 
     return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{span[0]}", stage=stage_run,
-                read=read, solves=modes * sources)
+                read=read, shape=(modes, sources, len(case.meridian), 3), solves=modes * sources,
+                size=RunSize("azimuthal_modes", case.mesh.elements,
+                             unknowns_of(case.mesh.inner, case.mesh.axis, span[0]),
+                             modes * sources, matrices=modes))
 
 
 def fill_run_folder(
@@ -257,12 +290,13 @@ def fill_run_folder(
     """
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
-    text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.mesh.regions,
-                  points=case.places.tolist(), rings=_rings(case), solved=max(1, len(case.solved)))
+    text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.real_mesh.regions,
+                  points=case.probes[1].tolist(), rings=_rings(case),
+                  solved=max(1, len(case.solved)))
     (folder / "case.pro").write_text(text, encoding="utf-8")
-    (folder / case.mesh.path.name).write_bytes(case.mesh.path.read_bytes())
+    (folder / case.real_mesh.path.name).write_bytes(case.real_mesh.path.read_bytes())
     return Job(
-        problem=PROBLEM, mesh=case.mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
+        problem=PROBLEM, mesh=case.real_mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
         solutions=SOLUTIONS_FILE,
         numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
                  "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
@@ -279,18 +313,18 @@ def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
 
 def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) -> Floats:
     """d psi/dr, psi/r and d psi/dz of a run's solutions, (modes, sources, points, 3)."""
-    unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.mesh.cell_type)
+    unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.real_mesh.cell_type)
     solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
 
     def gradients(located: Located, chosen: NDArray[np.floating]) -> Floats:
-        value, (along_r, along_z) = nodal_operators(case.mesh, located, unknowns)
-        r = coordinates(case.mesh, located)[:, 0]
+        value, (along_r, along_z) = nodal_operators(case.real_mesh, located, unknowns)
+        r = coordinates(case.real_mesh, located)[:, 0]
         r[r < AXIS_RADIUS * case.magnet.array.inner_radius_m] = np.inf  # see _limit_on_axis
         return np.stack([apply_operator(along_r, chosen), apply_operator(value, chosen) / r,
                          apply_operator(along_z, chosen)], axis=2)
 
-    compare_printed(gradients(case.probes, solutions[printed:printed + 1])[0], folder / OUTPUT,
-                    case.places)
+    probes, places = case.probes
+    compare_printed(gradients(probes, solutions[printed:printed + 1])[0], folder / OUTPUT, places)
     result = gradients(case.located, solutions)
     return result.reshape(modes, sources, *result.shape[1:])
 

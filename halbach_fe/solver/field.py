@@ -208,9 +208,10 @@ def _about(
     """
     base = finite_element_part(near, points, session)
     nominal, same_mesh = (
-        _solve_nominal(one, points, replace(session, folder=session.folder / name),
+        _solve_nominal(one, points, replace(session.within(name), purpose=purpose),
                        "scalar_potential")
-        for one, name in ((magnet, "as-it-is"), (near, "simpler")))
+        for one, name, purpose in ((magnet, "as-it-is", "the magnet on a 3D mesh"),
+                                   (near, "simpler", "its axisymmetric stand-in on a 3D mesh")))
     return replace(base, nominal=nominal, error=same_mesh - base.nominal)
 
 

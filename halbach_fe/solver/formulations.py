@@ -36,6 +36,8 @@ class Formulation:
         Constants of the problem.
     law : str
         Which of a curve's laws it solves with: ``reluctivity`` or ``permeability``.
+    route : str
+        Its name in a study, see `halbach_fe.solver.field.choose_route`.
     """
 
     problem: str
@@ -45,6 +47,7 @@ class Formulation:
     factorized_for_newton: float = np.inf
     numbers: Mapping[str, float] = field(default_factory=dict)
     law: str = "reluctivity"
+    route: str = "edge_elements"
 
 
 def _curl_of_axial(
@@ -64,9 +67,11 @@ FACTORIZED = 200_000
 """Unknowns of a scalar potential of second order: 160 000 take 4 GiB and 25 s, while thin iron
 takes conjugate gradients 2400 iterations, 60 s, for every source."""
 
-CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda inner: inner.nodes, _curl_of_axial)
+CROSS_SECTION = Formulation("magnetostatics_2d.pro", lambda inner: inner.nodes, _curl_of_axial,
+                            route="cross_section")
 SCALAR_POTENTIAL = Formulation("scalar_potential_3d.pro", lambda inner: inner.nodes,
-                               _minus_gradient, FACTORIZED, FACTORIZED // 4, law="permeability")
+                               _minus_gradient, FACTORIZED, FACTORIZED // 4, law="permeability",
+                               route="scalar_potential")
 
 
 def edge_elements(order: int) -> Formulation:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import metadata, resources
 from itertools import pairwise
 from pathlib import Path
@@ -31,9 +32,16 @@ from halbach_fe.solver.interpolation import (
     locate,
     probes_of,
 )
-from halbach_fe.solver.mesh import MESH_NAME, VerifiedMesh, build_mesh, verify_mesh
+from halbach_fe.solver.mesh import (
+    MESH_NAME,
+    CountedMesh,
+    VerifiedMesh,
+    build_mesh,
+    count_mesh,
+    verify_mesh,
+)
 from halbach_fe.solver.runs import MATRIX_FILE, Task, run_tasks, variant_name, write_history
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.materials import MU_0
 
 NOMINAL_SOURCE = 0
@@ -174,7 +182,7 @@ def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Asse
     # PETSc writes the matrix at every solve, so one run for it and one for the solutions
     alone = replace(_source_task(case, False, (0, 0), "-matrix", keep_matrix), matrix=True)
     run_tasks([alone, _source_task(case, False, (0, last), "", keep_solutions)], session)
-    return Assembly(case.mesh, **kept)
+    return Assembly(case.real_mesh, **kept)
 
 
 @dataclass(frozen=True)
@@ -182,11 +190,33 @@ class _Case:
     """What the runs for a magnet on one mesh have in common."""
 
     magnet: Magnet
-    mesh: VerifiedMesh
-    located: Located
+    mesh: VerifiedMesh | CountedMesh
+    points: Floats
     blocks: Sequence[int]
     formulation: Formulation
+    anywhere: bool
     time_limit_s: float
+
+    @property
+    def real_mesh(self) -> VerifiedMesh:
+        """The mesh; one that is only counted cannot be solved on."""
+        assert isinstance(self.mesh, VerifiedMesh)
+        return self.mesh
+
+    @cached_property
+    def located(self) -> Located:
+        """Elements of the points."""
+        return locate(self.real_mesh, self.points, self.anywhere)
+
+    @cached_property
+    def probes(self) -> tuple[Located, Floats]:
+        """Some of the points and their places, where GetDP prints what is compared."""
+        return probes_of(self.real_mesh, self.located)
+
+    def size(self, solves: int, newton: bool = False) -> RunSize:
+        """Size of a run with so many linear solves."""
+        return RunSize(self.formulation.route, self.mesh.elements,
+                       self.formulation.unknowns(self.mesh.inner), solves, newton=newton)
 
 
 def _case(
@@ -195,10 +225,13 @@ def _case(
 ) -> _Case:
     if magnet.dimension == 2:
         points = points * [1, 1, 0]  # the mesh's plane stands for every other
-    mesh = verify_mesh(build_mesh(magnet, make_folder(session.folder)))
+    mesh: VerifiedMesh | CountedMesh
+    if session.counter is None:
+        mesh = verify_mesh(build_mesh(magnet, make_folder(session.folder)))
+    else:
+        mesh = count_mesh(magnet, "cross_section" if magnet.dimension == 2 else "extruded")
     check_inside(magnet.name, mesh.radius, mesh.half_length, points)
-    return _Case(magnet, mesh, locate(mesh, points, anywhere), blocks, formulation,
-                 session.time_limit_s)
+    return _Case(magnet, mesh, points, blocks, formulation, anywhere, session.time_limit_s)
 
 
 def _difference(
@@ -251,11 +284,11 @@ def _source_task(
 ) -> Task:
     """The nominal array and sources of a linear problem; ``keep`` sees all solutions."""
     count = sources[1] - sources[0] + 1
-    probes, places = probes_of(case.mesh, case.located)
 
     def read(folder: Path) -> Floats:
         unknowns = _unknowns(case, folder)
         solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, count)
+        probes, places = case.probes
         printed = _fields(case, unknowns, probes, solutions[:1])[0]
         compare_printed(printed, folder / FLUX_DENSITY_FILE, places)
         result = _fields(case, unknowns, case.located, solutions)
@@ -266,9 +299,9 @@ def _source_task(
     return Task(
         name=f"getdp-{variant_name(vacuum)}{suffix}",
         stage=lambda folder: fill_run_folder(
-            case.magnet, case.mesh, places, folder, case.formulation, RunRequest(
+            case.magnet, case.real_mesh, case.probes[1], folder, case.formulation, RunRequest(
                 case.blocks, sources, vacuum, time_limit_s=case.time_limit_s)),
-        read=read, solves=count)
+        read=read, shape=(count, len(case.points), 3), solves=count, size=case.size(count))
 
 
 def _newton_task(
@@ -277,11 +310,10 @@ def _newton_task(
 ) -> Task:
     """Newton's method for samples (k, blocks, 3) in A/m; its fields, then derivatives if wanted."""
     columns = 1 + case.magnet.dimension * len(case.blocks) if gateaux else 0
-    probes, places = probes_of(case.mesh, case.located)
 
     def fill(folder: Path) -> Job:
         job = fill_run_folder(
-            case.magnet, case.mesh, places, folder, case.formulation, RunRequest(
+            case.magnet, case.real_mesh, case.probes[1], folder, case.formulation, RunRequest(
                 case.blocks, (0, max(columns - 1, 0)), vacuum, samples, case.time_limit_s))
         outputs = [NEWTON_FILE] + ([FLUX_DENSITY_FILE] if gateaux else [])
         unknowns = case.formulation.unknowns(case.mesh.inner)
@@ -296,6 +328,7 @@ def _newton_task(
         steps = write_history(folder)
         unknowns = _unknowns(case, folder)
         saved = read_saved(folder / _saved(case), unknowns.count, len(samples))
+        probes, places = case.probes
         compare_printed(_fields(case, unknowns, probes, saved[:1])[0], folder / NEWTON_FILE, places)
         fields = _fields(case, unknowns, case.located, saved)
         if not gateaux:
@@ -306,7 +339,9 @@ def _newton_task(
         fields = np.concatenate([fields, _fields(case, unknowns, case.located, derivatives)])
         return fields
 
-    return Task(f"getdp-{variant_name(vacuum)}", fill, read, len(samples) + columns)
+    return Task(f"getdp-{variant_name(vacuum)}", fill, read,
+                (len(samples) + columns, len(case.points), 3), len(samples) + columns,
+                case.size(columns, newton=True))
 
 
 def _saved(case: _Case) -> str:
@@ -315,13 +350,14 @@ def _saved(case: _Case) -> str:
 
 
 def _unknowns(case: _Case, folder: Path) -> Unknowns:
-    return read_unknowns(folder / f"{Path(case.formulation.problem).stem}.pre", case.mesh.cell_type)
+    return read_unknowns(folder / f"{Path(case.formulation.problem).stem}.pre",
+                         case.real_mesh.cell_type)
 
 
 def _fields(
     case: _Case, unknowns: Unknowns, located: Located, solutions: NDArray[np.floating]
 ) -> Floats:
-    operators = case.formulation.flux_density(case.mesh, located, unknowns)
+    operators = case.formulation.flux_density(case.real_mesh, located, unknowns)
     return np.stack([apply_operator(operator, solutions) for operator in operators], axis=2)
 
 

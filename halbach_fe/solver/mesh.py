@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import Regions
 
@@ -84,6 +85,33 @@ class VerifiedMesh:
     cell_type: str
     in_air: NDArray[np.bool_]
     in_iron: NDArray[np.bool_]
+    inner: Entities
+    axis: Entities
+    radius: float
+    half_length: float
+
+    @property
+    def elements(self) -> int:
+        """Number of elements."""
+        return len(self.cells)
+
+
+@dataclass(frozen=True)
+class CountedMesh:
+    """How many parts a mesh will have, before it is made.
+
+    Attributes
+    ----------
+    elements : int
+    inner : Entities
+        Off the outer boundary.
+    axis : Entities
+        Of these, those on the axis of a half-plane.
+    radius, half_length : float
+        Extent in m.
+    """
+
+    elements: int
     inner: Entities
     axis: Entities
     radius: float
@@ -239,3 +267,34 @@ def _different(corners: Ints, parts: tuple[tuple[int, ...], ...]) -> int:
 def _less(all_: Entities, some: Entities) -> Entities:
     return Entities(all_.nodes - some.nodes, all_.corners - some.corners,
                     all_.edges - some.edges, all_.faces - some.faces)
+
+
+def count_mesh(magnet: Magnet, kind: str) -> CountedMesh:
+    """Count the parts of a kind of mesh (a key of `BOUNDARY_RATIO`) without making it."""
+    radius = boundary_radius(magnet, kind)
+    half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
+    from halbach_fe import geo  # Gmsh loads only when something is meshed
+
+    if kind == "meridian":
+        columns, rows = geo.grid_size(magnet, meridian_size(magnet))
+        cells = (columns - 1) * (rows - 1)
+        nodes = (columns - 1) * (rows - 2)  # the outer boundary is three sides of the half-plane
+        return CountedMesh(cells, Entities(nodes, nodes, nodes + cells, cells),
+                           Entities(rows - 2, rows - 2, rows - 1, 0), radius, half_length)
+    triangles, rim = (round(number) for number in geo.plane_size(magnet, kind))
+    # Euler: a disk of T triangles with R edges on its rim has E edges and V corners
+    edges = (3 * triangles + rim) // 2
+    corners = 1 + edges - triangles
+    none = Entities(0, 0, 0, 0)
+    if kind == "cross_section":
+        inner = Entities(corners + edges - 2 * rim, corners - rim, edges - rim, triangles)
+        return CountedMesh(triangles, inner, none, radius, half_length)
+    # every prism on a triangle is cut into three, every rectangle on an edge into two
+    layers = len(geo.layers(magnet)) - 1
+    inner_corners = (corners - rim) * (layers - 1)
+    inner_edges = ((corners - rim) * layers + (edges - rim) * (layers - 1)  # upright, level
+                   + (edges - rim) * layers)  # and across the rectangles
+    inner_faces = triangles * (layers - 1) + 2 * (edges - rim) * layers + 2 * triangles * layers
+    return CountedMesh(3 * triangles * layers, Entities(
+        inner_corners + inner_edges, inner_corners, inner_edges, inner_faces), none, radius,
+                       half_length)

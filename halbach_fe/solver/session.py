@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from halbach_fe.solver import getdp as runner
@@ -17,6 +17,44 @@ materials as they are and with vacuum in their place."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of solves done and the number of all."""
+
+
+@dataclass(frozen=True)
+class RunSize:
+    """How large a run of GetDP is.
+
+    Attributes
+    ----------
+    route : str
+        Formulation that it solves, see `halbach_fe.solver.field.choose_route`.
+    elements, unknowns : int
+    solves : int
+        Linear solves; those of Newton's steps, which nobody knows before, do not count.
+    matrices : int
+        Different matrices; of Newton's method, again, none of its steps counts.
+    newton : bool
+        Whether the field is solved by Newton's method first.
+    """
+
+    route: str
+    elements: int
+    unknowns: int
+    solves: int
+    matrices: int = 1
+    newton: bool = False
+
+
+@dataclass
+class RunCounter:
+    """Collects the runs that a computation would start.
+
+    Attributes
+    ----------
+    batches : list of (str, sequence of RunSize)
+        Runs that may go side by side, with the purpose of the session that starts them.
+    """
+
+    batches: list[tuple[str, Sequence[RunSize]]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -42,6 +80,10 @@ class Session:
         Runs a job on this machine, or elsewhere (`halbach_fe.solver.dask_cluster`).
     processes : int
         MPI processes that share each run, for a solve that is too large for one process.
+    purpose : str
+        What the solves are for, in words.
+    counter : RunCounter, optional
+        With it nothing is meshed or solved: the runs that would be started are counted.
     """
 
     getdp: GetDP
@@ -52,6 +94,8 @@ class Session:
     cache: Cache | None = None
     run: Run = runner.run
     processes: int = 1
+    purpose: str = "the study's mesh"
+    counter: RunCounter | None = None
 
     @classmethod
     def open(
@@ -84,6 +128,11 @@ class Session:
         return cls(find_getdp(getdp), Path(folder),
                    jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
                    cache=default_cache(None))
+
+    @classmethod
+    def counting(cls, jobs: int) -> Session:
+        """Return a session that counts runs of GetDP in place of starting them."""
+        return cls(GetDP(Path(), "", (), ""), Path(), jobs=jobs, counter=RunCounter())
 
     def within(self, name: str) -> Session:
         """Return the same session in a folder of its own, inside this one's."""

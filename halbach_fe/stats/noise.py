@@ -51,7 +51,7 @@ class NoiseCovariance:
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.covariance.data).all():
-            raise _covariance_error("of finite numbers", "an infinite or missing one")
+            raise _covariance_error("of finite numbers", "an infinite or missing value")
         if not (self.covariance.diagonal() > 0).all():
             raise _covariance_error("of positive variances",
                                     f"{self.covariance.diagonal().min():g} T^2")

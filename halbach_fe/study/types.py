@@ -10,7 +10,10 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    ValidationError,
 )
+
+from halbach_fe.core.errors import StudyError, must_be
 
 MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
@@ -88,7 +91,7 @@ class StudyModel(BaseModel):
 
         Raises
         ------
-        pydantic.ValidationError
+        StudyError
             If the result is not valid.
         TypeError
             If there is no such key.
@@ -99,4 +102,12 @@ class StudyModel(BaseModel):
             if name not in values:
                 raise TypeError(f"{type(self).__name__} has no key {name}")
             values[name] = values[name].with_(**{rest: value}) if nested else value
-        return type(self).model_validate(values)
+        try:
+            return type(self).model_validate(values)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key = ".".join(map(str, first["loc"])) or "the whole"
+            raise StudyError(must_be(
+                f"`{key}`", f"changed {type(self).__name__}",
+                first["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
+                repr(first["input"]))) from None

@@ -248,9 +248,9 @@ def check_air(magnet: TrueMagnet, points: Floats) -> None:
     if inside.any():
         x, y, z = points[int(np.argmax(inside))]
         raise StudyError(must_be(
-            "`observation.positions`", "the study", "in air, as must be the held-out points halfway "
-            "between them, and the points to which hidden effects take the probe", f"({x:g}, {y:g}, {z:g}) m, inside magnet or "
-            "iron"))
+            "`observation.positions`", "the study", "in air, as must the held-out points halfway "
+            "between them and the points to which hidden effects take the probe",
+            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron"))
 
 
 def _map(

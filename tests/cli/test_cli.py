@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recovery import unreadable
 from halbach_fe.cli import main, parser
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import EXIT_CODES
@@ -28,6 +27,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT, circle
+from tests.support.interruption import unreadable
 
 STUDY = """
 name = "cli"

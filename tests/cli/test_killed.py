@@ -12,7 +12,9 @@ import numpy as np
 import psutil
 import pytest
 
-from benchmarks.recovery import (
+from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError
+from tests.conftest import ROOT
+from tests.support.interruption import (
     command,
     differences,
     environment_of,
@@ -20,8 +22,6 @@ from benchmarks.recovery import (
     undisturbed,
     unreadable,
 )
-from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError
-from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "studies" / "quadrupole"
 MOMENTS = 3

@@ -14,7 +14,7 @@ from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.response.multipoles import UNITS
 from halbach_fe.study.reader import read_study
-from tests.pages import page
+from tests.support.pages import page
 
 STUDY = """
 name = "cubes"  # as ordered

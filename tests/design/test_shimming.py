@@ -420,8 +420,8 @@ def test_a_shimmed_study_solves(session):
         for i, j in ((to, source), (source, to))])
     assert shimmed is not None
     assert any(one.rotation_deg != (0.0, 0.0, 0.0) for one in shimmed.array.exceptions)
-    one, other = (multipole_model(build_magnet(some), MultipoleReference(RADIUS, ORDERS), session)
-                  for some in (study, shimmed))
+    one, other = (multipole_model(some, MultipoleReference(RADIUS, ORDERS), session)
+                  for some in (build_magnet(study), shimmed))
     np.testing.assert_allclose(one.nominal, other.nominal, atol=1e-6 * np.abs(one.nominal).max())
     scale = np.abs(one.matrix).max()
     np.testing.assert_allclose(one.matrix, other.matrix, atol=1e-6 * scale)

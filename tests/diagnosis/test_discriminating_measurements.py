@@ -180,7 +180,7 @@ def test_options_fit_the_study(case):
     assert radius == pytest.approx(0.8 * 0.104)
     assert np.abs(found["far_field"].points[:, 2]).min() > 0.08  # the magnet's end
     array = diagnosis.before.study.array.with_(remanence_T=0.01)
-    weak = replace(diagnosis.before, study=diagnosis.before.study.with_(array=array))
+    weak = replace(diagnosis.before, magnet=diagnosis.before.magnet.with_(array=array))
     names = {one.name for one in candidate_measurements(replace(diagnosis, before=weak), data)}
     assert set(found) - names == {"nmr_point"}  # too weak for it
 

@@ -123,7 +123,8 @@ def update_of(residual, root, points=POINTS):
         positions=np.repeat(points, 3, axis=0),
         read=lambda fields: fields.reshape(len(fields), -1))
     return SimpleNamespace(
-        study=STUDY, observation=observation, errors=independent_noise(np.full(count, NOISE_T)),
+        study=STUDY, magnet=build_magnet(STUDY), observation=observation,
+        errors=independent_noise(np.full(count, NOISE_T)),
         held_out=np.zeros(count, bool), parts=("training",) * count, readings=residual,
         prior=SimpleNamespace(root=np.eye(root.shape[1])), response=SimpleNamespace(matrix=root),
         prediction_prior=SimpleNamespace(mean=np.zeros(count)), prior_conflict=2.0)

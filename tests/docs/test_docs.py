@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from halbach_fe.cli import VERBS
-from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.model import Study
 from tests.conftest import ROOT
 
@@ -49,7 +48,7 @@ def run_page(text, folder):
     environment = os.environ | {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "OMP_NUM_THREADS": "1"}
-    for block in build_magnet(text).blocks:
+    for block in blocks_of(text):
         if block.file:
             (folder / block.file).write_text(block.text, encoding="utf-8")
             continue

@@ -26,7 +26,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
-from tests.pages import page
+from tests.support.pages import page
 
 NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-5}]}
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

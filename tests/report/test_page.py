@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.report.page import save, write_page
 from tests.conftest import DIPOLE, parse_study
-from tests.pages import page
+from tests.support.pages import page
 
 SEEN = "what the picture shows, in words"
 

@@ -15,7 +15,7 @@ from halbach_fe.report.verification import verification_verdict, write_verificat
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
 from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
 from halbach_fe.solver.field import solve_nominal
-from tests.pages import page
+from tests.support.pages import page
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
 

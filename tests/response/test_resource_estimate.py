@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.memory import Weighed
 from halbach_fe import geo
 from halbach_fe.geo import cross_section
 from halbach_fe.geometry.magnet import build_magnet
@@ -25,6 +24,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import ROOT
 from tests.oracles.cuboids import long_dipole
+from tests.support.memory import Weighed
 
 TRAPEZOID = {"shape": "trapezoid", "side_gap_m": 0.002}
 STEEL = {"inner_radius_m": 0.19, "outer_radius_m": 0.215,

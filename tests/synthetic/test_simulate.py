@@ -28,7 +28,7 @@ from halbach_fe.synthetic.helmholtz_coil import moment_matrix
 from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
 from tests.conftest import DIPOLE, changed
-from tests.pages import page
+from tests.support.pages import page
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {

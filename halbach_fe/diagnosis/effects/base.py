@@ -165,8 +165,7 @@ class InstrumentEffect(Effect):
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
         change = self.change(study.instrument, values)
-        instrument = Instrument.model_validate(study.instrument.model_dump() | dict(change))
-        return study.with_(instrument=instrument)
+        return study.with_(instrument=study.instrument.with_(**change))
 
     @abstractmethod
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:

@@ -19,7 +19,7 @@ of maps are rounded (for example to 1 um with steps of 1 mm). The field error of
 1e-3 of the difference between neighbouring points, less than the error of the linear interpolation
 between them."""
 
-HINT = ('A study with observation positions kind = "grid" makes one (start_m, end_m, count), and '
+HINT = ('A study with observation positions kind = "grid" has such points (start_m, end_m, count); '
         "halbach-fe solve its map.")
 
 

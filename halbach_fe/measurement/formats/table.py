@@ -136,7 +136,7 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
     if len(declared.columns) != len(table.columns):
         raise MeasurementError(must_be(
             "--columns", table.where, f"of {len(table.columns)} columns, as the file has",
-            f"{len(declared.columns)}", "Name each; - leaves one out."))
+            f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
     for text, column in zip(declared.columns, table.columns, strict=True):
         stated = ColumnName("") if text == "-" else names.parse(text)
@@ -168,7 +168,7 @@ def _used(
             raise MeasurementError(must_be(
                 "header", table.where, f"with one column {column.quantity}",
                 f"'{columns[used[column.quantity]].text}' and '{column.text}'",
-                "Say which with --columns; - leaves one out."))
+                "Choose one with --columns; - ignores a column."))
         used[column.quantity] = index
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
@@ -193,7 +193,7 @@ def _missing(
     if not any(column.quantity for column in columns):
         shown = ", ".join(f"'{column.text}'" for column in columns if column.text)
         return [f"what its {len(columns)} columns {f'({shown}) ' if shown else ''}are "
-                "(--columns x,y,z,Bx,By,Bz, - for one to leave out)"] + [
+                "(--columns x,y,z,Bx,By,Bz, - to ignore a column)"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
@@ -272,7 +272,7 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(bad)) + 1}", where,
-                                       "at a finite position", "an empty or infinite one"))
+                                       "at a finite position", "an empty or infinite coordinate"))
     empty = np.full(len(points), np.nan)
     if "Br" not in si:
         return points, np.column_stack([si.get(name, empty) for name in ("Bx", "By", "Bz")])

@@ -158,5 +158,5 @@ def rows_of(
 def comma_hint(cell: str) -> str:
     """Return a hint for a cell that may be a number with a decimal comma, else an empty string."""
     if len(cell) <= MAX_CELL and re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", cell.strip()):
-        return "If its comma is a decimal one, add --decimal-comma."
+        return "If its comma is a decimal comma, add --decimal-comma."
     return ""
