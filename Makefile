@@ -60,7 +60,7 @@ SEED = 1
 fuzz: setup-test
 	.venv/bin/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
-# The figures of the README, ratios measured in one run.
+# The figures of README and docs, ratios measured in one run.
 benchmark: setup-test
 	.venv/bin/python -m benchmarks.run
 

@@ -1,4 +1,4 @@
-"""Measure the figures that the README quotes, in one run, and write benchmarks/results.json.
+"""Measure the figures that README and docs quote, in one run, and write benchmarks/results.json.
 
 ``make benchmark``. Ratios compare two ways of doing the same thing on the same machine, one after
 the other; seconds are there to be read, not to be asserted. ``python -m benchmarks.run PART ...``

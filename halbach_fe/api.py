@@ -1,8 +1,8 @@
-"""Functions of the Python interface that bring several rooms together.
+"""Functions of the Python interface that combine several subpackages.
 
-`halbach_fe` hands them on; a user writes ``import halbach_fe as hf`` and ``hf.multipoles(...)``.
-Each takes a `Magnet` (from `halbach_fe.build_magnet`) and a `Session`, and returns a result with
-labelled arrays. The command line calls the same functions.
+The package `halbach_fe` exports them: a user writes ``import halbach_fe as hf`` and
+``hf.multipoles(...)``. Most of them take a `Magnet` (from `halbach_fe.build_magnet`) and a
+`Session`, and return a result with labelled arrays. The command line calls the same functions.
 """
 
 from __future__ import annotations
@@ -47,14 +47,23 @@ from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign
 
 @dataclass(frozen=True)
 class MultipoleTables(ShownInNotebook):
-    """Multipoles of a magnet: integrated along z, and on one circle.
+    """The multipoles of a magnet, in one table per reference.
 
     Attributes
     ----------
     magnet : Magnet
-    tables : sequence of (MultipoleModel, mapping)
-        For each reference the linear model, and the multipoles by name of the distribution of
-        magnetizations: ``prior``, or ``prior`` and ``posterior``.
+    tables : sequence of (MultipoleModel, mapping of str to Multipoles)
+        The linear model of each reference, and its multipoles by the name of the distribution of
+        the magnetizations: ``prior``, or ``prior`` and ``posterior``. A 2D magnet has a single
+        table. A 3D magnet has two: of the field integrated along z, and of one circle.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> (model, multipoles), = hf.multipoles(magnet, hf.Session.open("results")).tables
+    >>> model.unit, multipoles["prior"].orders[:3]
+    ('T', (2, 3, 4))
     """
 
     magnet: Magnet
@@ -71,34 +80,50 @@ def diagnose(
     Parameters
     ----------
     magnet : Magnet
+        The magnet of the study that is examined.
     data : Dataset
         The measured map, see `halbach_fe.read_map`.
     session : Session
+        Its folder receives a subfolder for each round of solving and searching.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
     effects : sequence of str, optional
-        Names of the effects that may be missing; by default the whole catalogue.
+        Names of the candidate effects; by default all effects of the catalogue are candidates.
     validation_map : Dataset, optional
-        Another map, which is only predicted.
-    say : callable
-        Receives a line about each step.
+        Another map, which is predicted but does not update the model.
+    say : callable, optional
+        Called with a line of text about each step, to report progress.
+
+    Returns
+    -------
+    Diagnosis
+        The identified effects, the study with these effects added, and the inferences before and
+        after.
+
+    Raises
+    ------
+    StudyError
+        If a name in ``effects`` is not in the catalogue.
+    MeasurementError
+        If a map or the blocks do not fit the study.
 
     Examples
     --------
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
-    >>> found = hf.diagnose(magnet, hf.read_map("map.csv"), hf.Session.open("diagnosis"),
-    ...                     effects=["gain_x", "offset_y"])
-    >>> found.study.name
+    >>> diagnosis = hf.diagnose(magnet, hf.read_map("map.csv"), hf.Session.open("diagnosis"),
+    ...                         effects=["gain_x", "offset_y"])
+    >>> diagnosis.study.name
     'dipole'
     """
-    known = {effect.name: effect for effect in catalogue()}
+    effect_by_name = {effect.name: effect for effect in catalogue()}
     for name in effects or ():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0.5)
+        if name not in effect_by_name:
+            near = difflib.get_close_matches(name, effect_by_name, 1, 0.5)
             raise StudyError(must_be("effects", "diagnose", "names of the catalogue", f"'{name}'",
                                      f"Did you mean {near[0]}?" if near else ""))
-    chosen = None if effects is None else [known[name] for name in dict.fromkeys(effects)]
+    chosen = (None if effects is None
+              else [effect_by_name[name] for name in dict.fromkeys(effects)])
     return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say)
 
 
@@ -108,25 +133,37 @@ def multipoles(
 ) -> MultipoleTables:
     """Compute the multipoles of a magnet, with standard deviations.
 
-    In 3D there are two tables: of the field integrated along z, and of the circle at
-    ``reference.z_m`` (the middle by default).
+    A 3D magnet has two tables: of the field integrated along z, and of the circle at
+    ``reference.z_m`` (the middle of the magnet by default).
 
     Parameters
     ----------
     magnet : Magnet
     session : Session
+        Its folder receives the runs of GetDP and the response matrix.
     reference : MultipoleReference, optional
-        Radius, orders and z; by default two thirds of the bore, orders 1 to 10.
-    posterior : mapping or InferenceResult, optional
-        Distributions of the magnetizations by name; by default the study's prior.
+        Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
+        thirds of the bore radius, and orders 1 to 10.
+    posterior : mapping of str to Gaussian, or InferenceResult, optional
+        Distributions of the magnetizations in A/m by name. By default the study's prior of an
+        assembled magnet is the only distribution.
+
+    Returns
+    -------
+    MultipoleTables
+
+    Raises
+    ------
+    StudyError
+        If the reference does not fit the study, or the nominal magnet has no main multipole.
 
     Examples
     --------
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
-    >>> found = hf.multipoles(magnet, hf.Session.open("results"))
-    >>> model, known = found.tables[0]
-    >>> model.main, sorted(known)
+    >>> tables = hf.multipoles(magnet, hf.Session.open("results")).tables
+    >>> model, multipoles = tables[0]
+    >>> model.main, sorted(multipoles)
     (1, ['prior'])
     """
     reference = reference or MultipoleReference()
@@ -136,21 +173,35 @@ def multipoles(
     models = multipole_models(magnet, references, session)
     if isinstance(posterior, InferenceResult):
         posterior = {"prior": posterior.prior, "posterior": posterior.posterior}
-    known = posterior or {"prior": assembled_prior(magnet, models[0].nominal)}
+    distributions = posterior or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
-        (model, {name: model.of(one) for name, one in known.items()}) for model in models])
+        (model, {name: model.of(distribution) for name, distribution in distributions.items()})
+        for model in models])
 
 
 def plan(magnet: Magnet, session: Session, points: int | None = None) -> MeasurementPlan:
-    """Choose the positions that tell most about the block magnetizations.
+    """Choose the positions whose readings carry most information about the magnetizations.
 
     Parameters
     ----------
     magnet : Magnet
-        The study's ``plan.candidates`` are chosen from; by default its own positions.
+        The candidates are the positions ``plan.candidates`` of its study, or, by default, the
+        positions that the study measures.
     session : Session
+        Its folder receives the runs of GetDP and the response matrix.
     points : int, optional
-        How many to choose; by default the study's ``plan.points``.
+        Number of positions to choose; by default the study's ``plan.points``, else the number of
+        positions that the study measures.
+
+    Returns
+    -------
+    MeasurementPlan
+
+    Raises
+    ------
+    StudyError
+        If there are fewer candidates than positions to choose, a position is not in air within the
+        meshed region, or the study does not observe flux densities.
 
     Examples
     --------
@@ -172,18 +223,33 @@ def shim(
     Parameters
     ----------
     result : InferenceResult
-        Of the measured magnet.
+        The inference of the measured magnet, whose posterior describes the blocks.
     session : Session
     reference : MultipoleReference, optional
-        Radius, orders and z of the multipoles; by default two thirds of the bore, orders 1 to 10.
+        Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
+        thirds of the bore radius, and orders 1 to 10.
     swaps, turns, replacements : int
-        At most so many moves of each kind.
+        Largest number of moves of each kind.
     limit_units : float, optional
-        Largest unwanted multipole that is allowed, in units of 1e-4 of the main one.
+        Largest unwanted multipole that is allowed, in units of 1e-4 of the main multipole. The
+        search ends when it is met.
     stock : BlockTable, optional
-        Measured blocks that may replace others; by default nominal ones.
+        Measured blocks that may replace others; by default new blocks distributed as in the
+        study's prior. Needs ``replacements``.
     seed : int
-        Of the draws that the probability of meeting the limit is estimated with.
+        Seed of the random draws that estimate the probability of meeting the limit.
+
+    Returns
+    -------
+    Shim
+        The moves in their order, and the multipoles before and after.
+
+    Raises
+    ------
+    StudyError
+        If ``stock`` is given without ``replacements``, or the reference does not fit the study.
+    MeasurementError
+        If the stock does not fit the study.
 
     Examples
     --------
@@ -196,7 +262,7 @@ def shim(
     """
     if stock is not None and not replacements:
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
-                         "replaced; instead there are none. Give replacements.")
+                         "replaced; instead replacements is 0. Give replacements.")
     model = multipole_model(result.magnet, reference or MultipoleReference(),
                             session.within("multipoles"))
     budget: dict[Kind, int] = {"swap": swaps, "turn": turns, "replace": replacements}
@@ -209,12 +275,40 @@ def sort(
 ) -> SortedBlocks:
     """Assign measured blocks to slots so that unwanted multipoles become small.
 
+    Every block goes to a slot of its own type. The table may have more blocks than there are slots.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    blocks : BlockTable
+        The measured blocks, see `halbach_fe.read_blocks`.
+    session : Session
+        Its folder receives the runs of GetDP and the response matrix.
+    reference : MultipoleReference, optional
+        Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
+        thirds of the bore radius, and orders 1 to 10.
+    seed : int
+        Seed of the random orders from which the search starts.
+    progress : callable, optional
+        Called with the number of starts done and their total number.
+
+    Returns
+    -------
+    SortedBlocks
+
+    Raises
+    ------
+    StudyError
+        If the reference does not fit the study.
+    MeasurementError
+        If the table does not fit the study, or has too few blocks of a type.
+
     Examples
     --------
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
-    >>> found = hf.sort(magnet, hf.read_blocks("spares.csv"), hf.Session.open("results"))
-    >>> found.left_over
+    >>> assignment = hf.sort(magnet, hf.read_blocks("spares.csv"), hf.Session.open("results"))
+    >>> assignment.left_over
     2
     """
     model = multipole_model(magnet, reference or MultipoleReference(), session)
@@ -227,27 +321,43 @@ def tolerance(
     reference: MultipoleReference | None = None, draws: int = 10_000,
     limit_units: float | None = None, seed: int = 1,
 ) -> Tolerance:
-    """Draw magnets from the prior: what multipoles to expect, and how many are good enough.
+    """Predict the multipoles of magnets whose blocks are drawn from the prior.
 
     Parameters
     ----------
     magnet : Magnet
     session : Session
+        Its folder receives the runs of GetDP and the response matrix.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
     reference : MultipoleReference, optional
+        Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
+        thirds of the bore radius, and orders 1 to 10.
     draws : int
-        Magnets to draw.
+        Number of magnets to draw.
     limit_units : float, optional
-        Largest unwanted multipole that is allowed, in units of 1e-4 of the main one.
+        Largest unwanted multipole that is allowed, in units of 1e-4 of the main multipole.
     seed : int
+        Seed of the random draws.
+
+    Returns
+    -------
+    Tolerance
+        The multipoles to expect, and with a limit the share of the magnets that meet it.
+
+    Raises
+    ------
+    StudyError
+        If the reference does not fit the study.
+    MeasurementError
+        If the blocks do not fit the study.
 
     Examples
     --------
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
-    >>> found = hf.tolerance(magnet, hf.Session.open("results"), draws=100, limit_units=1e4)
-    >>> found.share
+    >>> session = hf.Session.open("results")
+    >>> hf.tolerance(magnet, session, draws=100, limit_units=1e4).share
     1.0
     """
     model = multipole_model(magnet, reference or MultipoleReference(), session)
@@ -259,15 +369,25 @@ def tolerance(
 def demagnetization(
     magnet: Magnet, session: Session, across: int = demagnetization_room.ACROSS
 ) -> DemagnetizationMap:
-    """Map how near the blocks are to the knee of their demagnetization curve, at temperature.
+    """Map how near the blocks are to the knee of their demagnetization curve when they are hot.
 
     Parameters
     ----------
     magnet : Magnet
-        Its study has a table ``demagnetization``.
+        Its study needs the table ``demagnetization`` with the material's data and temperature.
     session : Session
+        Its folder receives the runs of GetDP.
     across : int
-        Cells across the thickness of a block.
+        Number of cells across the radial thickness of a block.
+
+    Returns
+    -------
+    DemagnetizationMap
+
+    Raises
+    ------
+    StudyError
+        If the study has no table ``demagnetization``, or no block is magnetized.
 
     Examples
     --------
@@ -287,18 +407,36 @@ def simulate_measurement(
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
-    The field is magpylib's and NGSolve's, never halbach-fe's own, so that the inference can be
-    tested with it.
+    magpylib and NGSolve compute the field, never halbach-fe's own model, so that the inference can
+    be tested on the result.
 
     Parameters
     ----------
     study : Study
+        It must state the noise of its readings.
     seed : int
+        Seed of all random numbers: magnetizations, noise, and sizes of hidden effects.
     hide : sequence of str
-        Effects that the truth has and the study does not: ``NAME`` or ``NAME=VALUE,...``.
+        Effects that the simulated magnet has but the study lacks: ``NAME`` or ``NAME=VALUE,...``.
     hide_random : int
-        How many more effects to draw at random.
-    progress : callable
+        Number of further hidden effects that are drawn at random.
+    progress : callable, optional
+        Called with the amount of work that magpylib has done and its total.
+
+    Returns
+    -------
+    SimulatedCampaign
+        Map, held-out map and block table, and the truth behind them.
+
+    Raises
+    ------
+    ValueError
+        If a text in ``hide`` does not describe an effect.
+    StudyError
+        If the study does not state the noise of its readings, measures at a point inside a
+        material, or cannot have one of the effects.
+    ExtraMissingError
+        If magpylib or NGSolve is not installed.
 
     Examples
     --------

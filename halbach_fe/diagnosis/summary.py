@@ -284,7 +284,7 @@ def rivals(identified: IdentifiedEffect) -> list[tuple[Candidate, float]]:
 def diagnosis_summary(
     diagnosis: Diagnosis, separations: Sequence[Separation] = ()
 ) -> dict[str, object]:
-    """Return the content of diagnosis.json, whose keys the README describes."""
+    """Return the content of diagnosis.json, whose keys docs/diagnosis.md describes."""
     conflicting = diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
     return {
         "study": diagnosis.before.study.name,

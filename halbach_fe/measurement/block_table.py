@@ -190,7 +190,8 @@ def _check(table: BlockTable) -> None:
     blocks: dict[tuple[int, int], str] = {}
     for number, (serial, place) in enumerate(zip(table.serial, table.places, strict=True)):
         if serial in serials:
-            refuse(number, "serial", "unique to one block", "that of an earlier row", "Remove a row.")
+            refuse(number, "serial", "unique to one block", "that of an earlier row",
+                   "Remove a row.")
         if place[0] and place in blocks:
             refuse(number, "place", "unique to one block",
                    f"ring {place[0]}, slot {place[1]}, where block {blocks[place]} is")

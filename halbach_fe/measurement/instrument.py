@@ -210,9 +210,8 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
         if not np.abs(wrong).max() > CONVERGED_T:
             return shown - rest
     raise MeasurementError(must_be(
-        "`instrument`", "study", "a law of the sensors that can be undone",
-        "a law whose inversion does not converge",
-        "Make its nonlinear terms smaller."))
+        "`instrument`", "study", "a law of the sensors that can be inverted",
+        "a law whose inversion does not converge", "Make its nonlinear terms smaller."))
 
 
 def _check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:

@@ -490,10 +490,10 @@ def test_interruption_ends_getdp_too(study, tmp_path, number):
 
 def test_every_exit_code_is_documented():
     text = parser().format_help()
-    readme = (ROOT / "README.md").read_text()
+    page = (ROOT / "docs" / "reliability.md").read_text()
     for code, meaning in EXIT_CODES.items():
         assert f"{code:3d}  {meaning}" in text
-        assert f"| {code} | {meaning} |" in readme
+        assert f"| {code} | {meaning} |" in page
 
 
 def test_a_bug_is_called_a_bug(study, tmp_path, monkeypatch, capsys):

@@ -296,8 +296,8 @@ def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
     assert not (out / "study.diagnosed.toml").exists()
 
 
-def test_the_readme_says_what_is_in_the_file():
-    section = (ROOT / "README.md").read_text().split("## What the model lacks")[1].split("\n## ")[0]
+def test_the_documentation_says_what_is_in_the_file():
+    section = (ROOT / "docs" / "diagnosis.md").read_text()
     keys = re.findall(r"^\| `([a-z_]+)` \|", section, re.MULTILINE)
     study = parse_study(tomllib.loads(STUDY))
     update = SimpleNamespace(

@@ -20,7 +20,7 @@ of maps are rounded (for example to 1 um with steps of 1 mm). The field error of
 between them."""
 
 HINT = ('A study with observation positions kind = "grid" has such points (start_m, end_m, count); '
-        "halbach-fe solve its map.")
+        "halbach-fe solve computes its map.")
 
 
 @dataclass(frozen=True)
