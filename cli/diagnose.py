@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.diagnosis.diagnose import diagnose
     from halbach_fe.diagnosis.discriminating_measurements import separations
     from halbach_fe.diagnosis.summary import diagnosis_summary
-    from halbach_fe.report.write import write_diagnosis
+    from halbach_fe.report.result_files import write_diagnosis
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)

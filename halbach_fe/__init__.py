@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
     from halbach_fe.measurement.block_table import read_blocks as read_blocks
     from halbach_fe.measurement.field_map import read_map as read_map
-    from halbach_fe.report.write import write_report as write_report
+    from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.mesh_convergence import Verification as Verification
     from halbach_fe.response.mesh_convergence import verify as verify
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
@@ -60,7 +60,7 @@ _HOME = {
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "plan": "api", "shim": "api",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
-    "write_report": "report.write",
+    "write_report": "report.result_files",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "Solution": "response.solution", "InferenceResult": "inference.result",
     "Diagnosis": "diagnosis.result", "Verification": "response.mesh_convergence",

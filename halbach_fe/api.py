@@ -61,7 +61,7 @@ class MultipoleTables(ShownInNotebook):
     --------
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
-    >>> (model, multipoles), = hf.multipoles(magnet, hf.Session.open("results")).tables
+    >>> model, multipoles = hf.multipoles(magnet, hf.Session.open("results")).tables[0]
     >>> model.unit, multipoles["prior"].orders[:3]
     ('T', (2, 3, 4))
     """

@@ -73,9 +73,16 @@ def _path_of(module: str) -> Path | None:
 def _imported(path: Path, name: str) -> Iterator[str]:
     """Yield the names that a file imports absolutely, at its top or inside functions.
 
-    From ``from a import b`` both ``a`` and ``a.b`` follow, because ``b`` may be a module.
+    From ``from a import b`` both ``a`` and ``a.b`` follow, because ``b`` may be a module. Imports
+    for type checkers (``if TYPE_CHECKING``) do not count: they are never executed.
     """
-    for node in ast.walk(ast.parse(path.read_bytes(), filename=name)):
+    waiting: list[ast.AST] = [ast.parse(path.read_bytes(), filename=name)]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            waiting += node.orelse
+            continue
+        waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:

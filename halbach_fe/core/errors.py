@@ -21,6 +21,20 @@ class HalbachError(Exception):
     """Base of all errors that are reported as one sentence instead of a traceback.
 
     The message is always one line of printable text, even if it quotes a hostile input.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit code of the command line for this kind of error; every subclass has its own.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> try:
+    ...     hf.read_study("missing.toml")
+    ... except hf.HalbachError as error:
+    ...     print(type(error).__name__, error.exit_code)
+    StudyError 3
     """
 
     exit_code = 1

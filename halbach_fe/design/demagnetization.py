@@ -80,6 +80,10 @@ class DemagnetizationMap(ShownInNotebook):
     cells : Cells
     along : ndarray, shape (cells,), in A/m
         H along the magnetization; negative where H opposes the magnetization.
+    margin : ndarray, shape (cells,), in A/m
+        Margin between H and the knee; negative past the knee.
+    share_beyond_now : float
+        Share of the volume, from 0 to 1, that is past the knee at the material's temperature.
     """
 
     magnet: Magnet

@@ -55,6 +55,14 @@ class MeasurementPlan(ShownInNotebook):
     prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
         Standard deviation of the prior, of the posterior for the plan, and of the posterior for
         equally many evenly spread positions of the study (all of them if the plan has more).
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> plan = hf.plan(magnet, hf.Session.open("results"), points=4)
+    >>> plan.points.shape, bool(plan.gain[3] > plan.gain[0])
+    ((4, 3), True)
     """
 
     magnet: Magnet

@@ -132,7 +132,12 @@ class Shim(ShownInNotebook):
     limit : float or None
         Limit of all |c_n| in units of 1e-4.
     within : tuple of two floats, or None
-        Probabilities that all multipoles are within the limit, before and after the moves.
+        Probabilities that all multipoles are within the limit, before and after the moves; None
+        without a limit.
+    after : Multipoles
+        Multipoles after all moves.
+    shimmed_study : Study or None
+        The study with the moves of blocks as exceptions; None if a study cannot express them.
     """
 
     result: InferenceResult

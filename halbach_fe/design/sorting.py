@@ -56,6 +56,8 @@ class SortedBlocks(ShownInNotebook):
         Root mean square of the |c_n| of the mean for random assignments, in units.
     own_order : str
         Description of the order of the given table.
+    left_over : int
+        Number of blocks without a slot.
     """
 
     study: Study

@@ -35,6 +35,9 @@ class Tolerance(ShownInNotebook):
 
     Attributes
     ----------
+    study : Study
+    model : MultipoleModel
+        The linear model from magnetizations to multipoles.
     known : Multipoles
         Mean and covariance in closed form.
     sizes : ndarray, shape (draws, k)
@@ -43,6 +46,11 @@ class Tolerance(ShownInNotebook):
         |C_N| of the samples, in T, or T m if integrated along z.
     limit : float or None
         Limit of all |c_n|, in units of 1e-4.
+    quantiles : ndarray, shape (len(`QUANTILES`), k)
+        Quantiles of |c_n|, in units of 1e-4.
+    share : float or None
+        Share of the magnets, from 0 to 1, whose multipoles are all within the limit; None without
+        a limit.
     """
 
     study: Study

@@ -145,6 +145,15 @@ class Diagnosis(ShownInNotebook):
         The solver's own error, if it explains the misfit. The search for effects is then skipped.
     converged : bool
         Whether the last round changed neither the effects nor their amplitudes.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> diagnosis = hf.diagnose(magnet, hf.read_map("map.csv"), hf.Session.open("diagnosis"),
+    ...                         effects=["gain_x"])
+    >>> sorted(diagnosis.probabilities)
+    ['gain_x', 'none']
     """
 
     corrected_study: Study

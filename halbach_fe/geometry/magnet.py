@@ -30,11 +30,20 @@ SHAPE_KEYS = ("dimension", "array")
 class Magnet(ShownInNotebook):
     """The blocks of a magnet, together with the study that describes them.
 
+    Use `build_magnet` to make one.
+
     Attributes
     ----------
     study : Study
     blocks : tuple of MagnetBlock
         Ring by ring (lowest z first), slot by slot.
+    parameter_names : tuple of str
+        Names of the magnetization components that the inference determines, block by block.
+    nominal_magnetization : ndarray, shape (parameters,), in A/m
+        Nominal values of these components.
+    radius, half_length : float
+        Outer radius and half the length of the magnet in m, including the iron ring; the length of
+        a 2D magnet is infinite.
 
     Examples
     --------
@@ -177,10 +186,19 @@ class Magnet(ShownInNotebook):
 def build_magnet(study: Study) -> Magnet:
     """Build the magnet that a study describes.
 
+    Parameters
+    ----------
+    study : Study
+        The study, see `halbach_fe.read_study`.
+
+    Returns
+    -------
+    Magnet
+
     Raises
     ------
     StudyError
-        If neighbouring blocks overlap.
+        If the blocks cannot be built as described, for example because neighbours overlap.
 
     Examples
     --------

@@ -53,6 +53,13 @@ class BlockTable:
         Provenance, as free text by key.
     source : str
         Name of the table in error messages.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> table = hf.read_blocks("blocks.csv")
+    >>> table.moment.shape, table.places[0]
+    ((16, 3), (1, 1))
     """
 
     serial: tuple[str, ...]
@@ -83,6 +90,15 @@ def read_blocks(path: str | Path) -> BlockTable:
 
     The header names the columns of `COLUMNS` in any order. The columns ring, slot, volume_m3 and
     temperature_C may be missing or have empty cells. Lines ``# key: value`` are attributes.
+
+    Parameters
+    ----------
+    path : str or Path
+        A CSV file with one row per block.
+
+    Returns
+    -------
+    BlockTable
 
     Raises
     ------

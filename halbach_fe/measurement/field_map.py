@@ -92,6 +92,18 @@ def read_map(path: str | Path) -> xr.Dataset:
     x_m, y_m, z_m, at least one of Bx_T, By_T, Bz_T, and optionally sigma_T (or sigma_Bx_T ...),
     time_s and scan. An empty field is a component that was not measured.
 
+    Parameters
+    ----------
+    path : str or Path
+        The suffix of the file states its format; any other suffix is read as CSV.
+
+    Returns
+    -------
+    Dataset
+        ``B_T`` (point, component) in T, NaN where a component was not measured, with the
+        coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m; and ``sigma_T``, ``time_s`` and ``scan``
+        if the file has them.
+
     Raises
     ------
     MeasurementError

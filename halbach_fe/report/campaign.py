@@ -16,6 +16,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
+from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
@@ -26,7 +27,6 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
-from halbach_fe.report.view import ViewPoints, view_of_nominal_magnet
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.simulate import observed_components, point_noise

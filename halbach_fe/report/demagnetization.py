@@ -16,8 +16,8 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
-from halbach_fe.report.view import BlockValues, Colours, magnet_view
 
 PAST = "#D55E00"
 """Colour of the knee and of cells past it."""

@@ -28,8 +28,8 @@ from halbach_fe.diagnosis.summary import (
 from halbach_fe.inference.result import ALL_READINGS
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
+from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.page import save, write_page
-from halbach_fe.report.view import view_of_inference
 
 UNUSUAL_AMPLITUDE = 20.0
 """Amplitude in prior standard deviations above which the page warns: far beyond the errors of a

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
 from halbach_fe.report.prediction import (
@@ -20,7 +21,6 @@ from halbach_fe.report.prediction import (
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
-from halbach_fe.report.view import view_of_inference
 from halbach_fe.response.multipoles import circle_models
 from halbach_fe.stats.linear_gaussian import contraction
 

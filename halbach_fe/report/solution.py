@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import (
     MEASURED,
@@ -20,7 +21,6 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
-from halbach_fe.report.view import field_points, view_of_nominal_magnet
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
 from halbach_fe.study.types import COMPONENTS

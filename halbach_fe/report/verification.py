@@ -13,6 +13,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -25,7 +26,6 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
-from halbach_fe.report.view import ViewPoints, view_of_nominal_magnet
 from halbach_fe.response.discretization_error import REFINEMENT
 from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, Verification
 

@@ -1,6 +1,6 @@
-"""How far the mesh, the boundary or the formulation moves the field: error bars for readings.
+"""Error bars of readings from changes of the mesh, the boundary or the formulation.
 
-All errors are those of the full nominal array, where the errors of blocks add up.
+All errors are those of the full nominal array, because the errors of the blocks add up.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
 
 REFINEMENT = 1.5
+"""Factor between the element sizes, and between the distances of the boundary, of two solves."""
+
 DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
+"""The dual formulation of each formulation that has one."""
 
 
 def refined(magnet: Magnet, factor: float) -> Magnet:
-    """The magnet with all elements smaller by a factor.
+    """Return the magnet with all elements smaller by a factor (larger if it is below 1).
 
-    It is not validated: the limits of a study file catch wrong units, and a coarser mesh than
-    anybody should ask for may well serve an error bar.
+    The new study is not validated. The limits of a study file exist to catch wrong units; a mesh
+    that is coarser than these limits allow may still serve to estimate an error bar.
     """
     mesh = magnet.study.mesh
     bore = mesh.bore_size_m or mesh.block_size_m
@@ -37,7 +40,10 @@ def refined(magnet: Magnet, factor: float) -> Magnet:
 
 
 def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
-    """The magnet with the boundary of a kind of mesh farther by a factor."""
+    """Return the magnet with the boundary farther away by a factor.
+
+    ``mesh`` is the kind of mesh, a value of `halbach_fe.solver.field.MESHES`.
+    """
     end = magnet.half_length
     update = {"radius_m": factor * boundary_radius(magnet, mesh)}
     if magnet.dimension == 3:
@@ -46,34 +52,46 @@ def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
 
 
 def dual(magnet: Magnet, route: str) -> Magnet:
-    """The magnet solved by the other of two formulations that bracket the truth."""
+    """Return the magnet to be solved by the dual formulation of a route.
+
+    The magnetic energies of the two formulations bracket the exact energy.
+    """
     return magnet.with_(solver__route=DUAL[route])
 
 
 def error_bar_session(session: Session) -> Session:
-    """The session with a folder of its own for error bars: the study's run folders are kept."""
+    """Return the session in a subfolder for error bars, so that the study's runs are kept."""
     return session.within("error-bar")
 
 
 def reading_errors(
     magnet: Magnet, observation: Observation, parts: ElementFields, session: Session
 ) -> Floats:
-    """Error bar of every reading, (readings,) in T, by what another discretization says.
+    """Return the error bar of every reading: its change with another discretization.
 
-    On a 3D mesh that is the dual formulation on the same mesh: the truth lies between them, as far
-    as energies go, and they err in opposite directions at the boundary. Elsewhere, where a second
-    mesh is cheap, it is a coarser one, and a farther boundary.
+    On a 3D mesh the other discretization is the dual formulation on the same mesh: the energies of
+    the two formulations bracket the exact energy, and the two err in opposite directions at the
+    boundary. For the other routes a second mesh is cheap. Their error bar is the sum of the changes
+    made by a coarser mesh and by a farther boundary.
 
     Parameters
     ----------
+    magnet : Magnet
+    observation : Observation
     parts : ElementFields
         The finite-element part of the field at the observation's points.
+    session : Session
+        Session for the additional solves, see `error_bar_session`.
+
+    Returns
+    -------
+    ndarray, shape (readings,), in T
     """
     nominal = parts.nominal
     if parts.error is not None:
         return observation.magnitude(parts.error)
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
-        return np.zeros(len(observation))  # nothing is left to finite elements
+        return np.zeros(len(observation))  # the field is exact: finite elements add nothing
     route = choose_route(magnet, observation.points)
 
     def change(variant: Magnet, purpose: str) -> Floats:

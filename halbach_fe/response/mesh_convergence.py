@@ -1,7 +1,7 @@
-"""How wrong the solved field is: refinement, a farther boundary, and the dual formulation.
+"""Error estimates of the solved field: refinement, a farther boundary, the dual formulation.
 
-Everything is judged on the full nominal array at the study's own positions, where the errors of
-blocks add up, in units of the largest field there.
+All errors are those of the full nominal array at the study's own positions, because the errors of
+the blocks add up. They are relative to the largest field at these positions.
 """
 
 from __future__ import annotations
@@ -25,26 +25,29 @@ from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.measurement import FourierCoefficients
 
 HARMONICS = 8
+"""Number of harmonics that are compared if the study does not state a number."""
 
 EXACT = "exact field"
 
 FLATTEST, STEEPEST = 0.5, 4.0
-"""Orders of convergence that are believed."""
+"""Limits of the observed order of convergence. Orders outside of them are put down to chance."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Largest difference of two solves over the largest field.
+    """Largest differences between two solves, relative to the largest field.
 
     Attributes
     ----------
     what : str
+        Description of the two solves that are compared.
     pointwise : float
-        Of B at the points.
+        Largest |difference of B| at any point.
     fourier : float or None
-        Of the Fourier coefficients of B_r, where the study's positions are circles.
-    by_region : dict
-        Pointwise, by noise region.
+        Largest difference of the Fourier coefficients of B_r; None if the study's positions are not
+        circles.
+    by_region : dict of str to float
+        Largest |difference of B| at any point of each noise region.
     """
 
     what: str
@@ -55,29 +58,43 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verification(ShownInNotebook):
-    """What `verify` found.
+    """The error estimate of a solved field, from comparisons of several solves.
 
     Attributes
     ----------
     magnet : Magnet
     route : str
+        Formulation by which the field is solved, see `halbach_fe.solver.field.choose_route`.
     differences : tuple of Difference
-        Coarser to study, study to finer, nearer to farther boundary, the dual route if any, and
-        the exact field if there is one (method ``direct``, no permeability, no iron).
+        Between the coarser and the study's mesh, the study's and the finer mesh, and the nearer and
+        the farther boundary; then to the dual formulation if the route has one, and to the exact
+        field if it is known (method ``direct``, all permeabilities 1, no iron).
     order : float
         Observed order of convergence in the element size, between 0.5 and 4.
-    error_pointwise, error_fourier : float
-        Relative to the largest field: the difference to the exact field if there is one, otherwise
-        estimated for the study's own mesh as the remaining series of refinements, plus what the
-        boundary changes.
+    error_pointwise : float
+        Error of B at any point, relative to the largest field. It is the difference to the exact
+        field if that is known. Otherwise it is the sum of the geometric series of all further
+        refinements of the study's mesh, plus the change that the farther boundary makes.
+    error_fourier : float or None
+        The same for the Fourier coefficients of B_r; None if the study's positions are not circles.
     main_field_T : float
+        Largest |B| at the points, the scale of the relative errors.
     element_size_m : float
-        Of the study's own mesh, at the magnet.
+        Element size of the study's own mesh at the magnet.
     points : ndarray, shape (n, 3), in m
+        The study's positions.
     field : ndarray, shape (n, 3), in T
-        On the study's own mesh.
+        B at the points, solved on the study's own mesh.
     changes : ndarray, shape (differences, n), in T
-        |change of B| at every point.
+        |difference of B| at every point, for each of ``differences``.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> verification = hf.verify(magnet, hf.Session.open("results"))
+    >>> verification.differences[0].what
+    "coarser mesh to the study's"
     """
 
     magnet: Magnet
@@ -93,11 +110,11 @@ class Verification(ShownInNotebook):
     changes: Floats
 
     def plain(self) -> dict[str, object]:
-        """For scripts, without what is given by point."""
+        """Return the results as plain data for JSON, without the arrays over points."""
         by_point = ("magnet", "points", "field", "changes")
         return {name: getattr(self, name) for name in self.__dataclass_fields__
                 if name not in by_point} | {
-            "differences": [asdict(one) for one in self.differences]}
+            "differences": [asdict(difference) for difference in self.differences]}
 
 
 def verify(
@@ -105,8 +122,27 @@ def verify(
 ) -> Verification:
     """Estimate the error of the solved field of the nominal magnet.
 
-    The field is solved on a coarser, the study's own and a finer mesh, with the boundary farther
-    away, and by the dual formulation where there is one. ``say`` receives a line before each solve.
+    The field is solved on a coarser mesh, the study's own and a finer one, with the boundary
+    farther away, and by the dual formulation if the route has one.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+        Its folder receives the runs of GetDP.
+    say : callable, optional
+        Called with a description of each solve before it starts, to report progress.
+
+    Returns
+    -------
+    Verification
+
+    Raises
+    ------
+    StudyError
+        If a position is not in air.
+    GetDPError
+        If GetDP fails, or its answer does not pass verification.
 
     Examples
     --------
@@ -130,7 +166,7 @@ def verify(
         pairs[f"dual route, {DUAL[route]}"] = base, others[0]
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)
-    steps = [compare(what, *pair) for what, pair in pairs.items()]
+    steps = [compare(description, *pair) for description, pair in pairs.items()]
     order = observed_order(steps[0].pointwise, steps[1].pointwise)
     if EXACT in pairs:
         error, fourier = steps[-1].pointwise, steps[-1].fourier
@@ -145,28 +181,31 @@ def verify(
         element_size_m=(meridian_size(magnet) if route == "azimuthal_modes"
                         else magnet.study.mesh.block_size_m),
         points=points, field=base, changes=np.array(
-            [np.linalg.norm(one - other, axis=1) for one, other in pairs.values()]))
+            [np.linalg.norm(first - second, axis=1) for first, second in pairs.values()]))
 
 
 def variants_to_compare(magnet: Magnet, points: Floats) -> dict[str, Magnet]:
-    """Return what `verify` solves at the points (n, 3) in m, by its purpose in words: the study's
-    mesh, a coarser and a finer one, a farther boundary, and the dual route if there is one.
+    """Return the magnets that `verify` solves at the points (n, 3) in m, by a description.
+
+    They are the magnet with the study's mesh, with a coarser and a finer one, with a farther
+    boundary, and with the dual formulation if the route has one.
     """
     route = choose_route(magnet, points)
-    found = {
+    variants = {
         "the study's mesh": magnet, "a coarser mesh": refined(magnet, 1 / REFINEMENT),
         "a finer mesh": refined(magnet, REFINEMENT),
         "a farther boundary": farther(magnet, MESHES[route], REFINEMENT)}
     if route in DUAL:
-        found[f"the dual route, {DUAL[route]}"] = dual(magnet, route)
-    return found
+        variants[f"the dual route, {DUAL[route]}"] = dual(magnet, route)
+    return variants
 
 
 def observed_order(first: float, second: float) -> float:
-    """Order of convergence from two successive changes, kept between 0.5 and 4.
+    """Return the order of convergence from two successive changes, limited to 0.5 ... 4.
 
-    The lower limit makes the estimate of a solve that does not converge large (5.4 times the last
-    change) but finite; the upper one keeps a lucky pair from looking exact.
+    The lower limit makes the error estimate of a solve that does not converge large (5.4 times the
+    last change) but finite. The upper limit keeps a second change that is small by chance from
+    passing for an exact result.
     """
     if first <= 0 or second <= 0:
         return STEEPEST if second <= 0 else FLATTEST
@@ -174,17 +213,17 @@ def observed_order(first: float, second: float) -> float:
 
 
 class _Comparison:
-    """Differences of fields at a study's points."""
+    """Compares fields at a study's points with each other, relative to the largest field."""
 
     def __init__(self, magnet: Magnet, points: Floats, field: Floats) -> None:
         self.scale = float(np.linalg.norm(field, axis=1).max())
         self._circles = None
         positions = magnet.study.observation.positions
         if positions.kind == "circles" and positions.angles > 2:
-            wanted = getattr(magnet.study.observation, "harmonics", HARMONICS)
+            harmonics = getattr(magnet.study.observation, "harmonics", HARMONICS)
             self._circles, *_ = fourier_analysis(points, FourierCoefficients(
                 quantity="fourier_coefficients", positions=positions,
-                harmonics=min(wanted, (positions.angles - 1) // 2)))
+                harmonics=min(harmonics, (positions.angles - 1) // 2)))
         self._regions = {"all": np.ones(len(points), bool)}
         if magnet.study.noise is not None and magnet.study.noise.regions:
             names = getattr(magnet.study.observation, "components", ("",))
@@ -193,12 +232,12 @@ class _Comparison:
             regions = np.array([region.name for region in magnet.study.noise.regions])[index]
             self._regions = {name: (regions == name).any(axis=1) for name in np.unique(regions)}
 
-    def __call__(self, what: str, one: Floats, two: Floats) -> Difference:
-        change = np.linalg.norm(one - two, axis=1) / self.scale
+    def __call__(self, description: str, first: Floats, second: Floats) -> Difference:
+        change = np.linalg.norm(first - second, axis=1) / self.scale
         fourier = (None if self._circles is None
-                   else float(np.abs(self._circles @ (one - two).ravel()).max() / self.scale))
+                   else float(np.abs(self._circles @ (first - second).ravel()).max() / self.scale))
         return Difference(
-            what=what, pointwise=float(change.max()), fourier=fourier,
+            what=description, pointwise=float(change.max()), fourier=fourier,
             by_region={name: float(change[mask].max()) for name, mask in self._regions.items()
                        if mask.any()})
 

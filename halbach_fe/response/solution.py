@@ -29,14 +29,26 @@ class Solution(ShownInNotebook):
     Attributes
     ----------
     magnet : Magnet
-    points, flux_density : ndarray, shape (n, 3), in m and T
-        The study's positions and B there.
+    points : ndarray, shape (n, 3), in m
+        The study's positions.
+    flux_density : ndarray, shape (n, 3), in T
+        B at these positions.
     observation : Observation
         How the study turns B into readings.
     readings, errors : ndarray, shape (readings,), in T
-        The readings, and the error bar of the solver for each.
+        The readings, and the solver's error bar of each reading.
     getdp : str
         Version of GetDP.
+    field_map : Dataset
+        B at the study's positions as a labelled map.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> solution = hf.solve(magnet, hf.Session.open("results"))
+    >>> solution.readings.shape == solution.errors.shape
+    True
     """
 
     magnet: Magnet
@@ -72,7 +84,7 @@ def study_observation(magnet: Magnet) -> Observation:
     Raises
     ------
     StudyError
-        If a position, or the place of a sensor there, is not in air.
+        If a position, or the place of a sensor of a probe at that position, is not in air.
     """
     points = points_from(magnet.study.observation.positions)
     observation = observe(magnet.study, points, np.ones_like(points, bool))
@@ -84,12 +96,13 @@ def solve(magnet: Magnet, session: Session) -> Solution:
     """Solve for the field of the nominal magnet at the study's positions.
 
     Iron with an H(B) curve is solved by Newton's method. The run folders of GetDP are kept in the
-    session's folder, to be run by hand.
+    session's folder and can be run by hand.
 
     Parameters
     ----------
     magnet : Magnet
     session : Session
+        Its folder receives the run folders.
 
     Returns
     -------
@@ -99,7 +112,9 @@ def solve(magnet: Magnet, session: Session) -> Solution:
     Raises
     ------
     StudyError
-        If positions are not in air.
+        If a position, or the place of a sensor of a probe at that position, is not in air.
+    MeshError
+        If the magnet cannot be meshed, or positions lie outside the meshed region.
     GetDPError
         If GetDP fails, or its answer does not pass verification.
 
@@ -114,12 +129,12 @@ def solve(magnet: Magnet, session: Session) -> Solution:
     observation = study_observation(magnet)
     points = observation.map_points
     places = _places(points, observation)
-    part = finite_element_part(magnet, places, session, columns=False)
-    field = vacuum_part(magnet, places) + part.nominal
+    parts = finite_element_part(magnet, places, session, columns=False)
+    field = vacuum_part(magnet, places) + parts.nominal
     sensors = slice(-len(observation.points), None)
     errors = reading_errors(magnet, observation, replace(
-        part, nominal=part.nominal[sensors],
-        error=None if part.error is None else part.error[sensors]), error_bar_session(session))
+        parts, nominal=parts.nominal[sensors],
+        error=None if parts.error is None else parts.error[sensors]), error_bar_session(session))
     return Solution(magnet, points, field[:len(points)], observation,
                     observation.apply(field[sensors]), errors, session.getdp.version)
 
@@ -135,6 +150,9 @@ def write_solution(solution: Solution, folder: Path) -> None:
 
 
 def _places(points: Floats, observation: Observation) -> Floats:
-    """The points of the map, and behind them those of the sensors if these are elsewhere."""
-    elsewhere = not np.array_equal(observation.points, points)
-    return np.vstack([points, observation.points]) if elsewhere else points
+    """Return the points of the map, followed by those of the sensors if the two differ.
+
+    In either case the last rows are the points of the sensors.
+    """
+    displaced = not np.array_equal(observation.points, points)
+    return np.vstack([points, observation.points]) if displaced else points

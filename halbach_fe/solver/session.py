@@ -84,6 +84,12 @@ class Session:
         What the solves are for, in words.
     counter : RunCounter, optional
         With it nothing is meshed or solved: the runs that would be started are counted.
+
+    Examples
+    --------
+    >>> session = Session.open("results", jobs=1)
+    >>> session.jobs, session.folder.name
+    (1, 'results')
     """
 
     getdp: GetDP
@@ -114,6 +120,10 @@ class Session:
             GetDP executable; by default that of $HALBACH_FE_GETDP, then of PATH.
         progress : callable, optional
             See `Session`.
+
+        Returns
+        -------
+        Session
 
         Raises
         ------

@@ -29,6 +29,16 @@ MAX_WRONG_UNIT = 1e9
 def read_study(path: str | Path) -> Study:
     """Read and validate a study file.
 
+    Parameters
+    ----------
+    path : str or Path
+        A TOML file. If it names a file with the H(B) curve of the iron, that file is read too; its
+        path is relative to the folder of the study file.
+
+    Returns
+    -------
+    Study
+
     Raises
     ------
     StudyError

@@ -16,8 +16,8 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
-from halbach_fe.synthetic.extras import import_extra
 from halbach_fe.synthetic.ngsolve_reaction import outline_face
+from halbach_fe.synthetic.optional_packages import import_extra
 
 PRECISION = 1e-12
 """Relative tolerance of the conjugate gradients."""

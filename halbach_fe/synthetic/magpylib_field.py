@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
-from halbach_fe.synthetic.extras import import_extra
+from halbach_fe.synthetic.optional_packages import import_extra
 
 LONG = 250.0
 """Length that stands for an infinite one, relative to the distance of the points from the middle.

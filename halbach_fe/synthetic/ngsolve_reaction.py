@@ -33,7 +33,7 @@ from halbach_fe.synthetic.bodies import (
     TrueMagnet,
     Tube,
 )
-from halbach_fe.synthetic.extras import import_extra
+from halbach_fe.synthetic.optional_packages import import_extra
 
 RESIDUAL = 1e-11
 """Residual, relative to the first, at which Newton's method stops.

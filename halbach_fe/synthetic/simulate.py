@@ -27,17 +27,17 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.bodies import TrueMagnet, magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
-from halbach_fe.synthetic.extras import version_of
+from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
     instrument_with,
     with_effects,
 )
-from halbach_fe.synthetic.hidden_effects.kinds import site_of
-from halbach_fe.synthetic.instrument import FaultyInstrument
+from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.magpylib_field import Progress, no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
+from halbach_fe.synthetic.optional_packages import version_of
 from halbach_fe.synthetic.positions import between
 
 COIL_SD = 0.001
@@ -73,6 +73,13 @@ class SimulatedCampaign(ShownInNotebook):
         The magnetizations, hidden effects and other numbers that were drawn, as plain data.
     without_noise : ndarray, shape (n, 3)
         Readings of the map before noise was added, in the field unit of the record.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> campaign = hf.simulate_measurement(hf.read_study("dipole.toml"))
+    >>> campaign.without_noise.shape, len(campaign.blocks)
+    ((24, 3), 16)
     """
 
     study: Study

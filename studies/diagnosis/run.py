@@ -45,8 +45,8 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
-from halbach_fe.synthetic.extras import import_extra
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
+from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import simulate_campaign
 
 HERE = Path(__file__).parent

@@ -19,7 +19,7 @@ from halbach_fe.cli.diagnose import print_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.write import write_diagnosis
+from halbach_fe.report.result_files import write_diagnosis
 from halbach_fe.study.reader import read_study
 
 

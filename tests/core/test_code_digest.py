@@ -11,7 +11,8 @@ from halbach_fe.core.code_digest import sources
 
 MODEL = {
     "toy/__init__.py": "",
-    "toy/matrix.py": "from toy.solver import field\n",
+    "toy/matrix.py": "from typing import TYPE_CHECKING\nfrom toy.solver import field\n"
+                     "if TYPE_CHECKING:\n    from toy.report import page\n",
     "toy/solver/__init__.py": "",
     "toy/solver/field.py": "def f():\n    from toy.solver.closed_forms.cuboid import g\n",
     "toy/solver/closed_forms/__init__.py": "",

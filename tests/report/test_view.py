@@ -10,8 +10,14 @@ import pytest
 from matplotlib.image import imread
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import view
-from halbach_fe.report.view import BlockValues, Colours, magnet_view, prism, residual_points
+from halbach_fe.report import magnet_view_3d
+from halbach_fe.report.magnet_view_3d import (
+    BlockValues,
+    Colours,
+    magnet_view,
+    prism,
+    residual_points,
+)
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
@@ -121,14 +127,15 @@ def test_of_too_many_blocks_neighbouring_rings_are_one(short_dipole, monkeypatch
     values[16 * 3 + 4], values[16 * 6 + 1] = -5.0, 2.0  # ring 4, slot 5; ring 7, slot 2
     known = BlockValues(np.array([block.magnetization for block in blocks]), Colours(
         values, "change", [f"{one:g} %" for one in values]))
-    every, _ = view._merge_rings(build_magnet(study), known)
+    every, _ = magnet_view_3d._merge_rings(build_magnet(study), known)
     assert len(every) == len(blocks)
-    monkeypatch.setattr(view, "MOST_BLOCKS", 40)
-    few, shown = view._merge_rings(build_magnet(study), known)
+    monkeypatch.setattr(magnet_view_3d, "MOST_BLOCKS", 40)
+    few, shown = magnet_view_3d._merge_rings(build_magnet(study), known)
     assert len(few) == len(shown.magnetization) == len(shown.colours.words) == 48  # rings by three
     assert shown.colours.values[16 + 4] == -5.0
     assert shown.colours.words[16 + 4] == "largest in ring 4: -5 %"
-    assert view._hover_text(few[16 + 4], 2, shown, 16 + 4).startswith("rings 4 to 6, slot 5")
+    text = magnet_view_3d._hover_text(few[16 + 4], 2, shown, 16 + 4)
+    assert text.startswith("rings 4 to 6, slot 5")
     assert shown.colours.values[32 + 1] == 2.0
     assert (few[0].z_min, few[-1].z_max) == (blocks[0].z_min, blocks[-1].z_max)
     assert sum(block.volume for block in few) == pytest.approx(

@@ -12,7 +12,7 @@ from halbach_fe.core.errors import ExtraMissingError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.field import finite_element_part, solve_nominal
 from halbach_fe.solver.vacuum_field import field_of
-from halbach_fe.synthetic import extras, magpylib_field
+from halbach_fe.synthetic import magpylib_field, optional_packages
 from halbach_fe.synthetic.bodies import BodyPart, magnet_of, vector
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
@@ -274,4 +274,4 @@ def test_programs_that_are_not_installed(monkeypatch):
     """One sentence that says what to install."""
     monkeypatch.setitem(__import__("sys").modules, "magpylib", None)
     with pytest.raises(ExtraMissingError, match=r"pip install halbach-fe\[campaign\]"):
-        extras.import_extra("magpylib")
+        optional_packages.import_extra("magpylib")

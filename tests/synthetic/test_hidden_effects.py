@@ -23,7 +23,7 @@ from halbach_fe.synthetic.hidden_effects import (
     parse_hidden_effect,
     with_effects,
 )
-from halbach_fe.synthetic.hidden_effects.kinds import ChosenEffect, site_of
+from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, site_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.simulate import measured, simulate_campaign, true_field

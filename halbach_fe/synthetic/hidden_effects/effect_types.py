@@ -16,7 +16,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
 from halbach_fe.synthetic.bodies import TrueMagnet, Vector
-from halbach_fe.synthetic.instrument import FaultyInstrument
+from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.positions import between
 
 Need = Literal["3d", "rings", "no iron", "x", "y", "z", "circles"]

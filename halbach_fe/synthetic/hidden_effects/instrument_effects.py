@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.study.types import COMPONENTS, Component
 from halbach_fe.synthetic.bodies import Vector, vector
-from halbach_fe.synthetic.hidden_effects.kinds import (
+from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
+from halbach_fe.synthetic.hidden_effects.effect_types import (
     Draw,
     HiddenEffect,
     HiddenParameter,
@@ -20,7 +21,6 @@ from halbach_fe.synthetic.hidden_effects.kinds import (
     draw_number,
     log_uniform,
 )
-from halbach_fe.synthetic.instrument import FaultyInstrument
 
 
 def _with(values: Vector, index: int, more: float) -> Vector:

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.synthetic.bodies import Body, TrueMagnet, vector
-from halbach_fe.synthetic.hidden_effects.kinds import (
+from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
+from halbach_fe.synthetic.hidden_effects.effect_types import (
     HiddenEffect,
     HiddenParameter,
     Site,
     signed_log_uniform,
 )
-from halbach_fe.synthetic.instrument import FaultyInstrument
 
 NOTHING: tuple[float, ...] = ()
 """Values of an effect without parameters."""

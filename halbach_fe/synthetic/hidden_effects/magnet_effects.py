@@ -20,7 +20,7 @@ from halbach_fe.synthetic.bodies import (
     Tube,
     vector,
 )
-from halbach_fe.synthetic.hidden_effects.kinds import (
+from halbach_fe.synthetic.hidden_effects.effect_types import (
     HiddenEffect,
     HiddenParameter,
     Site,
