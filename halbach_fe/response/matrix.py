@@ -1,11 +1,12 @@
-"""The response matrix H: block magnetizations p in A/m to readings q in T, q = H p, and the offset
-of fields that are not the magnet's.
+"""The response matrix H, which maps block magnetizations p in A/m to readings q in T.
 
-With non-linear iron H is the derivative at the nominal magnetization, and q = offset + H p near it.
+The model is ``q = offset + H p``, where the offset holds the readings of external fields. If the
+iron is non-linear, H is the derivative at the nominal magnetization, and the model holds near it.
 
-Each column is the field of one block magnetized by 1 A/m along one axis: its exact field in
-vacuum plus the finite-element reaction, or the finite-element field alone (method ``direct``).
-One more solve, of the nominal array at once, is compared with the sum of the columns.
+Each column of H has the readings of a single block that is magnetized by 1 A/m along one axis. Its
+field is the exact field in vacuum plus the finite-element reaction of the magnet, or, with the
+method ``direct``, the finite-element field alone. An additional solve of all nominal blocks at once
+is compared with the sum of the columns.
 """
 
 from __future__ import annotations
@@ -47,17 +48,18 @@ from halbach_fe.study.model import FIELD_KEYS
 from halbach_fe.study.types import COMPONENTS
 
 LOADED_BYTES = 2**30
-"""A larger matrix stays on the disk, and is read in parts."""
+"""Size in bytes above which a matrix stays on the disk and is read in parts."""
 
 
 @dataclass(frozen=True)
 class StoredMatrix:
-    """A matrix in a .npy file.
+    """A matrix in a .npy file, of which only the rows in use are in memory.
 
     Attributes
     ----------
     path : Path
     shape : tuple of int
+        Numbers of rows and columns.
     """
 
     path: Path
@@ -65,7 +67,7 @@ class StoredMatrix:
 
     @classmethod
     def of(cls, parts: Iterable[Floats], shape: tuple[int, int], path: Path) -> StoredMatrix:
-        """Write a matrix of its rows, parts (k, m)."""
+        """Write a matrix whose rows arrive in parts (k, m)."""
         with atomic(path) as temporary, temporary.open("wb") as file:
             file.write(_npy_header(shape))
             for part in parts:
@@ -74,7 +76,13 @@ class StoredMatrix:
 
     @classmethod
     def at(cls, path: Path, shape: tuple[int, int]) -> StoredMatrix:
-        """One that was written before; ValueError if it is damaged, or another."""
+        """Return the matrix in a file that was written before.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or holds a matrix of another shape.
+        """
         header = _npy_header(shape)
         with path.open("rb") as file:
             if file.read(len(header)) != header or (
@@ -86,7 +94,7 @@ class StoredMatrix:
         return self.shape[0]
 
     def __getitem__(self, rows: Rows) -> Floats:
-        try:  # mapped anew: pages that were read are not kept
+        try:  # a new memory map for each access, so that pages already read are released
             return np.array(np.memmap(self.path, "<f8", "r", len(_npy_header(self.shape)),
                                       self.shape)[rows])
         except OSError as error:
@@ -106,25 +114,27 @@ def _npy_header(shape: tuple[int, int]) -> bytes:
 
 @dataclass(frozen=True)
 class Response:
-    """H and its labels.
+    """The linear model ``q = offset + H p`` from magnetizations p to readings q.
 
     Attributes
     ----------
     matrix : ndarray or StoredMatrix, shape (readings, parameters), in T m/A
+        The response matrix H.
     parameters : tuple of str
-        ``r01s05.Mx``: ring 1, slot 5, component x.
+        Names of the parameters; ``r01s05.Mx`` is M_x of ring 1, slot 5.
     nominal : ndarray, shape (parameters,), in A/m
         The study's nominal magnetization.
     offset : ndarray, shape (readings,), in T
-        Fields that are not the magnet's, and what linearizing iron leaves.
+        Readings of external fields, and with non-linear iron also the constant term of the
+        linearization.
     error : ndarray, shape (readings,), in T
         Error bar of the finite elements, for the nominal array; see
         `halbach_fe.response.discretization_error.reading_errors`.
     superposition_error : float
-        How far the blocks' finite-element parts, summed, miss that of the whole array, see
-        `verify_superposition`.
+        Relative difference between the sum of the blocks' finite-element parts and that of the
+        whole array, see `verify_superposition`.
     reused : bool
-        Whether it was taken from an earlier run with the same inputs.
+        Whether the response was read from the file of an earlier run with the same inputs.
     """
 
     matrix: Floats | StoredMatrix
@@ -137,18 +147,28 @@ class Response:
 
     @property
     def whole(self) -> Floats:
-        """The matrix in memory, however large."""
+        """The whole matrix H in memory, even if it is stored in a file because of its size."""
         return self.matrix[np.arange(len(self.matrix))]
 
 
 def parameter_names(magnet: Magnet) -> tuple[str, ...]:
-    """Names of the parameters p, block by block; the cross-section has no M_z."""
+    """Return the names of the parameters p, block by block; a cross-section has no M_z."""
     components = COMPONENTS[: magnet.dimension]
     return tuple(f"{block.name}.M{c}" for block in magnet.blocks for c in components)
 
 
 def response_matrix(magnet: Magnet, observation: Observation, session: Session) -> Response:
-    """Build H, or take it from the session's folder if it is there for the same inputs."""
+    """Build H, or read it from the session's folder if it was built for the same inputs.
+
+    Raises
+    ------
+    StudyError
+        If a point of the observation is not in air.
+    PointsOutsideError
+        If a point lies outside the meshed region.
+    GetDPError
+        If GetDP fails, or the columns do not add up to the field of the whole array.
+    """
     check_points(magnet, observation.points)
     key = _key(magnet, observation, session)
     path = session.folder / "response.h5"
@@ -160,9 +180,9 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
     def rows() -> Iterator[Floats]:
-        # as many at once as memory takes: they share integrals
-        for some in row_slices(len(observation), dimension * len(blocks), len(observation)):
-            matrix, total[some], magnitude[some] = _rows(magnet, observation, parts, some)
+        # as many rows at once as memory allows, because rows share integrals
+        for part in row_slices(len(observation), dimension * len(blocks), len(observation)):
+            matrix, total[part], magnitude[part] = _rows(magnet, observation, parts, part)
             yield matrix
 
     shape = len(observation), dimension * len(blocks)
@@ -172,7 +192,8 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
     direct = observation.apply(parts.along_nominal)
     error = reading_errors(magnet, observation, parts, error_bar_session(session))
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
-    # where symmetry places blocks on a mesh without it, the columns miss the nominal array a little
+    # if columns follow from symmetry but the mesh is not quite symmetric, they add up to slightly
+    # less or more than the field of the nominal array
     offset = observation.apply(external_field(magnet, observation.points))
     if parts.linearized:
         field = vacuum_part(magnet, observation.points) + parts.nominal
@@ -184,13 +205,15 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
 
 
 def _rows(
-    magnet: Magnet, observation: Observation, parts: ElementFields, some: slice
+    magnet: Magnet, observation: Observation, parts: ElementFields, rows: slice
 ) -> tuple[Floats, Floats, Floats]:
-    """Some rows (k, parameters) of H; and of what finite elements contribute to these readings of
-    the nominal array, block by block, the sum and that of magnitudes (k,), in T.
+    """Return some rows (k, parameters) of H, and two sums over the blocks of the nominal array.
+
+    Both sums are (k,) in T: of the blocks' finite-element contributions to these readings, and of
+    the magnitudes of these contributions. They serve `verify_superposition`.
     """
     blocks, dimension = magnet.blocks, magnet.dimension
-    seen, operator = observation.part(some)
+    seen, operator = observation.part(rows)
     points = observation.points[seen]
     vacuum = unit_fields(blocks, points) if magnet.study.solver.method == "reaction" else None
     total, magnitude = np.zeros(operator.shape[0]), np.zeros(operator.shape[0])
@@ -198,19 +221,19 @@ def _rows(
     for number, block in enumerate(blocks):
         readings = operator @ parts.block(number, seen).reshape(-1, dimension)
         source = parts.sources[number]
-        share = readings * (source.remanence * np.array(source.easy_axis[:dimension]))
-        total += share.sum(axis=1)
-        magnitude += np.abs(share).sum(axis=1)
+        contribution = readings * (source.remanence * np.array(source.easy_axis[:dimension]))
+        total += contribution.sum(axis=1)
+        magnitude += np.abs(contribution).sum(axis=1)
         if vacuum is not None:
             readings = readings + operator @ next(vacuum)[:, :, :dimension].reshape(-1, dimension)
-        # B_r = mu_0 mu_r M turns per tesla into per A/m
+        # B_r = mu_0 mu_r M converts readings per tesla into readings per A/m
         matrix[:, dimension * number:dimension * (number + 1)] = readings @ (
             MU_0 * block.recoil_tensor[:dimension, :dimension])
     return matrix, total, magnitude
 
 
 def _whole(parts: Iterable[Floats], shape: tuple[int, int]) -> Floats:
-    """A matrix of its rows, parts (k, m)."""
+    """Return a matrix whose rows arrive in parts (k, m)."""
     matrix, first = np.empty(shape), 0
     for part in parts:
         matrix[first:first + len(part)] = part
@@ -221,11 +244,29 @@ def _whole(parts: Iterable[Floats], shape: tuple[int, int]) -> Floats:
 def verify_superposition(
     total: Floats, magnitude: Floats, direct: Floats, tolerance: float = SUPERPOSITION_TOLERANCE
 ) -> float:
-    """Return the largest difference between readings of all blocks together, summed and solved
-    directly, relative to the largest sum of magnitudes (readings may vanish by symmetry).
+    """Compare the sum of the blocks' readings with the readings of all blocks solved together.
 
-    Only what finite elements contribute is compared; the rest is exact. GetDPError if it is too
-    large.
+    Only the contributions of the finite elements are compared; the remainder is exact.
+
+    Parameters
+    ----------
+    total, magnitude : ndarray, shape (readings,), in T
+        Sums over the blocks of their contributions, and of the magnitudes of these.
+    direct : ndarray, shape (readings,), in T
+        Contributions of all blocks solved together.
+    tolerance : float
+        Largest relative difference that is accepted.
+
+    Returns
+    -------
+    float
+        Largest difference, relative to the largest sum of magnitudes, because the readings
+        themselves may vanish by symmetry.
+
+    Raises
+    ------
+    GetDPError
+        If the difference is larger than the tolerance.
     """
     scale = magnitude.max()
     error = float(np.abs(total - direct).max() / scale) if scale > 0 else float(
@@ -233,16 +274,16 @@ def verify_superposition(
     if not error <= tolerance:
         raise GetDPError(
             f"The columns of the response do not add up to the directly solved field: the largest "
-            f"difference is {error:.1e} of it, where {tolerance:.0e} is allowed. "
-            "A column is wrong; please report this with the study.")
+            f"difference is {error:.1e} of the blocks' contributions, where {tolerance:.0e} is "
+            "allowed. A column is wrong; please report this with the study.")
     return error
 
 
 def _key(magnet: Magnet, observation: Observation, session: Session) -> str:
-    """Digest of all that the matrix depends on."""
+    """Return a digest of everything that the matrix depends on."""
     relevant = magnet.study.model_dump(mode="json", include=FIELD_KEYS)
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
-    curve = magnet.curve  # a steel's name says nothing of its numbers
+    curve = magnet.curve  # the study may only name the steel, whose data may change
     if curve is not None:
         digest.update(np.array([curve.H, curve.B]).tobytes())
     versions = [metadata.version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]
@@ -267,16 +308,16 @@ def _write(path: Path, key: str, built: Response) -> None:
     write_hdf5(data, path)
     for other in path.parent.glob("response-*.npy"):
         if "H" in data or other != _beside(path, key):
-            other.unlink()  # of other inputs
+            other.unlink()  # it belongs to other inputs
 
 
 def _beside(path: Path, key: str) -> Path:
-    """Where a matrix is that is too large for the file of the rest."""
+    """Return the path of a matrix that is too large to be in the file response.h5 at ``path``."""
     return path.with_name(f"response-{key[:16]}.npy")
 
 
 def _read(path: Path, key: str) -> Response | None:
-    """The stored response; None if there is none, or it is of other inputs, or damaged."""
+    """Return the stored response; None if it is missing, damaged, or belongs to other inputs."""
     try:
         data = untrusted.read_dataset(path)
         if data.attrs["key"] != key:

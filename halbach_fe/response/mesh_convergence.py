@@ -30,7 +30,7 @@ HARMONICS = 8
 EXACT = "exact field"
 
 FLATTEST, STEEPEST = 0.5, 4.0
-"""Limits of the observed order of convergence. Orders outside of them are put down to chance."""
+"""Limits of the observed order of convergence, see `observed_order`."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ Computation for Accelerator Magnets, 2010, ch. 6). On the circle that is ``B_r =
 of 1e-4 of the main one, ``c_n = 1e4 C_n / |C_N|``, along axes turned about z such that the nominal
 magnet's main multipole is normal: ``C_n exp(-i n arg(C_N) / N)``.
 
-In two dimensions there is one circle. In three the field is integrated along z over the magnet and
-far beyond its ends, which makes it a solution of the two-dimensional Laplace equation again; or,
-at one z, the coefficients of B_r there are given as they are.
+In 2D the multipoles are those of a single circle. In 3D they are those of the field integrated
+along z over the magnet and far beyond its ends, because this integral solves the two-dimensional
+Laplace equation again. Alternatively, they are the coefficients of B_r on the circle at a given z.
 """
 
 from __future__ import annotations
@@ -37,40 +37,55 @@ from halbach_fe.study.types import COMPONENTS
 Complexes = NDArray[np.complex128]
 
 UNITS = 1e4
-"""Multipoles are given in 1e-4 of the main one."""
+"""Units per main multipole: unwanted multipoles are given in units of 1e-4 of the main one."""
 
 DEFAULT_RADIUS = 2 / 3
-"""Reference radius over the blocks' inner radius, as is usual."""
+"""Default reference radius relative to the inner radius of the blocks, the usual choice."""
 
 DEFAULT_ORDERS = tuple(range(1, 11))
+"""Default orders of multipoles."""
 
 SUM_ERROR = 1e-8
-"""What equally spaced angles, or z, may add of one multipole to another, relative to the field at
-the blocks. Harmonics of order k fall as (R / r)^k from the blocks' radius r inwards, and a sum over
-steps h along z of a field whose sources are d away errs by exp(-2 pi d / h)."""
+"""Tolerance of sums over equally spaced angles or z, relative to the field at the blocks. Such a
+sum mixes a small part of a multipole into another. Harmonics of order k fall as (R / r)^k from the
+blocks' radius r inwards, and the sum over steps h along z of a field whose sources are at the
+distance d has the error exp(-2 pi d / h)."""
 
 BEYOND_ENDS = 4.5
-"""How far sums along z go beyond the magnet, over its outer radius. A block's field falls as 1/z^3,
-which leaves some 1e-3 of a block's own integral of order 1 to the field of point dipoles beyond.
-Higher orders fall faster: for two rings of 80 mm with errors of 2 %, 0.01 units remain. It is half
-of the way to where 3D meshes end."""
+"""Distance by which sums along z extend beyond the ends, relative to the magnet's outer radius. The
+field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 of a block lies
+beyond; it is added as the field of point dipoles (`beyond`). Higher orders fall faster: for two
+rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of that to the
+boundary of 3D meshes."""
 
 NOTHING_THERE = 1e-6
-"""Main multipole below which a magnet has none, relative to what its blocks could do together."""
+"""Tolerance below which the main multipole counts as zero, relative to the largest multipole that
+the blocks could produce together."""
 
 
 @dataclass(frozen=True)
 class MultipoleReference:
-    """Where multipoles are taken, and which.
+    """The reference radius, orders and z of multipoles.
 
     Attributes
     ----------
     radius_m : float or None
-        Default: that of the study's own circles if it has one, else `DEFAULT_RADIUS` of the bore.
+        Reference radius R in m. None stands for the radius of the study's circles if they have a
+        single radius, and else for two thirds of the inner radius of the blocks.
     orders : tuple of int
-        Unwanted ones; the main one, if it is there, does not count.
+        Orders of the unwanted multipoles, 1 for the dipole. The magnet's main order is ignored.
     z_m : float or None
-        In three dimensions: of one circle, in place of the integral along z.
+        Only in 3D: position in m of the circle on which the multipoles are taken. None stands for
+        the field integrated along z.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> reference = hf.MultipoleReference(radius_m=0.02, orders=(2, 3))
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> model, _ = hf.multipoles(magnet, hf.Session.open("results"), reference).tables[0]
+    >>> model.radius, model.orders
+    (0.02, (2, 3))
     """
 
     radius_m: float | None = None
@@ -80,22 +95,24 @@ class MultipoleReference:
 
 @dataclass(frozen=True)
 class Multipoles:
-    """Multipoles of a magnet, as far as they are known.
+    """The multipoles of a magnet, with their uncertainty.
 
     Attributes
     ----------
-    orders : tuple of int
-        Unwanted ones, k of them.
-    main : float
-        |C_N| in T, or T m if integrated along z; ``main_sd`` its standard deviation.
-    roll : float
-        Angle in rad by which the main multipole is turned about z from the nominal one.
+    orders : tuple of int, length k
+        Orders of the unwanted multipoles.
+    main, main_sd : float
+        Mean and standard deviation of |C_N| in T, or in T m if integrated along z.
+    roll, roll_sd : float
+        Mean and standard deviation of the angle in rad by which the main multipole is turned about
+        z from that of the nominal magnet.
     mean : ndarray, shape (2 k,)
-        b_n of all orders, then a_n, in units of 1e-4 of the main one.
+        Means of b_n of all orders, followed by those of a_n, in units of 1e-4 of the main one.
     root : ndarray, shape (2 k, q)
-        Root of their covariance.
+        Root of the covariance of these, in the same units.
     error : ndarray, shape (2 k,)
-        The solver's own, of the nominal magnet, not in ``root``.
+        Error of the solver for the nominal magnet in the same units, which ``root`` does not
+        include.
     """
 
     orders: tuple[int, ...]
@@ -109,32 +126,32 @@ class Multipoles:
 
     @property
     def covariance(self) -> Floats:
-        """Shape (2 k, 2 k)."""
+        """Covariance (2 k, 2 k) of b_n and a_n in units^2, without the solver's error."""
         return self.root @ self.root.T
 
     @property
     def sd(self) -> Floats:
-        """Standard deviations (2 k,), the solver's error included."""
+        """Standard deviations (2 k,) of b_n and a_n in units, including the solver's error."""
         return np.sqrt(np.einsum("ij,ij->i", self.root, self.root) + self.error**2)
 
     @property
     def sizes(self) -> Floats:
-        """|c_n| (k,) of the mean."""
+        """Magnitudes |c_n| (k,) of the mean, in units."""
         return np.hypot(*self.mean.reshape(2, -1))
 
     @property
     def expected_square(self) -> float:
-        """Expected sum of all |c_n|^2, without the solver's error."""
+        """Expectation of the sum of all |c_n|^2 in units^2, without the solver's error."""
         return float(self.mean @ self.mean + np.sum(self.root**2))
 
     def sizes_of(self, normals: Floats) -> Floats:
-        """|c_n| (count, k) of samples, made of standard normal numbers (count, 2 k)."""
+        """Return |c_n| (count, k) of samples made from standard normal numbers (count, 2 k)."""
         values, vectors = np.linalg.eigh(self.covariance + np.diag(self.error**2))
         drawn = self.mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T
         return np.hypot(*drawn.reshape(len(drawn), 2, -1).swapaxes(0, 1))
 
     def table(self) -> list[dict[str, float]]:
-        """One row per order, as plain numbers."""
+        """Return a row per order, as plain numbers for JSON."""
         size = len(self.orders)
         return [{"n": order, "b": float(self.mean[i]), "b_sd": float(self.sd[i]),
                  "a": float(self.mean[size + i]), "a_sd": float(self.sd[size + i]),
@@ -143,26 +160,33 @@ class Multipoles:
 
 @dataclass(frozen=True)
 class MultipoleModel:
-    """Multipoles ``C = offset + matrix p`` in T (integrated: T m), the main one first.
+    """The linear model ``C = offset + matrix p`` of the multipoles, with the main one first.
+
+    C is in T, or in T m if integrated along z, and p are the magnetizations in A/m.
 
     Attributes
     ----------
-    orders : tuple of int
-        Unwanted ones.
+    orders : tuple of int, length k
+        Orders of the unwanted multipoles.
     main : int
-        The magnet's own order N.
-    radius : float, in m
+        The magnet's main order N.
+    radius : float
+        Reference radius in m.
     z : float or None
-        In m, of one circle in three dimensions.
+        Position in m of the circle, in 3D; None in 2D and for the integral along z.
     integrated : bool
-    matrix : ndarray of complex, shape (1 + k, parameters)
-        Along axes in which the nominal main multipole is normal.
-    offset : ndarray of complex, shape (1 + k,)
-    error : ndarray, shape (1 + k,)
-        Of the solver, of the modulus.
+        Whether the field is integrated along z.
+    matrix : ndarray of complex, shape (1 + k, parameters), in T m/A (integrated: T m^2/A)
+        Rows for the main multipole and for ``orders``, along axes in which the nominal main
+        multipole is normal.
+    offset : ndarray of complex, shape (1 + k,), in T (integrated: T m)
+        Multipoles of external fields.
+    error : ndarray, shape (1 + k,), in T (integrated: T m)
+        Error bar of the solver for the moduli |C|.
     nominal : ndarray, shape (parameters,), in A/m
+        Nominal magnetization.
     turn : float
-        Angle of those axes in rad.
+        Angle in rad of the axes about z.
     """
 
     orders: tuple[int, ...]
@@ -178,25 +202,28 @@ class MultipoleModel:
 
     @property
     def unit(self) -> str:
-        """Of the main multipole."""
+        """Unit of the main multipole."""
         return "T m" if self.integrated else "T"
 
     @cached_property
     def nominal_main(self) -> float:
-        """|C_N| of the nominal magnet."""
+        """|C_N| of the nominal magnet, in `unit`."""
         return float(abs((self.offset + self.matrix @ self.nominal)[0]))
 
     def scaled(self, main: float) -> Floats:
-        """The matrix (2 k, parameters) of b_n, a_n for a given |C_N|."""
+        """Return the matrix (2 k, parameters) from magnetizations to b_n, a_n for a given |C_N|."""
         return UNITS / main * np.vstack([self.matrix[1:].real, self.matrix[1:].imag])
 
     def of(self, parameters: Gaussian) -> Multipoles:
-        """Multipoles of magnetizations in A/m."""
+        """Return the multipoles of normally distributed magnetizations in A/m."""
         return self.known(self.offset + self.matrix @ parameters.mean,
                           self.matrix @ parameters.root)
 
     def known(self, mean: Complexes, root: Complexes) -> Multipoles:
-        """Multipoles of a mean (1 + k,) and a root (1 + k, q) of C, linearized about that mean."""
+        """Return the multipoles for a mean (1 + k,) of C and a root (1 + k, q) of its covariance.
+
+        The ratios of C to |C_N| are linearized about the mean.
+        """
         strength = float(abs(mean[0]))
         along = (np.conj(mean[0]) * root[0]).real / strength  # of |C_N|
         across = (np.conj(mean[0]) * root[0]).imag / strength**2
@@ -204,14 +231,14 @@ class MultipoleModel:
         own = (root[1:] - np.outer(relative, along)) / strength
         return Multipoles(
             self.orders, strength, float(np.linalg.norm(along)),
-            # C_N exp(i N theta) is that of axes turned by theta
+            # in axes turned by theta, C_N becomes C_N exp(i N theta)
             float(-np.angle(mean[0])) / self.main, float(np.linalg.norm(across)) / self.main,
             UNITS * np.concatenate([relative.real, relative.imag]),
             UNITS * np.vstack([own.real, own.imag]),
             UNITS * np.tile(self.error[1:] / strength, 2))
 
     def units(self, coefficients: Complexes) -> Floats:
-        """b_n, a_n (..., 2 k) of coefficients C (..., 1 + k), without linearizing."""
+        """Return b_n, a_n (..., 2 k) of coefficients C (..., 1 + k), without linearization."""
         relative = UNITS * coefficients[..., 1:] / np.abs(coefficients[..., :1])
         return np.concatenate([relative.real, relative.imag], axis=-1)
 
@@ -224,7 +251,7 @@ def multipole_model(magnet: Magnet, reference: MultipoleReference,
     Raises
     ------
     StudyError
-        If the reference is none for this study, or the nominal magnet has no main multipole.
+        If the reference does not fit the study, or the nominal magnet has no main multipole.
     """
     return multipole_models(magnet, (reference,), session)[0]
 
@@ -232,22 +259,23 @@ def multipole_model(magnet: Magnet, reference: MultipoleReference,
 def multipole_models(
     magnet: Magnet, references: Sequence[MultipoleReference], session: Session
 ) -> list[MultipoleModel]:
-    """`multipole_model` of several references, solved for together."""
+    """Return the `multipole_model` of several references, which share the solves."""
     main = magnet.array.multipole_order
     wanted, observations = [], []
-    for one in references:
-        orders = tuple(sorted(set(one.orders) - {main}))
+    for reference in references:
+        orders = tuple(sorted(set(reference.orders) - {main}))
         if not orders:
             raise StudyError(must_be("--orders", f"study {magnet.name}",
-                                     "those of unwanted multipoles", "the main one only"))
-        if magnet.dimension == 2 and one.z_m is not None:
+                                     "those of unwanted multipoles", "only the main order"))
+        if magnet.dimension == 2 and reference.z_m is not None:
             raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
-                                     f"{one.z_m:g}"))
-        wanted.append((orders, _radius(magnet, one), one.z_m))
-        observations.append(_observation(magnet, wanted[-1][1], max(*orders, main), one.z_m))
+                                     f"{reference.z_m:g}"))
+        wanted.append((orders, _radius(magnet, reference), reference.z_m))
+        observations.append(
+            _observation(magnet, wanted[-1][1], max(*orders, main), reference.z_m))
     bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(concatenate, observations), session)
-    found, first = [], 0
+    models, first = [], 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
         part = slice(first, first + len(observation))
         first = part.stop
@@ -258,33 +286,36 @@ def multipole_models(
         index = np.array([main, *orders]) - 1
         turn = _turn(magnet, matrix[main - 1], model)
         phases = np.exp(-1j * turn * (index + 1))
-        found.append(MultipoleModel(
+        models.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * _complexes(model.offset[part])[index], model.error[part][index],
             model.nominal, -turn))
-    return found
+    return models
 
 
 def circle_models(
     magnet: Magnet, observation: Observation, model: Response
 ) -> list[MultipoleModel]:
-    """Multipoles on the circles that a study reads, without another solve: all orders that the
-    readings tell, the main one too, in units of the main one on the circle of that radius that is
-    nearest to the middle; none if there are no full circles, or an instrument between.
+    """Return the multipoles on the circles that a study reads, without a further solve.
 
-    They are Fourier coefficients of B_r at the study's own angles: of m angles, order n has what
-    there is of order m - n too. `multipole_models` takes as many angles as are needed.
+    They include all orders that the readings resolve, the main order too, in units of the main
+    multipole on the circle of the same radius that is nearest to z = 0. The list is empty if the
+    study reads no full circles, or if its instrument changes the readings.
+
+    The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
+    also contains (aliases with) order m - n. `multipole_models` uses as many angles as are needed
+    to avoid this.
     """
-    main, found = magnet.array.multipole_order, []
+    main, models = magnet.array.multipole_order, []
     circles = _read_circles(magnet, observation)
     for radius in sorted({radius for radius, _, _ in circles}):
-        own = sorted((z, analysis) for one, z, analysis in circles if one == radius)
+        own = sorted((z, analysis) for other, z, analysis in circles if other == radius)
         _, middle = min(own, key=lambda pair: abs(pair[0]))
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        reference, fixed = (_complexes(_seen(middle, one))[main - 1:main]
-                            for one in (model.matrix, model.offset))
+        reference, fixed = (_complexes(_seen(middle, values))[main - 1:main]
+                            for values in (model.matrix, model.offset))
         try:
             turn = _turn(magnet, reference[0], model)
         except StudyError:
@@ -292,21 +323,30 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix, offset = (_complexes(_seen(analysis, one))[:len(orders)]
-                              for one in (model.matrix, model.offset))
-            found.append(MultipoleModel(
+            matrix, offset = (_complexes(_seen(analysis, values))[:len(orders)]
+                              for values in (model.matrix, model.offset))
+            models.append(MultipoleModel(
                 orders, main, radius, z if magnet.dimension == 3 else None, False,
                 phases[:, None] * np.vstack([reference, matrix]),
                 phases * np.concatenate([fixed, offset]),
                 _circle_error(analysis, model.error)[order - 1], model.nominal, -turn))
-    return found
+    return models
 
 
 def solved_circles(
     magnet: Magnet, points: Floats, flux_density: Floats, errors: Floats
 ) -> list[tuple[MultipoleModel, Multipoles]]:
-    """Multipoles of a solved field B (n, 3) in T on the study's circles, with the solver's errors
-    (readings,) in T of the study's readings.
+    """Return the multipoles of a solved field on the study's circles.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    points : ndarray, shape (n, 3), in m
+        The study's positions.
+    flux_density : ndarray, shape (n, 3), in T
+        B at these points.
+    errors : ndarray, shape (readings,), in T
+        Error bar of the solver for each of the study's readings.
     """
     observed = magnet.study.observation
     if observed.quantity == "flux_density":
@@ -315,40 +355,51 @@ def solved_circles(
     bare = magnet.with_(instrument=Instrument(), observation=observed)
     observation = observe(bare.study, points, np.ones_like(points, bool))
     readings = observation.apply(flux_density)
-    # one parameter, the strength of the whole magnet
+    # a model with a single parameter, the strength of the whole magnet
     whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
     exact = Gaussian(np.ones(1), np.zeros((1, 1)))
-    return [(one, one.of(exact)) for one in circle_models(bare, observation, whole)]
+    return [(model, model.of(exact)) for model in circle_models(bare, observation, whole)]
 
 
 def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:
-    """An analysis (k, readings) of values (readings, ...), of which it needs few."""
+    """Return an analysis (k, readings) of values (readings, ...), reading only the rows it uses."""
     used = np.unique(analysis.indices)
     return np.asarray(analysis[:, used] @ values[used])
 
 
 def _complexes(values: Floats) -> Complexes:
-    """C_n = B_n + i A_n of A_1 ... A_K, B_1 ... B_K."""
+    """Return C_n = B_n + i A_n from rows in the order A_1 ... A_K, B_1 ... B_K."""
     half = len(values) // 2
     return values[half:] + 1j * values[:half]
 
 
 def _turn(magnet: Magnet, row: Complexes, model: Response) -> float:
-    """Angle of the nominal main multipole, whose row of the matrix is (parameters,)."""
+    """Return the angle in rad of the nominal main multipole about z.
+
+    ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C.
+
+    Raises
+    ------
+    StudyError
+        If the main multipole of the nominal magnet vanishes.
+    """
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
     if not abs(own) > NOTHING_THERE * scale:
         raise StudyError(must_be(
             "`array`", f"study {magnet.name}",
             f"that of a magnet with a multipole of order {magnet.array.multipole_order}",
-            "one without", "Check multipole_order and its exceptions."))
+            "a magnet without it", "Check multipole_order and its exceptions."))
     return float(np.angle(own)) / magnet.array.multipole_order
 
 
 def _read_circles(
     magnet: Magnet, observation: Observation
 ) -> list[tuple[float, float, sparse.csr_array]]:
-    """Radius and z in m of each circle, and the matrix (2 K, readings) of A_1 ... B_K there."""
+    """Return radius and z in m of each circle, and the matrix from readings to its coefficients.
+
+    The matrix is (2 K, readings), with rows A_1 ... A_K, B_1 ... B_K.
+    """
     positions, labels = observation.positions, np.array(observation.labels)
     settings, size = magnet.study.observation.positions, len(labels)
     plain = (observation.operator.shape == observation.analysis.shape
@@ -368,7 +419,7 @@ def _read_circles(
     try:
         analysis, _, where = fourier_analysis(positions[x], FourierCoefficients(
             quantity="fourier_coefficients", harmonics=harmonics, positions=settings))
-    except MeasurementError:  # these are no full circles
+    except MeasurementError:  # the circles are not full
         return []
     matrix = sparse.csr_array(analysis[:, 0::3] @ pick[x] + analysis[:, 1::3] @ pick[y])
     return [(float(where[first, 0]), float(where[first, 2]), matrix[first:first + 2 * harmonics])
@@ -376,8 +427,11 @@ def _read_circles(
 
 
 def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
-    """Error bars (K,) of |C_n| on a circle: those of the coefficients, or by Parseval's theorem
-    the largest that errors of its points allow.
+    """Return the error bars (K,) of |C_n| on a circle, in T.
+
+    If the readings are Fourier coefficients, these are the error bars of the readings. If they are
+    flux densities, they are the largest errors of coefficients that the errors at the points of the
+    circle allow by Parseval's theorem.
     """
     if np.all(np.diff(analysis.indptr) == 1):
         return np.asarray(analysis @ errors)[:analysis.shape[0] // 2]
@@ -386,17 +440,18 @@ def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
 
 
 def beyond(magnet: Magnet, reach: float) -> Complexes:
-    """Integral of B_y + i B_x on the axis, beyond |z| = reach in m, per A/m of every block as a
-    point dipole in vacuum: (parameters,) in T m.
+    """Return the integral of B_y + i B_x along the axis beyond |z| = ``reach`` in m.
 
-    ``B = mu_0 / 4 pi (3 (m R) R / R^5 - m / R^3)``, integrated along z by hand.
+    The result is (parameters,) in T m per A/m of each block, with every block a point dipole in
+    vacuum. It is the closed form of the integral of
+    ``B = mu_0 / 4 pi (3 (m R) R / R^5 - m / R^3)`` along z.
     """
-    found = []
+    integrals = []
     for block in magnet.blocks:
         middle, total = block.middle, np.zeros((2, 3))
         aside = -middle[:2]
         square = float(aside @ aside)
-        for side in (1.0, -1.0):  # the lower end is the upper one of the mirrored magnet
+        for side in (1.0, -1.0):  # the lower end is the upper end of the mirrored magnet
             z = reach - side * middle[2]
             distance = np.hypot(z, np.sqrt(square))
             third = (1 - z / distance) / square
@@ -404,16 +459,17 @@ def beyond(magnet: Magnet, reach: float) -> Complexes:
             total[:, :2] += 3 * fifth * np.outer(aside, aside) - third * np.eye(2)
             total[:, 2] += side * aside / distance**3
         total *= MU_0 * block.volume / (4 * np.pi)
-        found.append(total[1] + 1j * total[0])
-    return np.concatenate(found)
+        integrals.append(total[1] + 1j * total[0])
+    return np.concatenate(integrals)
 
 
 def _reach(magnet: Magnet) -> float:
-    """Where sums along z end, in m from the middle."""
+    """Return the distance in m from the middle at which sums along z end."""
     return magnet.half_length + BEYOND_ENDS * magnet.radius
 
 
 def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
+    """Return the reference radius in m, by default as `MultipoleReference` describes."""
     positions = magnet.study.observation.positions
     bore = magnet.array.inner_radius_m
     radius = reference.radius_m
@@ -428,7 +484,10 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
 
 
 def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -> Observation:
-    """Fourier coefficients of B_r, of one circle or integrated along z."""
+    """Return an observation of the Fourier coefficients of B_r.
+
+    They are those of the circle at z, or in 3D with z None those of the field integrated along z.
+    """
     bore = magnet.array.inner_radius_m
     angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
@@ -452,26 +511,28 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
 
 
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:
-    """Rows of text, ``b_n ± sd`` and ``a_n ± sd`` in units, of magnets by name."""
-    names, known = list(columns), list(columns.values())
-    first = known[0]
+    """Return a row of text per order, with ``b_n ± sd`` and ``a_n ± sd`` in units.
+
+    The columns are multipoles of the same orders, each by a name for the heading.
+    """
+    first = next(iter(columns.values()))
     rows = []
     for i, order in enumerate(first.orders):
         row = {"n": str(order)}
         for letter, number in (("b", i), ("a", len(first.orders) + i)):
-            row |= {f"{letter}_n {name}": f"{one.mean[number]:+.2f} ± {one.sd[number]:.2f}"
-                    for name, one in zip(names, known, strict=True)}
+            row |= {f"{letter}_n {name}": f"{column.mean[number]:+.2f} ± {column.sd[number]:.2f}"
+                    for name, column in columns.items()}
         rows.append(row)
     return rows
 
 
 def met(sizes: Floats, limit: float) -> float:
-    """Share of samples (count, k) of |c_n| none of which is above a limit in units."""
+    """Return the share of samples (count, k) of |c_n| with all |c_n| within a limit in units."""
     return float(np.mean((sizes <= limit).all(axis=1)))
 
 
 def plain(known: Multipoles, unit: str) -> dict[str, object]:
-    """For scripts."""
+    """Return multipoles as plain data for JSON; ``unit`` is the unit of the main multipole."""
     name = unit.replace(" ", "_")
     return {f"main_{name}": known.main, f"main_sd_{name}": known.main_sd, "roll_rad": known.roll,
             "roll_sd_rad": known.roll_sd, "rms_units": float(np.sqrt(

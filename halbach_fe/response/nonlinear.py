@@ -1,9 +1,10 @@
-"""The non-linear model of a magnet: magnetizations in A/m to readings in T, tens of thousands of
-times.
+"""The non-linear model of a magnet with saturating iron, from magnetizations to readings.
 
-GetDP assembles the problem with the iron as vacuum, and solves it for every block; the rest is
-condensed to the iron's unknowns (`halbach_fe.solver.condensed_newton`). What comes out is compared
-with GetDP's own Newton method for a sample of magnetizations, always.
+Markov chains evaluate this model tens of thousands of times. GetDP therefore assembles the problem
+only once, with vacuum in place of the iron, and solves it for every block. The non-linear problem
+is then condensed to the unknowns in the iron (`halbach_fe.solver.condensed_newton`). The readings
+of the condensed model are always compared with GetDP's own Newton method, for a sample of
+magnetizations.
 """
 
 from __future__ import annotations
@@ -30,30 +31,36 @@ from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.study.materials import MU_0
 
 AGREEMENT_T = 1e-8
-"""How well readings must agree with GetDP's Newton method. Its residual of 1e-10 is some 1e-10 T,
-the condensed solve is asked for 1e-9 T; a wrong sign or Gauss point shows at 1e-4 T."""
+"""Largest accepted difference in T between readings of the model and of GetDP's Newton method.
+
+GetDP's relative residual of 1e-10 is about 1e-10 T, and the condensed solve converges to 1e-9 T. A
+wrong sign or Gauss point makes a difference of 1e-4 T."""
 
 VERIFIED_SAMPLES = 3
+"""Number of magnetizations for which the model is compared with GetDP's Newton method."""
+
 IRON_MATRIX_TOLERANCE = 1e-9
-"""GetDP's Gauss points have 12 digits."""
+"""Relative tolerance of the matrix in the iron. GetDP's Gauss points have 12 digits."""
 
 
 @dataclass(frozen=True)
 class NonlinearModel:
-    """Magnetizations p in A/m to readings in T.
+    """The map from magnetizations p in A/m to readings in T; call an instance to evaluate it.
 
     Attributes
     ----------
     condensed : Condensed
+        The problem condensed to the unknowns in the iron.
     offset : ndarray, shape (readings,), in T
-        Fields that are not the magnet's.
+        Readings of external fields.
     parameters : tuple of str
-        As of `halbach_fe.response.matrix.Response`.
+        Names of the parameters, as in `halbach_fe.response.matrix.Response`.
     nominal : ndarray, shape (parameters,), in A/m
+        The study's nominal magnetization.
     error : ndarray, shape (readings,), in T
         Error bar of the finite elements, for the nominal array.
     agreement_T : float
-        Largest difference to GetDP's Newton method at any reading of the verified samples.
+        Largest difference from GetDP's Newton method in any reading of the verified samples.
     """
 
     condensed: Condensed
@@ -64,16 +71,17 @@ class NonlinearModel:
     agreement_T: float
 
     def __call__(self, magnetizations: Floats, tolerance_T: float = 1e-9) -> Floats:
-        """Readings (..., readings) in T of magnetizations (..., parameters) in A/m.
+        """Return the readings (..., readings) in T of magnetizations (..., parameters) in A/m.
 
-        ``tolerance_T`` is how far from convergence they may be; a tenth of the noise is plenty.
+        Newton's method stops when the readings have converged to ``tolerance_T``; a tenth of the
+        noise is accurate enough for an inference.
         """
         flat = magnetizations.reshape(-1, len(self.parameters))
-        found = [self.condensed.solve(row, tolerance_T)[0] for row in flat]
-        return self.offset + np.array(found).reshape(*magnetizations.shape[:-1], -1)
+        readings = [self.condensed.solve(row, tolerance_T)[0] for row in flat]
+        return self.offset + np.array(readings).reshape(*magnetizations.shape[:-1], -1)
 
     def jacobian(self, magnetization: Floats) -> Floats:
-        """dq/dp (readings, parameters) in T m/A at a magnetization (parameters,) in A/m."""
+        """Return dq/dp (readings, parameters) in T m/A at a magnetization (parameters,) in A/m."""
         return self.condensed.jacobian(magnetization)
 
 
@@ -83,13 +91,23 @@ def nonlinear_model(
 ) -> NonlinearModel:
     """Build the model of a study whose iron ring has an H(B) curve, and verify it.
 
-    ``generator`` draws the magnetizations, from the study's prior or another, at which it is
-    compared with GetDP's own Newton method.
+    Parameters
+    ----------
+    magnet : Magnet
+    observation : Observation
+    session : Session
+        Its folder receives the runs of GetDP.
+    generator : numpy.random.Generator
+        Draws the magnetizations at which the model is compared with GetDP's own Newton method.
+    prior : Gaussian, optional
+        Distribution of these magnetizations in A/m; by default the study's prior.
 
     Raises
     ------
+    StudyError
+        If the iron has no H(B) curve, or a point is not in air.
     GetDPError
-        If it does not agree with GetDP.
+        If the model does not agree with GetDP.
     """
     if magnet.curve is None:
         raise StudyError(f"Input `iron_ring.curve` of study {magnet.name} must be given for a "
@@ -101,9 +119,9 @@ def nonlinear_model(
     error = _error(magnet, observation, session)
     model = NonlinearModel(condensed, linear.offset, magnet.parameter_names, linear.nominal, error,
                            np.nan)
-    known = magnet.study.prior
-    prior = prior or nominal_prior(linear.nominal, magnet.dimension, known.magnitude_sd,
-                                   known.direction_sd_deg, known.common_mode_sd)
+    settings = magnet.study.prior
+    prior = prior or nominal_prior(linear.nominal, magnet.dimension, settings.magnitude_sd,
+                                   settings.direction_sd_deg, settings.common_mode_sd)
     samples = prior.sample(VERIFIED_SAMPLES, generator)
     return replace(model,
                    agreement_T=compare_with_newton(model, magnet, observation, session, samples))
@@ -112,9 +130,12 @@ def nonlinear_model(
 def condense_to_iron(
     magnet: Magnet, observation: Observation, session: Session, linear: Response
 ) -> Condensed:
-    """Condense a study to its iron; ``linear`` are the readings with vacuum in its place."""
+    """Condense the non-linear problem of a magnet to the unknowns in its iron.
+
+    ``linear`` is the response of the same magnet with vacuum in place of the iron.
+    """
     curve = magnet.curve
-    assert curve is not None  # the caller's
+    assert curve is not None  # the caller has checked it
     route = choose_route(magnet, observation.points)
     formulation = formulation_of(magnet, route)
     assembly = assemble(_with_vacuum_for_iron(magnet, route), session, formulation)
@@ -143,7 +164,21 @@ def newton_readings(
     magnet: Magnet, observation: Observation, session: Session, magnetizations: Floats,
     cold: bool = False,
 ) -> Floats:
-    """Readings (k, readings) in T of magnetizations (k, parameters) in A/m by GetDP's Newton."""
+    """Return the readings of magnetizations by GetDP's own Newton method.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    observation : Observation
+    session : Session
+    magnetizations : ndarray, shape (k, parameters), in A/m
+    cold : bool
+        Start Newton's method from zero for every sample, instead of from the sample before.
+
+    Returns
+    -------
+    ndarray, shape (k, readings), in T
+    """
     size = magnet.dimension
     samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
     samples[..., :size] = magnetizations.reshape(len(magnetizations), -1, size)
@@ -163,12 +198,12 @@ def compare_with_newton(
     model: NonlinearModel, magnet: Magnet, observation: Observation, session: Session,
     magnetizations: Floats, cold: bool = False,
 ) -> float:
-    """Largest difference in T between the model and GetDP's Newton method at any reading.
+    """Return the largest difference in T of any reading from that of GetDP's Newton method.
 
     Raises
     ------
     GetDPError
-        If it is larger than AGREEMENT_T.
+        If the difference is larger than AGREEMENT_T.
     """
     folder = replace(session, folder=session.folder / "verified", progress=None)
     theirs = newton_readings(magnet, observation, folder, magnetizations, cold)
@@ -182,14 +217,18 @@ def compare_with_newton(
 
 
 def _with_vacuum_for_iron(magnet: Magnet, route: str) -> Magnet:
-    """The magnet with nothing in the iron's place, on the same mesh, every block by itself."""
-    assert magnet.iron_ring is not None  # a curve is the iron's
+    """Return the magnet with vacuum in place of the iron, on the same mesh.
+
+    Symmetry is switched off, so that every block is solved by itself.
+    """
+    assert magnet.iron_ring is not None  # only iron has a curve
     ring = magnet.iron_ring.with_(curve=None, relative_permeability=1.0)
     solver = {"symmetry": False} | ({} if magnet.dimension == 2 else {"route": route})
     return magnet.with_(iron_ring=ring, solver=magnet.study.solver.with_(**solver))
 
 
 def _error(magnet: Magnet, observation: Observation, session: Session) -> Floats:
+    """Return the error bar of the finite elements, (readings,) in T, for the nominal magnet."""
     parts = finite_element_part(magnet, observation.points, replace(
         session, folder=session.folder / "nominal"), columns=False)
     return reading_errors(magnet, observation, parts, error_bar_session(session))
@@ -199,14 +238,20 @@ def _check_iron(
     theirs: sparse.csr_array, gradient: sparse.csr_array, weights: Floats, vacuum: float,
     surface: Ints,
 ) -> None:
-    """Inside the iron GetDP's matrix must be the one of these Gauss points."""
+    """Check that GetDP's matrix inside the iron equals that assembled from our Gauss points.
+
+    Raises
+    ------
+    GetDPError
+        If the two matrices differ.
+    """
     size = gradient.shape[0] // len(weights)
     ours = vacuum * (gradient.T @ (sparse.diags_array(np.tile(weights, size)) @ gradient))
     inside = np.setdiff1d(np.arange(ours.shape[0]), surface)
     if not len(inside):
-        return  # one layer of elements: the verification has to do
+        return  # a single layer of elements has no inner unknowns; `compare_with_newton` must do
     difference = abs(ours - theirs).tocsr()[inside].max() / abs(theirs).max()
     if not difference <= IRON_MATRIX_TOLERANCE:
         raise GetDPError(
-            f"GetDP's matrix in the iron is {difference:.1e} from the one built here: this GetDP "
-            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+            f"GetDP's matrix in the iron differs by {difference:.1e} from that of halbach-fe: this "
+            "GetDP numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")

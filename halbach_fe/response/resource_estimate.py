@@ -1,11 +1,13 @@
-"""What a run will take in memory, time and disk, before anything is solved.
+"""An estimate of the memory, time and disk that a run needs, before it is started.
 
-The problems are those that `routes`, `discretization` and `verification` will pose, counted in
-place of solved. Meshes are counted too: the half-plane's is a grid, and the stacked mesh follows
-from the number of its plane triangles (`halbach_fe.geo.plane_size`), of which there are few.
+The functions that would solve the field are called with a session that counts the runs of GetDP
+instead of starting them. Meshes are counted as well, not built: that of a half-plane is a grid, and
+the number of elements of an extruded mesh follows from the number of its plane triangles
+(`halbach_fe.geo.plane_size`), which is quick to find.
 
-What one GetDP process takes is a law of its unknowns, see `CostLaw`. Measured with GetDP 3.2, MUMPS
-and OpenBLAS, one thread; seconds are in units of a factorization that is timed anew.
+The memory and time of a GetDP process are functions of its number of unknowns, see `CostLaw`. Their
+constants were measured with GetDP 3.2, MUMPS and OpenBLAS on one thread of a reference machine. The
+speed of the present machine relative to it follows from the time of a factorization.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from scipy.sparse.linalg import splu
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
@@ -32,28 +35,38 @@ from halbach_fe.response.discretization_error import error_bar_session, reading_
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.response.mesh_convergence import variants_to_compare
 from halbach_fe.solver.azimuthal_modes import mode_decay
-from halbach_fe.solver.field import MESHES, check_points, finite_element_part, formulation_of
+from halbach_fe.solver.field import (
+    MESHES,
+    check_points,
+    choose_route,
+    finite_element_part,
+    formulation_of,
+)
+from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
 from halbach_fe.study.types import COMPONENTS
 
 GIB = 2.0**30
 EXACT_FIELD_ONLY = "exact_field_only"
+"""Route of an estimate without finite elements."""
+
 UPDATED_MAGNET = "the updated magnet"
+"""Purpose of the solve that checks whether the iron is linear enough."""
 
 TIME_FACTOR = 3.0
-"""Times are right within it: on nine studies the processor time of all GetDP runs was foretold
-between 0.95 and 2.3 times too long, and machines differ in other ways than by their speed."""
+"""Factor within which the estimated times hold. On nine studies the estimated processor time of all
+GetDP runs was 0.95 to 2.3 times the measured one, and machines differ in more than their speed."""
 
 
 @dataclass(frozen=True)
 class CostLaw:
-    """What a GetDP process takes, by its number n of unknowns.
+    """Memory and time of a GetDP process as functions of its number n of unknowns.
 
-    Memory is ``GETDP_BYTES + n (bytes_each + fill n^(1/3))``: the factors of a matrix grow as
-    n^(4/3) in 3D (A. George, SIAM J. Numer. Anal. 10 (1973) 345), in a plane as n log n, whose
-    logarithm does not show. Seconds on the reference machine are ``GETDP_SECONDS``, and
-    ``matrix_s n^power`` for every matrix, and ``solve_s n`` for every solve.
+    The memory in bytes is ``GETDP_BYTES + n (bytes_each + fill n^(1/3))``. The factors of a matrix
+    grow as n^(4/3) in 3D (A. George, SIAM J. Numer. Anal. 10 (1973) 345) and as n log n in a plane,
+    where the logarithm is too weak to matter. The time in seconds on the reference machine is
+    ``GETDP_SECONDS``, plus ``matrix_s n^power`` for every matrix and ``solve_s n`` for every solve.
     """
 
     bytes_each: float
@@ -64,88 +77,104 @@ class CostLaw:
 
 
 GETDP_BYTES, GETDP_SECONDS = 50e6, 0.1
+"""Memory and time of a GetDP process that do not depend on its number of unknowns."""
 
 PLANE = CostLaw(3600, 0, 1.5e-5, 2.3e-6)
-"""Eleven runs on cross-sections and half-planes, 3 400 to 152 000 unknowns, 1 to 9 solves: memory
-within 5 %, of which 2400 bytes each are what ``-petsc_prealloc 200`` takes; time within 20 %."""
+"""Law for plane meshes. It fits eleven runs on cross-sections and half-planes with 3 400 to 152 000
+unknowns and 1 to 9 solves: the memory within 5 %, the time within 20 %. Of the bytes per unknown,
+``-petsc_prealloc 200`` takes 2400."""
 
 FACTORIZED = CostLaw(2480, 150, 1.1e-6, 1.3e-6, 1.4)
-"""Scalar potential, 36 000, 61 000, 96 000 and 99 000 unknowns: memory within 8 % but for a flat
-magnet, whose factors are smaller: 26 % too much, and twice the time."""
+"""Law for the scalar potential with a factorized matrix. It fits runs with 36 000, 61 000, 96 000
+and 99 000 unknowns: the memory within 8 %, except for a flat magnet, whose factors are smaller. For
+that magnet the law gives 26 % too much memory and twice the time."""
 
 ITERATED = CostLaw(5150, 0, 2e-5, 5.8e-5)
-"""By conjugate gradients, 226 000 and 274 000 unknowns: memory within 1 %, time without iron within
-5 %. Thin iron takes five times as many iterations."""
+"""Law for the scalar potential with conjugate gradients. It fits runs with 226 000 and 274 000
+unknowns: the memory within 1 %, and without iron the time within 5 %."""
 
 IRON_ITERATIONS = 5.0
+"""Factor by which thin iron increases the number of iterations."""
 
 EDGES = {1: CostLaw(2700, 90, 7e-7, 1.5e-6, 1.4), 2: CostLaw(2430, 88, 5.5e-7, 1.5e-6, 1.4)}
-"""Edge elements by order. First: 27 000 to 206 000 unknowns on three magnets, memory within 7 %,
-time within 40 %. Second: 42 000, 132 000 and 264 000, memory within 4 %, time within 20 %."""
+"""Laws for edge elements, by their order. The law of the first order fits runs with 27 000 to
+206 000 unknowns on three magnets: the memory within 7 %, the time within 40 %. That of the second
+order fits runs with 42 000, 132 000 and 264 000 unknowns within 4 % and 20 %."""
 
 STEPPED = CostLaw(10_700, 0, 8e-5, 0)
-"""Multigrid for Newton's steps, 61 000 and 203 000 unknowns: with `NEWTON_BYTES`, within 1 %."""
+"""Law for multigrid in Newton's steps. Together with `NEWTON_BYTES` it fits the memory of runs with
+61 000 and 203 000 unknowns within 1 %."""
 
 NEWTON_BYTES, NEWTON_MATRICES, NEWTON_STEPS = 4400, 2, 6
-"""By unknown, for the matrix of the Jacobian, and by step, both measured at 11 000 and 86 000
-unknowns; 3 to 9 steps were seen."""
+"""For Newton's method: additional bytes per unknown for the Jacobian, matrices per step, and the
+assumed number of steps (3 to 9 were seen). The first two were measured with 11 000 and 86 000
+unknowns."""
 
 PYTHON_BYTES, ELEMENT_BYTES = 0.27 * GIB, 2000
-"""This program, its libraries, and what it reads of a mesh and its unknowns: measured 1000 to 2100
-by element, of 10 000 to 208 000."""
+"""Memory in bytes of this program with its libraries, and per element for the mesh and the unknowns
+that it reads. The latter was 1000 to 2100 for meshes of 10 000 to 208 000 elements."""
 
 PART_COPIES, INFORMATION_COPIES = 4, 3
-"""Of the rows of H that are taken at once, and of the square root of the information, while its
-singular values are found; measured with 48 to 30 720 parameters and 1 008 to 28 080 readings."""
+"""Numbers of copies in memory of the rows of H that are processed together, and of the square root
+of the information while its singular values are computed. They were measured with 48 to 30 720
+parameters and 1 008 to 28 080 readings."""
 
 READING_BYTES, READING_SECONDS = 1200, 6e-5
-"""For labels, tables and pictures of every reading; a million were measured."""
+"""Memory in bytes and time in s per reading for labels, tables and figures, measured with a million
+readings."""
 
 CHUNK_BYTES, CHUNK_PLACES, PLACE_BYTES, PLACES_AT_ONCE = 230e6, 40_000, 180, 4_000_000
-"""The exact field from 96 000 and 576 000 places (see `_places`): temporary arrays, which many
-places fill, and what is kept of each."""
+"""Memory for the exact field of the blocks at the distinct places that `_places` counts: bytes of
+the temporary arrays, number of places that fills them, bytes per place of the stored fields, and
+largest number of places whose fields are stored. Measured with 96 000 and 576 000 places."""
 
 OWN_SECONDS, ELEMENT_SECONDS, PLACE_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 2.5e-5, 1e-9
-"""To start and to report; by element of every process; by place; by entry of H and parameter, or
-reading if there are fewer."""
+"""Time in s of this program: to start and to write the report; per element of every GetDP process;
+per place of the exact field; and per entry of H, times the number of parameters or readings,
+whichever is smaller."""
 
 COUNTED_PLACES = 500_000
-"""At most, half a second."""
+"""Largest number of places that are counted, which takes half a second."""
 
 MESH_BYTES = {"cross_section": 104, "meridian": 70, "extruded": 104}
-"""Of the file, by element, by kind of mesh."""
+"""Bytes per element of a mesh file, by the kind of mesh."""
 
 UNKNOWN_BYTES = {"edge_elements": 75}
-"""Of GetDP's list of unknowns, by unknown, by route; of the others `OTHER_UNKNOWN_BYTES`."""
+"""Bytes per unknown of GetDP's list of unknowns, by route."""
 
 OTHER_UNKNOWN_BYTES = 30
+"""Bytes per unknown of GetDP's list of unknowns for all other routes."""
 
 GRID, GRID_SECONDS = 150, 0.095
-"""The grid whose factorization tells a machine's speed, and the processor time that it took where
-the laws were measured."""
+"""Side of the grid whose factorization measures the speed of a machine, and the processor time in s
+that the factorization took on the reference machine."""
 
 COARSER = {"cross_section": "enlarge mesh.block_size_m",
            "meridian": "enlarge mesh.meridian_size_m",
            "extruded": "enlarge mesh.block_size_m, mesh.bore_size_m or mesh.growth, or take fewer "
                        "mesh.layers_per_ring"}
-"""How to have fewer elements, by kind of mesh."""
+"""Advice on how to reduce the number of elements, by the kind of mesh."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Runs of GetDP that are alike.
+    """Runs of GetDP that are equal in size.
 
     Attributes
     ----------
     what : str
-        Which of the meshes; all runs of a mesh may go side by side.
+        Purpose of the mesh; all runs on the same mesh may go side by side.
     route : str
+        Formulation, see `halbach_fe.solver.field.choose_route`.
     elements, unknowns : int
+        Numbers of elements and unknowns of each run.
     processes : int
+        Number of runs, each of which is a GetDP process.
     matrices, solves : int
-        To be factorized (or prepared for iterations), and to be solved, by each process.
+        Numbers of matrices that each process factorizes (or prepares for iterations), and of linear
+        systems that it solves.
     memory_GiB, seconds, disk_GiB : float
-        Of each process: at its peak, alone on a core, of its run folder.
+        Peak memory of each process, its time alone on a core, and the size of its run folder.
     """
 
     what: str
@@ -162,23 +191,29 @@ class Problem:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run will take.
+    """The memory, time and disk that a run of the command line is expected to need.
 
     Attributes
     ----------
+    study : str
+        Name of the study.
     route : str
-        The study's own, or ``exact_field_only`` if nothing is left to finite elements.
+        Formulation of the study's own solve, or ``exact_field_only`` if the exact field needs no
+        finite elements.
     blocks, readings, parameters : int
-        Parameters are 0 where there is no inference.
+        Sizes of the problem; the number of parameters is 0 if there is no inference.
+    jobs : int
+        Number of GetDP processes that run at a time.
     problems : tuple of Problem
-        In the order in which they are solved.
+        Runs of GetDP, in the order in which they are solved.
     own_memory_GiB : float
-        Of this program at its peak.
+        Peak memory of this program.
     memory_GiB : float
-        Of this program and as many GetDP processes as run at a time, all at their peaks.
+        Peak memory of this program and of the GetDP processes that run at a time.
     disk_GiB, seconds : float
+        Disk space and time of the whole run.
     available_GiB : float or None
-        Memory that the machine has left; None if it does not say.
+        Memory that the machine has left; None if it is not known.
     """
 
     study: str
@@ -196,24 +231,24 @@ class Estimate:
 
     @property
     def processes(self) -> int:
-        """GetDP processes of the whole run."""
-        return sum(one.processes for one in self.problems)
+        """Number of GetDP processes of the whole run."""
+        return sum(problem.processes for problem in self.problems)
 
     @property
     def solves(self) -> int:
-        """Linear solves of the whole run."""
-        return sum(one.processes * one.solves for one in self.problems)
+        """Number of linear solves of the whole run."""
+        return sum(problem.processes * problem.solves for problem in self.problems)
 
     @property
     def warning(self) -> str | None:
-        """What to change if the memory is not enough; None if it is."""
+        """A sentence about what to change if the memory does not suffice, or None if it does."""
         if self.available_GiB is None or self.memory_GiB <= self.available_GiB:
             return None
         hints = []
-        alone = self.own_memory_GiB + max((one.memory_GiB for one in self.problems), default=0.0)
+        alone = self.own_memory_GiB + max((each.memory_GiB for each in self.problems), default=0.0)
         if alone <= self.available_GiB < self.memory_GiB:
             hints.append(f"use --jobs 1 ({alone:.2g} GiB)")
-        largest = max(self.problems, key=lambda one: one.memory_GiB, default=None)
+        largest = max(self.problems, key=lambda problem: problem.memory_GiB, default=None)
         if largest is None or largest.memory_GiB < self.own_memory_GiB:
             hints.append("take fewer readings")
         else:
@@ -224,14 +259,15 @@ class Estimate:
                 f"{self.available_GiB:.2g} GiB left: {', '.join(hints)}.")
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the estimate as plain data for JSON."""
         return asdict(self) | {"processes": self.processes, "solves": self.solves,
                                "warning": self.warning}
 
 
 def estimate_solve(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
-    """Estimate what the field of the nominal array takes, with error bars."""
+    """Estimate the cost of solving the field of the nominal array, with error bars."""
     check_points(magnet, observation.points)
+    check_domain(magnet, observation.points)
     session = Session.counting(jobs)
     few = decisive_points(magnet, observation.points)
     parts = finite_element_part(magnet, few.points, session, columns=False)
@@ -240,16 +276,17 @@ def estimate_solve(magnet: Magnet, observation: Observation, jobs: int) -> Estim
 
 
 def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estimate:
-    """Estimate what the response matrix takes, with error bars, and the update."""
+    """Estimate the cost of the response matrix, with error bars, and of the update."""
     check_points(magnet, observation.points)
-    session = Session.counting(jobs)
-    few = decisive_points(magnet, observation.points)
     try:
-        parts = finite_element_part(magnet, few.points, session)
+        check_domain(magnet, observation.points)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
+    session = Session.counting(jobs)
+    few = decisive_points(magnet, observation.points)
+    parts = finite_element_part(magnet, few.points, session)
     reading_errors(magnet, few, parts, error_bar_session(session))
-    if magnet.is_nonlinear:  # is the iron linear enough?
+    if magnet.is_nonlinear:  # `infer` checks whether the iron is linear enough
         finite_element_part(magnet, few.points, replace(session, purpose=UPDATED_MAGNET),
                             columns=False)
     return _estimate(magnet, observation.points, len(observation), session, jobs,
@@ -257,9 +294,10 @@ def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estim
 
 
 def estimate_verify(magnet: Magnet, jobs: int) -> Estimate:
-    """Estimate what refinement, a farther boundary and the dual route take."""
+    """Estimate the cost of `verify`: refinement, a farther boundary and the dual formulation."""
     points = points_from(magnet.study.observation.positions)
     check_points(magnet, points)
+    check_domain(magnet, points)
     session = Session.counting(jobs)
     few = decisive_points(magnet, points)
     for purpose, variant in variants_to_compare(magnet, points).items():
@@ -267,9 +305,20 @@ def estimate_verify(magnet: Magnet, jobs: int) -> Estimate:
     return _estimate(magnet, points, 3 * len(points), session, jobs)
 
 
+def check_domain(magnet: Magnet, points: Floats) -> None:
+    """Refuse points (n, 3) outside the mesh that the solver will make, as it does itself."""
+    if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
+        return
+    kind = MESHES[choose_route(magnet, points)]
+    half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
+    check_inside(magnet.name, boundary_radius(magnet, kind), half_length, points)
+
+
 def decisive_points(magnet: Magnet, points: Floats) -> Observation:
-    """Return an observation of the few points that decide which runs there are: those that need the
-    most azimuthal modes and that lie farthest out.
+    """Return an observation of the few points that determine the runs of GetDP.
+
+    These are the point that needs the most azimuthal modes, and the points farthest from the axis
+    and from the plane z = 0.
     """
     decisive = np.unique([
         np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,
@@ -281,7 +330,7 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
 
 
 def problems_of(magnet: Magnet, session: Session) -> list[Problem]:
-    """Return the runs that a session has counted, those that are alike together."""
+    """Return the runs that a session has counted, with equal runs put together."""
     assert session.counter is not None
     return [_problem(magnet, purpose, size, count)
             for purpose, sizes in session.counter.batches
@@ -289,7 +338,7 @@ def problems_of(magnet: Magnet, session: Session) -> list[Problem]:
 
 
 def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Problem:
-    """What each of some runs takes, by the `CostLaw` of its route."""
+    """Return the cost of some equal runs, by the `CostLaw` of their route."""
     formulation = formulation_of(magnet, size.route)
     law = {"cross_section": PLANE, "azimuthal_modes": PLANE, "edge_elements": EDGES[
         magnet.study.solver.edge_order]}.get(size.route, FACTORIZED)
@@ -316,66 +365,71 @@ def _estimate(
     magnet: Magnet, points: Floats, readings: int, session: Session, jobs: int,
     parameters: int = 0,
 ) -> Estimate:
-    """Add what this program itself takes: for elements, for fields of sources at points, for H."""
+    """Add the cost of this program itself: for elements, for fields of blocks at points, for H."""
     blocks, speed, problems = magnet.blocks, machine_speed(), problems_of(magnet, session)
-    elements = max((one.elements for one in problems), default=0)
+    elements = max((problem.elements for problem in problems), default=0)
     matrix = readings * parameters
     places = 0.0 if magnet.study.solver.method == "direct" else _places(magnet, points)
     fields = parameters * len(points) * 3 if problems else 0
-    known = parameters * min(readings, parameters)
-    # the fields of blocks are gone when the posterior is found
-    making = (8 * fields + CHUNK_BYTES * min(1.0, places / CHUNK_PLACES)
-              + PLACE_BYTES * min(places, PLACES_AT_ONCE))
-    learning = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
-                    + INFORMATION_COPIES * known)
-    own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(making, learning)
+    information = parameters * min(readings, parameters)
+    # the fields of the blocks are freed before the posterior is computed
+    building = (8 * fields + CHUNK_BYTES * min(1.0, places / CHUNK_PLACES)
+                + PLACE_BYTES * min(places, PLACES_AT_ONCE))
+    updating = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
+                    + INFORMATION_COPIES * information)
+    own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(building, updating)
            + (READING_BYTES * readings if parameters else 0)
            + (8 * matrix if 8 * matrix <= LOADED_BYTES else 8 * NUMBERS_AT_ONCE)) / GIB
     side_by_side = 0.0
-    seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(one.elements * one.processes for one in problems)
+    seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(
+        problem.elements * problem.processes for problem in problems)
     seconds += PLACE_SECONDS * places + MATRIX_SECONDS * matrix * min(readings, parameters)
     seconds += READING_SECONDS * readings if parameters else 0
-    for what in dict.fromkeys(one.what for one in problems):
-        runs = [one for problem in problems if problem.what == what
-                for one in [problem] * problem.processes]
-        largest = sorted((one.memory_GiB for one in runs), reverse=True)[:jobs]
+    for purpose in dict.fromkeys(problem.what for problem in problems):
+        runs = [run for problem in problems if problem.what == purpose
+                for run in [problem] * problem.processes]
+        largest = sorted((run.memory_GiB for run in runs), reverse=True)[:jobs]
         side_by_side = max(side_by_side, sum(largest))
         at_once = min(jobs, os.cpu_count() or 1)
-        seconds += max(max(one.seconds for one in runs),
-                       sum(one.seconds for one in runs) / at_once)
+        seconds += max(max(run.seconds for run in runs),
+                       sum(run.seconds for run in runs) / at_once)
     return Estimate(
         study=magnet.name, blocks=len(blocks), readings=readings, parameters=parameters, jobs=jobs,
         route=problems[0].route if problems else EXACT_FIELD_ONLY,
-        problems=tuple(replace(one, seconds=one.seconds / speed) for one in problems),
+        problems=tuple(replace(problem, seconds=problem.seconds / speed) for problem in problems),
         own_memory_GiB=own, memory_GiB=own + side_by_side,
-        disk_GiB=sum(one.processes * one.disk_GiB for one in problems)
-        + 8 * (matrix + known) / GIB,
+        disk_GiB=sum(problem.processes * problem.disk_GiB for problem in problems)
+        + 8 * (matrix + information) / GIB,
         seconds=seconds / speed, available_GiB=available_memory())
 
 
 def _places(magnet: Magnet, points: Floats) -> float:
-    """From how many places blocks see points: those on circles are seen by many from the same, and
-    share integrals (`exact_field.unit_fields`). Counted for the blocks of one ring.
+    """Return the number of distinct positions of points (n, 3) in m relative to the blocks.
+
+    Several blocks see points on circles from the same relative position and share the integrals of
+    their fields (`halbach_fe.solver.vacuum_field.unit_fields`). Positions are counted for the
+    blocks of a single ring and a sample of the points, and scaled up.
     """
     slots = np.arange(1, magnet.array.blocks_per_ring + 1)
-    some = points[:COUNTED_PLACES // len(slots) + 1]
+    sample = points[:COUNTED_PLACES // len(slots) + 1]
     middles = np.radians([position_angle_deg(magnet.array, slot) for slot in slots.tolist()])
-    turn = np.arctan2(some[:, 1], some[:, 0])[:, None] - middles
+    turn = np.arctan2(sample[:, 1], sample[:, 0])[:, None] - middles
     turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
-    r = np.hypot(some[:, 0], some[:, 1])[:, None]
-    z = np.broadcast_to(some[:, 2:], turn.shape)
+    r = np.hypot(sample[:, 0], sample[:, 1])[:, None]
+    z = np.broadcast_to(sample[:, 2:], turn.shape)
     different, _ = unique_points(np.column_stack(
         [x.ravel() for x in (r * np.cos(turn), r * np.sin(turn), z)]).round(9))
-    return magnet.array.rings * len(different) * len(points) / len(some)
+    return magnet.array.rings * len(different) * len(points) / len(sample)
 
 
 def machine_speed() -> float:
-    """How fast this machine is now, over the one that the laws were measured on: by a sparse
-    factorization of fixed size, the best of three.
+    """Return the present speed of this machine relative to the reference machine.
+
+    It is measured by the shortest time of three factorizations of a sparse matrix of fixed size.
     """
     line = sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(GRID, GRID))
-    one = sparse.eye_array(GRID)
-    matrix = sparse.csc_array(sparse.kron(line, one) + sparse.kron(one, line))
+    identity = sparse.eye_array(GRID)
+    matrix = sparse.csc_array(sparse.kron(line, identity) + sparse.kron(identity, line))
 
     def factorize() -> float:
         started = time.perf_counter()
@@ -386,15 +440,18 @@ def machine_speed() -> float:
 
 
 def available_memory() -> float | None:
-    """Memory in GiB that can be had: of the machine, or of the container if that is less."""
-    found = []
+    """Return the available memory in GiB of the machine, or of the container if that is less.
+
+    It is None if the operating system does not tell.
+    """
+    limits = []
     try:
         lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        found.append(int(lines["MemAvailable"].split()[0]) / 2**20)
+        limits.append(int(lines["MemAvailable"].split()[0]) / 2**20)
         group = Path("/sys/fs/cgroup")
         limit = (group / "memory.max").read_text().strip()
         if limit != "max":
-            found.append((int(limit) - int((group / "memory.current").read_text())) / GIB)
+            limits.append((int(limit) - int((group / "memory.current").read_text())) / GIB)
     except (OSError, KeyError, ValueError):
         pass
-    return min(found, default=None)
+    return min(limits, default=None)

@@ -1,8 +1,18 @@
-"""Fields of rotationally symmetric materials, one azimuthal mode at a time.
+"""Magnetostatics of rotationally symmetric materials, one azimuthal mode at a time.
 
-Where recoil permeability and iron do not depend on the angle, the 3D problem of one block splits
-into one small (r, z) problem per mode m (see pro/azimuthal_modes.pro), and all blocks of a ring
-share it by rotation. Seconds to minutes where 3D meshes take minutes to hours, and more exact.
+The unknown is the scalar potential psi = mu_0 phi in T m (H = -grad phi), and div B = 0 is solved
+in weak form with B = -mu_r grad psi + B_r. Where recoil permeability and iron do not depend on the
+angle, the modes cos(m theta) and sin(m theta) of psi are not coupled. The 3D problem of one block
+then splits into one problem per mode m in the (r, z) half-plane, on rectangles of second order:
+
+    w int mu_r (grad psi_m . grad v + m^2/r^2 psi_m v) r dr dz = int (P . grad v + Q/r v) r dr dz,
+
+with w = 2 pi for m = 0 and pi otherwise, and P and Q integrals of the block's remanence over its
+angle; pro/azimuthal_modes.pro derives them. psi_m = 0 on the outer boundary, and on the axis for
+m > 0; mode 0 has no condition on the axis.
+
+All blocks of a ring share the solutions by rotation. This takes seconds to minutes where 3D meshes
+take minutes to hours, and is more accurate.
 """
 
 from __future__ import annotations
@@ -50,25 +60,35 @@ from halbach_fe.solver.session import RunSize, Session
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
 NOMINAL_SOURCES = 2
-"""Cosine and sine part of the nominal array."""
+"""Number of sources of the nominal array in every mode: its cosine part and its sine part."""
 
 MODE_TOLERANCE = 1e-4
-"""Modes fall as (r / inner radius)^m. What is left out of one block's reaction, itself a few per
-cent of its field, is below 1e-5 of that field."""
+"""Modes are solved for until their decay, (r / inner radius)^m in the bore, is below this value.
+The truncation error of one block's reaction, itself a few per cent of the block's field, is then
+below 1e-5 of that field."""
 
 SOLVED_NUMBERS = 2**28
-"""In the solutions of one run, 2 GB on the disk until they are read."""
+"""Largest number of values in the solutions of one run. They take 2 GB on the disk until they are
+read."""
 
 MAX_MODES = 64
+"""Highest mode up to which this route applies; points close to the blocks need more modes."""
+
 AXIS_RADIUS = 1e-8
-"""Points nearer to the axis than this fraction of the bore are on it, where psi/r is a limit."""
+"""Points nearer to the axis than this fraction of the inner radius count as points on the axis,
+where psi/r is a limit."""
 
 NO_REMANENCE = 1e-12
-"""Of the largest mode: a mode of the nominal array below it is excluded by symmetry."""
+"""Tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
+remanence is smaller, which are rounding errors and are not solved for."""
 
 
 def is_axisymmetric(magnet: Magnet, points: Floats) -> bool:
-    """Tell whether materials are rotationally symmetric and the points need few modes."""
+    """Tell whether the materials are rotationally symmetric and few modes suffice at the points.
+
+    The magnet must be 3D, of sectors without angular gaps and of one isotropic permeability in each
+    ring, with linear iron or none. At the points (n, 3) in m at most `MAX_MODES` modes may matter.
+    """
     block = magnet.array.block
     if magnet.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
         return False
@@ -80,17 +100,18 @@ def is_axisymmetric(magnet: Magnet, points: Floats) -> bool:
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
-    """Highest mode that matters at any of the points (n, 3)."""
+    """Return the highest mode that matters at any of the points (n, 3) in m."""
     worst = float(np.clip(mode_decay(magnet, points).max(), 1e-9, 1 - 1e-9))
     return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
 
 
 def mode_decay(magnet: Magnet, points: Floats) -> Floats:
-    """Factor (n,) by which the field at each point falls from one mode to the next."""
+    """Return the factor (n,) by which the field at each point falls from one mode to the next."""
     array = magnet.array
     r, z = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
     beyond = np.maximum(z - magnet.array_half_length, 0)
-    # decay per mode: r/ri in the bore, ro/r outside, and with the distance beyond the ends
+    # with inner radius ri and outer radius ro: r/ri in the bore, ro/r outside the array, and in
+    # between an exponential of the distance beyond the ends
     decay = np.where(r < array.inner_radius_m, r / array.inner_radius_m,
                      np.where(r > array.outer_radius_m, array.outer_radius_m / np.maximum(r, 1e-9),
                               np.exp(-beyond / array.outer_radius_m)))
@@ -99,7 +120,17 @@ def mode_decay(magnet: Magnet, points: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Ring:
-    """What case_modes.pro.j2 says of a ring; see there."""
+    """Data of one ring for the template case_modes.pro.j2, which describes them.
+
+    Attributes
+    ----------
+    recoil_permeability : float
+    rank : int
+        Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings.
+    along, across, axial : list of float, in T
+        Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
+        part in mode 0, then in mode 1, and so on (see `nominal_waves`).
+    """
 
     recoil_permeability: float
     rank: int
@@ -110,16 +141,19 @@ class _Ring:
 
 @dataclass(frozen=True)
 class _Case:
-    """What all runs of a study have in common.
+    """The data that all runs for a magnet share.
 
     Attributes
     ----------
-    weights : ndarray
-        Of the nominal array, see `nominal_waves`.
+    magnet : Magnet
+    mesh : VerifiedMesh or CountedMesh
+        Mesh of the (r, z) half-plane.
+    weights : ndarray, shape (modes, 2, rings, 3), in T
+        Remanence of the nominal array, see `nominal_waves`.
     solved : tuple of int
-        Rings, from 0, of the blocks that are solved for.
+        Numbers, from 0, of the rings that hold the blocks to solve for.
     meridian : ndarray, shape (m, 3), in m
-        Points (r, z, 0) of the half-plane where fields are wanted.
+        Points (r, z, 0) of the half-plane at which fields are evaluated.
     """
 
     magnet: Magnet
@@ -130,42 +164,50 @@ class _Case:
 
     @property
     def real_mesh(self) -> VerifiedMesh:
-        """The mesh; one that is only counted cannot be solved on."""
+        """The mesh of a run that is solved; a `CountedMesh` serves estimates only."""
         assert isinstance(self.mesh, VerifiedMesh)
         return self.mesh
 
     @cached_property
     def located(self) -> Located:
-        """Elements of the points."""
+        """The elements that hold the points, and the points' coordinates in them."""
         return locate(self.real_mesh, self.meridian)
 
     @cached_property
     def probes(self) -> tuple[Located, Floats]:
-        """Some of the points and their places, where GetDP prints what is compared."""
+        """Probes (p, 3) in m where GetDP prints gradients, to check our own evaluation."""
         return probes_of(self.real_mesh, self.located)
 
     @property
     def last_source(self) -> int:
+        """Number of the last source: three per solved ring follow the nominal array's two."""
         return NOMINAL_SOURCES - 1 + 3 * len(self.solved)
 
 
 def solve_modes(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session
 ) -> Floats:
-    """Finite-element part of the field of the nominal array and of single blocks, as
-    `halbach_fe.solver.magnetostatics.solve_sources` returns it: the reaction, or B itself, by the
-    study's method.
+    """Return the finite-element part of B of the nominal array and of single blocks, mode by mode.
+
+    The result has the form of `halbach_fe.solver.magnetostatics.solve_sources`. For the method
+    ``direct`` it is B itself. For ``reaction`` it is the difference of two solves on one mesh, real
+    materials minus vacuum, to be added to the exact field in vacuum.
 
     Parameters
     ----------
+    magnet : Magnet
+        Must satisfy `is_axisymmetric`.
     points : ndarray, shape (n, 3), in m
+        In air.
     blocks : sequence of int
-        Numbers, from 0, of the blocks to solve for with 1 T along x, y and z. Blocks of one ring
-        cost no more than one.
+        Numbers, from 0, of the blocks to solve for with a remanence of 1 T along x, y and z. Since
+        the blocks of a ring share their solutions, more blocks of the same ring cost nothing more.
+    session : Session
 
     Returns
     -------
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
+        The nominal array, then block by block, axis by axis.
     """
     array = magnet.array
     r = np.hypot(points[:, 0], points[:, 1])
@@ -199,57 +241,76 @@ def solve_modes(
 
 
 def spans_of(weights: Floats, all_modes: bool, each: int) -> list[tuple[int, int]]:
-    """First and last mode of every run, by the `nominal_waves`; all modes for single blocks, or
-    only those of the nominal array. A mode's solutions are ``each`` numbers.
+    """Return the first and the last mode of every run of GetDP.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (modes, 2, rings, 3), in T
+        Remanence of the nominal array, see `nominal_waves`.
+    all_modes : bool
+        Whether to solve for all modes, as single blocks need, or only for those that the nominal
+        array has.
+    each : int
+        Values in the solutions of one mode. It limits the modes per run, see `SOLVED_NUMBERS`.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
     wanted = [m for m in range(len(weights)) if all_modes or size[m] > NO_REMANENCE * size.max()]
-    # mode 0 has another condition on the axis, so it is a run of its own
+    # mode 0 has no boundary condition on the axis, unlike all others, so it is a run of its own
     return [span for first in (True, False)
             for span in _runs([m for m in wanted if (m == 0) == first],
                               max(1, SOLVED_NUMBERS // each))]
 
 
 def _runs(modes: Sequence[int], most: int) -> list[tuple[int, int]]:
-    """Spans (first, last) of consecutive modes, at most so many in each."""
-    found = []
+    """Split modes into spans (first, last) of at most ``most`` consecutive modes."""
+    spans = []
     for _, group in groupby(enumerate(modes), lambda pair: pair[1] - pair[0]):
         span = [mode for _, mode in group]
-        found += [(part[0], part[-1]) for part in (
+        spans += [(part[0], part[-1]) for part in (
             span[first:first + most] for first in range(0, len(span), most))]
-    return found
+    return spans
 
 
 def nominal_waves(magnet: Magnet, highest: int) -> Floats:
-    """Nominal remanence as waves, (modes, 2, rings, 3) in T: by what goes into cos(m theta) and
-    sin(m theta), ring, and along or across the blocks' middles, or along z.
+    """Return the nominal remanence by azimuthal mode.
 
-    A block at angle t with remanence A along and C across its middle, and Z along z, has the
-    potential (A psi_along + Z psi_axial) cos(m (theta - t)) + C psi_across sin(m (theta - t)).
+    A block at angle t with remanence A along its middle, C across it and Z along z has in mode m
+    the potential (A psi_along + Z psi_axial) cos(m (theta - t)) + C psi_across sin(m (theta - t)).
+    The addition theorems split it into multiples of cos(m theta) and sin(m theta), which are summed
+    over the blocks of each ring.
+
+    Returns
+    -------
+    ndarray, shape (highest + 1, 2, rings, 3), in T
+        ``[m, part, ring, component]``: part 0 belongs to cos(m theta) and part 1 to sin(m theta);
+        component 0 is along the blocks' middles, 1 across them, 2 along z.
     """
     m = np.arange(highest + 1)
-    found = np.zeros((highest + 1, 2, magnet.array.rings, 3))
+    waves = np.zeros((highest + 1, 2, magnet.array.rings, 3))
     for block in magnet.blocks:
         middle = _middle(magnet, block)
         x, y, axial = block.remanence * np.array(block.easy_axis)
         along = np.cos(middle) * x + np.sin(middle) * y
         across = np.cos(middle) * y - np.sin(middle) * x
         cosine, sine = np.cos(m * middle), np.sin(m * middle)
-        found[:, 0, block.ring - 1] += np.column_stack(
+        waves[:, 0, block.ring - 1] += np.column_stack(
             [along * cosine, -across * sine, axial * cosine])
-        found[:, 1, block.ring - 1] += np.column_stack(
+        waves[:, 1, block.ring - 1] += np.column_stack(
             [along * sine, across * cosine, axial * sine])
-    # a remanence across the middle, the same all round, has no charges; and there is no sin(0)
-    found[0, 1] = 0
-    found[0, :, :, 1] = 0
-    return found
+    # mode 0: a purely azimuthal remanence, the same at all angles, has no divergence and so no
+    # source; and the sine part vanishes, because sin(0 theta) = 0
+    waves[0, 1] = 0
+    waves[0, :, :, 1] = 0
+    return waves
 
 
 def _middle(magnet: Magnet, block: MagnetBlock) -> float:
+    """Return the angle in rad of a block's middle."""
     return float(np.radians(position_angle_deg(magnet.array, block.slot)))
 
 
 def _rings(case: _Case) -> list[_Ring]:
+    """Return the data of all rings for the template of the problem."""
     blocks = case.magnet.blocks[::case.magnet.array.blocks_per_ring]
     return [_Ring(block.recoil_permeability,
                   case.solved.index(ring) + 1 if ring in case.solved else 0,
@@ -259,9 +320,11 @@ def _rings(case: _Case) -> list[_Ring]:
 
 
 def _task(case: _Case, span: tuple[int, int], vacuum: bool, session: Session) -> Task:
+    """Return the run of GetDP for all sources in the modes from ``span[0]`` to ``span[1]``."""
     modes, sources = span[1] - span[0] + 1, case.last_source + 1
 
-    # one whose field does not vanish: a block's, or the larger part of the nominal array
+    # print a source whose field does not vanish, or the check of our evaluation would be empty: a
+    # single block if any is solved for, else the larger part of the nominal array
     printed = case.last_source if case.solved else int(
         np.argmax(np.abs(case.weights[span[0]]).max(axis=(1, 2))))
 
@@ -283,10 +346,21 @@ def fill_run_folder(
     case: _Case, folder: Path, span: tuple[int, int], sources: tuple[int, int], printed: int,
     vacuum: bool, time_limit_s: float,
 ) -> Job:
-    """Fill a run folder, and return the job to run there.
+    """Fill a run folder with everything that GetDP needs, and return the job to run there.
 
-    ``span`` and ``sources`` are the first and last mode and source, ``printed`` the source that
-    GetDP prints in the first mode.
+    Parameters
+    ----------
+    case : _Case
+    folder : Path
+        An existing folder.
+    span, sources : tuple of int
+        First and last mode, and first and last source, both included; azimuthal_modes.pro numbers
+        the sources.
+    printed : int
+        The source whose gradients GetDP prints, in the first mode.
+    vacuum : bool
+        Whether all materials are replaced by vacuum.
+    time_limit_s : float
     """
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
@@ -306,13 +380,37 @@ def fill_run_folder(
 
 
 def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
-    """How many unknowns a mode has, by what the mesh has off the boundary, and on the axis."""
-    everywhere, fixed = (one.nodes + one.edges + one.faces for one in (inner, axis))
+    """Return the number of unknowns of a mode.
+
+    The potential has one unknown per node, edge and face of the mesh, except on the outer boundary
+    and, for m > 0, on the axis, where it is fixed to 0.
+
+    Parameters
+    ----------
+    inner : Entities
+        Off the outer boundary.
+    axis : Entities
+        Of these, those on the axis.
+    mode : int
+    """
+    everywhere, fixed = (part.nodes + part.edges + part.faces for part in (inner, axis))
     return everywhere - (fixed if mode > 0 else 0)
 
 
 def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) -> Floats:
-    """d psi/dr, psi/r and d psi/dz of a run's solutions, (modes, sources, points, 3)."""
+    """Return d psi/dr, psi/r and d psi/dz of all solutions of a run at the points.
+
+    Returns
+    -------
+    ndarray, shape (modes, sources, points, 3), in T
+        The values on the axis are placeholders until `_limit_on_axis` sets them.
+
+    Raises
+    ------
+    GetDPError
+        If the files are damaged, or if our evaluation differs from what GetDP printed for the
+        source ``printed``.
+    """
     unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.real_mesh.cell_type)
     solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
 
@@ -330,8 +428,10 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
 
 
 def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None:
-    """Put what d psi/dr, psi/r, d psi/dz (..., points, 3) are on the axis: psi is like r^m there,
-    and elements are not.
+    """Replace d psi/dr, psi/r, d psi/dz (..., points, 3) on the axis by their limits, in place.
+
+    Near the axis psi_m is proportional to r^m. The functions of the elements are not, so that their
+    gradients on the axis are wrong; psi/r would even be 0/0.
     """
     if m == 1:
         gradient[..., on_axis, 1] = gradient[..., on_axis, 0]
@@ -345,7 +445,23 @@ def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None
 def _superpose(
     case: _Case, modes: dict[int, Floats], points: Floats, where: Ints, blocks: Sequence[int]
 ) -> Floats:
-    """Sum modes into the fields at the points, each block turned to its place."""
+    """Sum the modes into B at the points, with each block rotated into its position.
+
+    Parameters
+    ----------
+    case : _Case
+    modes : dict of int to ndarray, shape (sources, m, 3), in T
+        d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode.
+    points : ndarray, shape (n, 3), in m
+    where : ndarray of int, shape (n,)
+        Number of each point's (r, z) among the points of the half-plane.
+    blocks : sequence of int
+
+    Returns
+    -------
+    ndarray, shape (1 + 3 len(blocks), n, 3), in T
+        As `solve_modes` returns it.
+    """
     phi = np.arctan2(points[:, 1], points[:, 0])
     everything = case.magnet.blocks
     result = np.zeros((1 + 3 * len(blocks), len(points), 3))
@@ -366,19 +482,26 @@ def _superpose(
 
 
 def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
-    """B_r, B_theta, B_z (n, 3) of a potential in cos(m theta), or sin(m theta), from its
-    gradients (n, 3) by mode.
+    """Return B_r, B_theta, B_z (n, 3) in T of a sum of modes, B = -grad psi.
+
+    Parameters
+    ----------
+    gradients : dict of int to ndarray, shape (n, 3), in T
+        d psi_m/dr, psi_m/r and d psi_m/dz, by mode m.
+    theta : ndarray, shape (n,), in rad
+    sine : bool
+        Whether the potential is the sum of psi_m sin(m theta), or of psi_m cos(m theta).
     """
     field = np.zeros((len(theta), 3))
     for m, gradient in gradients.items():
         cos, sin = np.cos(m * theta), np.sin(m * theta)
         even, derivative = (sin, m * cos) if sine else (cos, -m * sin)
-        field -= gradient * np.column_stack([even, derivative, even])  # B = -grad psi
+        field -= gradient * np.column_stack([even, derivative, even])
     return field
 
 
 def _to_cartesian(field: Floats, phi: Floats) -> Floats:
-    """Turn (..., n, 3) from B_r, B_theta, B_z to B_x, B_y, B_z."""
+    """Convert B_r, B_theta, B_z (..., n, 3) at azimuths phi (n,) in rad to B_x, B_y, B_z."""
     cosine, sine = np.cos(phi), np.sin(phi)
     radial, tangential = field[..., 0], field[..., 1]
     return np.stack([radial * cosine - tangential * sine, radial * sine + tangential * cosine,

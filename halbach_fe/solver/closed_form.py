@@ -1,6 +1,10 @@
-"""Closed forms for infinitely long arrays of sectors: the oracle that solves are checked against.
+"""Closed-form fields of infinitely long arrays of sectors, to check finite-element solves against.
 
-Imports nothing of this package on purpose: it must not share a mistake with what it checks.
+The problem is two-dimensional magnetostatics without currents: div B = 0 and curl H = 0, with
+B = mu_0 mu_r H + B_r in the magnets. Complex numbers stand for vectors of the cross-section.
+
+This module imports nothing from this package but `halbach_fe.core`, on purpose: it must not share a
+mistake with the code that it checks.
 """
 
 from __future__ import annotations
@@ -17,7 +21,15 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class SectorMagnetization:
-    """A uniformly magnetized sector: angles in rad, remanence as ``B_rx + i B_ry`` in T."""
+    """A uniformly magnetized sector.
+
+    Attributes
+    ----------
+    middle, half_width : float
+        Azimuth of the sector's middle, and half of its opening angle, in rad.
+    remanence : complex
+        ``B_rx + i B_ry`` in T.
+    """
 
     middle: float
     half_width: float
@@ -28,7 +40,19 @@ def ideal_sectors(
     multipole_order: int, blocks: int, remanence: float,
     first_angle: float = 0.0, first_magnetization_angle: float = 0.0,
 ) -> list[SectorMagnetization]:
-    """Sectors of a Halbach array without gaps (K. Halbach, NIM 169 (1980) 1); angles in rad."""
+    """Return the sectors of a Halbach array without gaps (K. Halbach, NIM 169 (1980) 1).
+
+    Parameters
+    ----------
+    multipole_order : int
+        1 is a dipole, 2 a quadrupole. The magnetization turns by 1 + this order times the azimuth.
+    blocks : int
+        Number of sectors.
+    remanence : float
+        In T.
+    first_angle, first_magnetization_angle : float
+        Azimuth of the first sector's middle and direction of its remanence, in rad.
+    """
     pitch = 2 * np.pi / blocks
     return [
         SectorMagnetization(first_angle + i * pitch, pitch / 2,
@@ -42,19 +66,21 @@ def bore_field(
     sectors: list[SectorMagnetization], inner_radius: float, outer_radius: float, points: Floats,
     terms: int = 400,
 ) -> Floats:
-    """Field in the bore of sectors of recoil permeability 1.
+    """Return B in the bore of an array of sectors of recoil permeability 1.
 
-    The line dipole j dA at z' has ``B_x - i B_y = j / (2 pi (z - z')^2)``; integrating its
-    expansion in z/z' over each sector gives the multipoles in closed form.
+    A line dipole of remanence j times area dA at z' has ``B_x - i B_y = j dA / (2 pi (z - z')^2)``.
+    Integrating its expansion in powers of z/z' over each sector gives the multipoles in closed
+    form.
 
     Parameters
     ----------
+    sectors : list of SectorMagnetization
     inner_radius, outer_radius : float
-        In m.
+        Radii of the sectors in m.
     points : ndarray, shape (n, 2), in m
         Inside the inner radius.
     terms : int
-        Multipoles summed; the error falls as (r / inner_radius)^terms.
+        Number of multipoles; the truncation error falls as (r / inner_radius)^terms.
 
     Returns
     -------
@@ -62,7 +88,7 @@ def bore_field(
     """
     k = np.arange(1, terms + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # radii over the inner one, so that nothing overflows
+        # radii relative to the inner radius, so that no power overflows
         radial = (1 - (outer_radius / inner_radius) ** (1.0 - k)) / (k - 1)
     radial[0] = np.log(outer_radius / inner_radius)
     coefficient = np.zeros(terms, complex)
@@ -80,24 +106,27 @@ def layered_bore_field(
     recoil_permeability: float,
     points: Floats, iron: tuple[float, float, float] | None = None, terms: int = 200,
 ) -> Floats:
-    """Field in the bore of a closed ring of sectors of any permeability, with an iron tube.
+    """Return B in the bore of a closed ring of sectors of any permeability, with an iron tube.
 
-    Harmonic by harmonic the scalar potential is ``a r^k + b r^-k`` in every layer, plus in the
-    magnet a particular solution of ``mu_r lap(psi) = div B_r``; tangential H and normal B are
-    continuous at each radius.
+    The scalar potential psi (B = -mu_r grad psi + B_r) is solved for harmonic by harmonic. In every
+    layer (bore, magnet, air, iron, outside) harmonic k is ``a r^k + b r^-k``, plus in the magnet a
+    particular solution of ``mu_r lap(psi) = div B_r``. Tangential H and normal B are continuous at
+    each radius, and psi vanishes at infinity.
 
     Parameters
     ----------
-    sectors : list of Sector
+    sectors : list of SectorMagnetization
         Without gaps between them.
     inner_radius, outer_radius : float
-        Of the magnets, in m.
+        Radii of the magnets in m.
     recoil_permeability : float
+        The same for all sectors.
     points : ndarray, shape (n, 2), in m
         In the bore.
     iron : (inner radius in m, outer radius in m, relative permeability), optional
+        A tube around the magnets, with an air gap if its inner radius exceeds ``outer_radius``.
     terms : int
-        Harmonics summed.
+        Number of harmonics.
 
     Returns
     -------
@@ -128,18 +157,23 @@ def layered_bore_field(
 def _bore_coefficient(
     sectors: list[SectorMagnetization], r: Floats, permeability: list[float], k: int
 ) -> complex:
-    """Solve harmonic k for the coefficient of r^k in the bore; radii over the inner one."""
+    """Solve harmonic k for the coefficient of r^k in the bore, with all radii over the inner one.
+
+    The harmonic of psi is 2 Re(a rho^k e^(ik theta)) there. The two rows of the matrix at each
+    interface are the continuity of psi (tangential H) and of -mu_r dpsi/dr + B_r (normal B).
+    """
     radial = _harmonic(sectors, k, 0)
     divergence = radial + 1j * k * _harmonic(sectors, k, 1)
     scale = divergence / permeability[1]
 
     def particular(x: float) -> tuple[complex, complex]:
-        """psi_p and its derivative."""
+        """Return the particular solution in the magnet and its derivative at radius x."""
         if k == 1:
             return scale * x * np.log(x) / 2, scale * (np.log(x) + 1) / 2
         return scale * x / (1 - k**2), scale / (1 - k**2)
 
-    # Unknowns: bore a; layer i (1..): a_i, b_i with (r/r_i)^k, (r_{i-1}/r)^k; outside b.
+    # Unknowns: a in the bore; in layer i = 1, 2, ... a_i of (r/r_i)^k and b_i of (r_{i-1}/r)^k; b
+    # outside. Scaled by the layer's own radii, the powers never exceed 1.
     layers = len(r) - 1
     size = 2 * len(r)
     matrix, right = np.zeros((size, size), complex), np.zeros(size, complex)
@@ -165,10 +199,11 @@ def _bore_coefficient(
 
 
 def _harmonic(sectors: list[SectorMagnetization], k: int, part: int) -> complex:
-    """Coefficient of e^(ik theta) in the radial (0) or tangential (1) remanence."""
+    """Return the coefficient of e^(ik theta) in the radial (part 0) or tangential (1) remanence."""
     total = 0j
     for sector in sectors:
-        # radial + i tangential = j e^(-i theta); the real function needs both conjugate halves
+        # radial + i tangential = j e^(-i theta): the radial part is half the sum of this expression
+        # and its complex conjugate, the tangential part half the difference over i
         plus = _sector_integral(sector, k + 1) * sector.remanence
         minus = _sector_integral(sector, k - 1) * sector.remanence.conjugate()
         total += (plus + minus) / 2 if part == 0 else (plus - minus) / 2j
@@ -176,7 +211,7 @@ def _harmonic(sectors: list[SectorMagnetization], k: int, part: int) -> complex:
 
 
 def _sector_integral(sector: SectorMagnetization, order: int) -> complex:
-    """1/2pi times the integral of e^(-i order theta) over a sector."""
+    """Return 1/2pi times the integral of e^(-i order theta) over the angles of a sector."""
     width = (2 * sector.half_width if order == 0
              else 2 * np.sin(order * sector.half_width) / order)
     return complex(width * np.exp(-1j * order * sector.middle) / (2 * np.pi))

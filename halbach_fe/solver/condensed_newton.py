@@ -1,19 +1,24 @@
-"""Non-linear magnetostatics on the iron's unknowns alone: arrays in, readings out.
+"""Non-linear magnetostatics condensed onto the unknowns of the iron.
 
-Outside the iron the problem is linear, and is solved once and for all. With u the potential and d
-what the iron's magnetization adds to it, on the unknowns of the iron,
+Only the iron is non-linear. All other unknowns are eliminated once, so that a solve for other
+magnetizations p (the parameters) works on the unknowns of the iron alone and returns readings q:
 
-    u = U p + d,      S d + G^T w s(G u) = 0,      q = Q0 p + Q d,
+    u = U p + d,      S d + G^T w s(G u) = 0,      q = Q0 p + Q d.
 
-where S is the stiffness of everything as the iron's own unknowns see it (a Schur complement, the
-iron being vacuum: it is dense on the iron's surface and sparse inside), G the field at the iron's
-Gauss points, w their weights, and s(F) = (c(|F|^2) - c_vacuum) F the iron's law less vacuum's:
-minus the magnetization for the vector potential, the polarization for the scalar one. The problem
-is the minimum of a convex energy, so Newton's method with a line search always gets there.
+u is the potential (vector potential a, or scalar potential psi = mu_0 phi) on the iron's unknowns,
+U p its value without the iron, and d the contribution of the iron's magnetization. S is the
+stiffness with the iron replaced by vacuum, condensed onto the iron's unknowns: a Schur complement,
+which is dense on the iron's surface and sparse inside. G maps the unknowns to the field F in T at
+the iron's Gauss points, curl a = B or -grad psi = mu_0 H; w are the weights of these points.
+s(F) = (c(|F|^2) - c_vacuum) F is the iron's law minus the law of vacuum. For the vector potential c
+is the reluctivity, and s is minus the magnetization; for the scalar potential c is the relative
+permeability, and s is the polarization. The solution minimizes a convex energy, so that Newton's
+method with a line search converges from every start.
 
-A solve starts from the linearization about a reference, keeps the reference's factorized tangent,
-and accelerates (D. G. Anderson, J. ACM 12 (1965) 547; H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49
-(2011) 1715). Newton's method takes over where that stalls.
+A solve starts from the linearization about a reference magnetization. It iterates with the
+factorized tangent of the reference and Anderson acceleration (D. G. Anderson, J. ACM 12 (1965) 547;
+H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49 (2011) 1715). If this iteration does not converge,
+Newton's method takes over.
 """
 
 from __future__ import annotations
@@ -29,28 +34,46 @@ from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.study.materials import ConstitutiveLaw
 
 MAX_ITERATIONS = 25
-"""Of the accelerated iteration; 4 to 6 are usual, more than that is Newton's work."""
+"""Largest number of accelerated iterations. 4 to 6 are usual; where more are needed, Newton's
+method takes over."""
 
 MEMORY = 5
-"""Steps that the acceleration looks back on."""
+"""Number of previous steps that the Anderson acceleration combines."""
 
 MAX_NEWTON_STEPS = 60
+"""Largest number of Newton steps in one solve."""
+
 NEWTON_RESIDUAL = 1e-11
-"""Relative to the sources; rounding leaves some 1e-14."""
+"""Newton's method stops at this residual relative to the sources. Rounding leaves about 1e-14."""
 
 MAX_RESIDUAL = 1e-5
-"""An accelerated solution is taken only with so small a residual, whatever the readings say."""
+"""Largest relative residual of an accepted accelerated solution. Readings that hardly change do not
+prove convergence by themselves: they see only a part of the iron's unknowns."""
 
 SAFE_RATE = 0.1
-"""Convergence is not believed to be faster than this by the step: the last two may be luck."""
+"""Smallest factor per step by which the error is assumed to fall. A smaller ratio of the last two
+changes may be a coincidence."""
 
 SMALLEST_STEP = 2.0**-20
+"""Step length, relative to the full Newton step, at which the line search gives up."""
+
 COLUMNS_AT_ONCE = 256
+"""Number of columns that `condense` solves for at a time, which limits its memory."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """How a solve went: iterations, Newton steps after them, and the relative residuals."""
+    """Convergence of a solve.
+
+    Attributes
+    ----------
+    iterations : int
+        Accelerated iterations.
+    newton_steps : int
+        Newton steps after them, 0 if the accelerated iteration converged.
+    residuals : tuple of float
+        Residual of every iterate, relative to the sources.
+    """
 
     iterations: int
     newton_steps: int
@@ -59,26 +82,31 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Condensed:
-    """A magnet with non-linear iron, condensed.
+    """A magnet with non-linear iron, condensed onto the iron's unknowns.
+
+    The letters are those of the equations at the top of this module. The unknowns are nodal values
+    of the potential in T m, or circulations along edges in T m^2.
 
     Attributes
     ----------
-    law : Law
+    law : ConstitutiveLaw
+        The iron's law c(|F|^2).
     gradient : sparse array, shape (d m, unknowns)
-        The field at m Gauss points, component after component.
-    weights : ndarray, shape (m,)
+        G. The field in T at m Gauss points in d dimensions, component after component.
+    weights : ndarray, shape (m,), in m^d
+        w.
     stiffness : sparse array, shape (unknowns, unknowns)
-        S, the iron being vacuum.
+        S, with the iron replaced by vacuum.
     potential : ndarray, shape (unknowns, parameters)
-        U.
-    linear : ndarray, shape (readings, parameters)
+        U, the potential without the iron per A/m.
+    linear : ndarray, shape (readings, parameters), in T m/A
         Q0, the readings without the iron.
     surface : ndarray, shape (s,)
-        The unknowns that readings depend on.
+        The unknowns on which the readings depend.
     readings : ndarray, shape (readings, s)
-        Q there.
-    reference : ndarray, shape (parameters,)
-        Magnetization in A/m about which the model is linearized, usually the nominal one.
+        The columns of Q for ``surface``; all others are zero. Q d is in T.
+    reference : ndarray, shape (parameters,), in A/m
+        Magnetization about which the model is linearized, usually the nominal one.
     """
 
     law: ConstitutiveLaw
@@ -99,24 +127,32 @@ class Condensed:
             added, tangent, self._added_slope(self.reference, added, tangent)))
 
     def __reduce__(self) -> tuple[type[Condensed], tuple[object, ...]]:
-        """Travels without the factorization, which is made again where it arrives."""
-        return Condensed, tuple(getattr(self, one.name) for one in fields(self) if one.init)
+        """Support pickling: a factorization cannot be pickled, so unpickling computes it again."""
+        return Condensed, tuple(getattr(self, item.name) for item in fields(self) if item.init)
 
     def solve(
         self, parameters: Floats, tolerance_T: float = 1e-9, newton: bool = False
     ) -> tuple[Floats, Statistics]:
-        """Readings (readings,) in T of magnetizations (parameters,) in A/m.
+        """Solve the non-linear problem for the readings.
 
         Parameters
         ----------
+        parameters : ndarray, shape (parameters,), in A/m
+            Magnetizations.
         tolerance_T : float
-            How far the readings may be from convergence.
+            Largest error in T of any reading that incomplete convergence may leave.
         newton : bool
-            Start from zero by Newton's method, and use nothing else.
+            Use Newton's method alone, started from d = 0.
+
+        Returns
+        -------
+        readings : ndarray, shape (readings,), in T
+        statistics : Statistics
 
         Raises
         ------
         NotConvergedError
+            If Newton's method does not converge either.
         """
         own = self.potential @ parameters
         if newton:
@@ -132,7 +168,7 @@ class Condensed:
             iterations, len(more) - 1, residuals + more)
 
     def jacobian(self, parameters: Floats) -> Floats:
-        """dq/dp (readings, parameters) in T m/A at magnetizations (parameters,) in A/m."""
+        """Return dq/dp (readings, parameters) in T m/A at magnetizations (parameters,) in A/m."""
         own = self.potential @ parameters
         if np.array_equal(parameters, self.reference):
             slope = self._state.slope
@@ -143,66 +179,83 @@ class Condensed:
         return self.linear + self.readings @ slope[self.surface]
 
     def iron_field(self, parameters: Floats) -> Floats:
-        """Size (m,) in T of what the law starts from at the iron's Gauss points: B by the vector
-        potential, mu_0 H by the scalar one.
+        """Return |F| (m,) in T at the iron's Gauss points, the argument of its law.
+
+        That is |B| for the vector potential and mu_0 |H| for the scalar potential.
         """
         own = self.potential @ parameters
         added, _ = self._newton(own, self._state.added)
         return np.sqrt(self._square(self._field(own + added)))
 
     def _read(self, parameters: Floats, added: Floats) -> Floats:
+        """Return q = Q0 p + Q d, (readings,) in T."""
         return np.asarray(self.linear @ parameters + self.readings @ added[self.surface])
 
     def _field(self, potential: Floats) -> Floats:
+        """Return F = G u at the Gauss points, (d, m) in T."""
         return np.asarray(self.gradient @ potential).reshape(-1, len(self.weights))
 
     @staticmethod
     def _square(field_: Floats) -> Floats:
+        """Return |F|^2 (m,) in T^2 of fields (d, m) in T."""
         return np.einsum("dm,dm->m", field_, field_)
 
     def _source(self, potential: Floats) -> Floats:
-        """G^T w s(G u)."""
-        found = self._field(potential)
-        coefficient = self.law.coefficient(self._square(found)) - self.law.limit
-        return np.asarray(self.gradient.T @ (found * (coefficient * self.weights)).ravel())
+        """Return G^T w s(G u), the share of the iron's magnetization in the residual."""
+        field_ = self._field(potential)
+        coefficient = self.law.coefficient(self._square(field_)) - self.law.limit
+        return np.asarray(self.gradient.T @ (field_ * (coefficient * self.weights)).ravel())
 
     def _residual(self, own: Floats, added: Floats) -> Floats:
+        """Return S d + G^T w s(G (U p + d)) with U p as ``own`` and d as ``added``."""
         return np.asarray(self.stiffness @ added) + self._source(own + added)
 
     def _weigh(self, potential: Floats) -> sparse.csr_array:
-        """w ds/dF at every Gauss point, as a matrix of d x d diagonals."""
-        found = self._field(potential)
-        square = self._square(found)
+        """Return w ds/dF at every Gauss point, as a d x d block matrix of diagonal blocks.
+
+        With s = (c(|F|^2) - c_vacuum) F, ds/dF is 2 c' F F^T + (c - c_vacuum) 1.
+        """
+        field_ = self._field(potential)
+        square = self._square(field_)
         slope = 2 * self.law.slope(square)
-        own = self.law.coefficient(square) - self.law.limit
-        size = len(found)
+        excess = self.law.coefficient(square) - self.law.limit
+        size = len(field_)
         return sparse.csr_array(sparse.block_array([[
-            sparse.diags_array(self.weights * (slope * found[i] * found[j] + (i == j) * own))
+            sparse.diags_array(self.weights * (slope * field_[i] * field_[j] + (i == j) * excess))
             for j in range(size)] for i in range(size)]))
 
     def _factorize(self, potential: Floats) -> sparse_linalg.SuperLU:
-        """The tangent S + G^T w ds/dF G, symmetric and positive definite."""
+        """Factorize the tangent S + G^T w ds/dF G, which is symmetric and positive definite."""
         tangent = self.stiffness + self.gradient.T @ (self._weigh(potential) @ self.gradient)
         return factorize(tangent)
 
     def _added_slope(
         self, parameters: Floats, added: Floats, tangent: sparse_linalg.SuperLU
     ) -> Floats:
-        """dd/dp, (unknowns, parameters)."""
+        """Return dd/dp (unknowns, parameters) at a solution, from the factorized tangent there."""
         weigh = self._weigh(self.potential @ parameters + added)
         return -np.asarray(tangent.solve(
             np.asarray(self.gradient.T @ (weigh @ (self.gradient @ self.potential)))))
 
     def _scale(self, own: Floats) -> float:
-        """Size of the sources that residuals are measured by."""
+        """Return the norm of S U p, the sources to which residuals are relative."""
         return max(float(np.linalg.norm(self.stiffness @ own)), 1e-300)
 
     def _accelerate(
         self, own: Floats, added: Floats, tolerance: float
     ) -> tuple[Floats, int, tuple[float, ...], bool]:
-        """Fixed-point iteration with the reference's tangent, accelerated.
+        """Iterate with the factorized tangent of the reference and Anderson acceleration.
 
-        Stops when the readings' next change, bounded from the last two, is below the tolerance.
+        The iteration has converged when the estimated remaining change of every reading, by
+        geometric extrapolation of the last two changes, is below the tolerance.
+
+        Returns
+        -------
+        added : ndarray, shape (unknowns,)
+            d; if the iteration has not converged, Newton's method starts from this value.
+        iterations : int
+        residuals : tuple of float
+        converged : bool
         """
         scale = self._scale(own)
         points: list[Floats] = []
@@ -216,7 +269,7 @@ class Condensed:
             change = float(np.abs(self.readings @ step[self.surface]).max())
             if not np.isfinite(change) or (iteration > 3 and residuals[-1] > residuals[0]):
                 break
-            # what is left after this step is about its size times the rate of convergence
+            # the changes fall by about this factor per step: change * rate / (1 - rate) remains
             rate = min(max(change / before, SAFE_RATE), 0.9)
             if residuals[-1] < MAX_RESIDUAL and change * rate / (1 - rate) <= tolerance / 4:
                 return added + step, iteration + 1, tuple(residuals), True
@@ -230,11 +283,19 @@ class Condensed:
         return added, len(residuals), tuple(residuals), False
 
     def _newton(self, own: Floats, added: Floats) -> tuple[Floats, tuple[float, ...]]:
-        """Newton's method, halving steps until the residual falls; the residuals of every step."""
+        """Solve by Newton's method, with every step halved until the residual falls.
+
+        Returns
+        -------
+        added : ndarray, shape (unknowns,)
+            d.
+        residuals : tuple of float
+            Relative residual at the start and after every step.
+        """
         scale = self._scale(own)
         residual = self._residual(own, added)
         norms = [float(np.linalg.norm(residual)) / scale]
-        while not norms[-1] <= NEWTON_RESIDUAL:  # nor is nan
+        while not norms[-1] <= NEWTON_RESIDUAL:  # written so that nan does not end the loop
             if len(norms) > MAX_NEWTON_STEPS or not np.isfinite(norms[-1]):
                 raise NotConvergedError(
                     f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
@@ -249,7 +310,7 @@ class Condensed:
                     break
                 length /= 2
             if not norm < norms[-1]:
-                if norms[-1] < 1e3 * NEWTON_RESIDUAL:  # rounding: there is nothing left to gain
+                if norms[-1] < 1e3 * NEWTON_RESIDUAL:  # rounding errors stop the progress
                     break
                 raise NotConvergedError(
                     f"Newton's method on the iron stalled at a residual of {norms[-1]:.1e}. Smooth "
@@ -261,7 +322,17 @@ class Condensed:
 
 @dataclass(frozen=True)
 class _Reference:
-    """The solution at the reference, its factorized tangent, and its slope by the parameters."""
+    """The solution at the reference magnetization.
+
+    Attributes
+    ----------
+    added : ndarray, shape (unknowns,)
+        d, the contribution of the iron.
+    tangent : SuperLU
+        The factorized tangent.
+    slope : ndarray, shape (unknowns, parameters)
+        dd/dp.
+    """
 
     added: Floats
     tangent: sparse_linalg.SuperLU
@@ -269,7 +340,7 @@ class _Reference:
 
 
 def factorize(matrix: sparse.sparray) -> sparse_linalg.SuperLU:
-    """Factorize a symmetric positive definite matrix, in an order that keeps it sparse."""
+    """Factorize a symmetric positive definite matrix, in an order that keeps the factors sparse."""
     return sparse_linalg.splu(sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A",
                               diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
@@ -277,24 +348,26 @@ def factorize(matrix: sparse.sparray) -> sparse_linalg.SuperLU:
 def condense(
     matrix: sparse.csr_array, iron: Ints, outputs: sparse.csr_array
 ) -> tuple[sparse.csr_array, Ints, Floats]:
-    """Eliminate all unknowns but the iron's.
+    """Eliminate all unknowns except those of the iron.
 
     Parameters
     ----------
     matrix : sparse array, shape (n, n)
-        Stiffness, the iron being vacuum.
+        Stiffness with the iron replaced by vacuum.
     iron : ndarray
-        Its unknowns.
+        The unknowns of the iron.
     outputs : sparse array, shape (k, n)
+        Readings per unknown.
 
     Returns
     -------
     stiffness : sparse array, shape (len(iron), len(iron))
-        The Schur complement.
+        The Schur complement onto the iron's unknowns.
     surface : ndarray, shape (s,)
-        Which of the iron's unknowns outputs depend on.
+        Indices into ``iron`` of the unknowns on which the readings depend: those that share an
+        element with the eliminated unknowns, or that the readings use directly.
     condensed : ndarray, shape (k, s)
-        How they do when there are no other sources.
+        Readings per unknown of ``surface``, without sources outside the iron.
     """
     rest = np.setdiff1d(np.arange(matrix.shape[0]), iron)
     inner = factorize(matrix[rest][:, rest])

@@ -1,8 +1,9 @@
-"""Independent work on other machines, by Dask: runs of GetDP, and functions.
+"""Runs of GetDP and calls of functions on other machines, by Dask.
 
-The files of a run travel to a worker and what GetDP wrote travels back, so that nothing has to be
-shared but the network. A worker runs and verifies GetDP as this machine would, and must have the
-same version and build of it. What a lost worker was doing is done again by another.
+The input files of a run are sent to a worker, and the files that GetDP wrote are sent back, so that
+the machines need no common file system. A worker runs and verifies GetDP as this machine would, and
+must have the same version and build of GetDP. When a worker is lost, Dask repeats its tasks on
+another worker.
 """
 
 from __future__ import annotations
@@ -23,13 +24,28 @@ from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Job
 
 CONNECT_S = 20.0
+"""Time limit in s for the connection to the scheduler."""
+
 POLL_S = 0.05
+"""Time in s between two looks at whether a run has ended."""
+
 WATCH_S = 0.5
+"""Time in s between two looks of a worker at whether its task was cancelled."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a run of GetDP: its log and what it wrote, or why it cannot be trusted."""
+    """The outcome of a run of GetDP on a worker.
+
+    Attributes
+    ----------
+    lines : list of str
+        The log, empty after a failure.
+    files : dict of str to bytes
+        Content of every file that the run wrote, by name; after a failure the log is among them.
+    failure : str
+        Why the result cannot be trusted; empty if the run passed verification.
+    """
 
     lines: list[str]
     files: dict[str, bytes]
@@ -37,7 +53,7 @@ class Answer:
 
 
 class _Workers(Executor):
-    """Runs functions on workers as if they were alone in the world."""
+    """An executor of Dask whose functions do not use Dask themselves, see `_without_scheduler`."""
 
     def __init__(self, inner: Executor) -> None:
         self._inner = inner
@@ -45,11 +61,15 @@ class _Workers(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: object, **kwargs: object
     ) -> Future[Any]:
-        return self._inner.submit(_alone, fn, *args, **kwargs)
+        """Call a function on a worker."""
+        return self._inner.submit(_without_scheduler, fn, *args, **kwargs)
 
 
-def _alone(function: Callable[..., Any], *args: object, **kwargs: object) -> object:
-    """Where there is a Dask scheduler, xarray asks it for leave to write a file."""
+def _without_scheduler(function: Callable[..., Any], *args: object, **kwargs: object) -> object:
+    """Call a function on a worker, with Dask's scheduler hidden from it.
+
+    On a worker xarray would ask the scheduler for a lock before it writes a file.
+    """
     import dask
 
     with dask.config.set(scheduler="synchronous"):
@@ -65,20 +85,29 @@ class Cluster:
 
     @property
     def cores(self) -> int:
-        """Threads of all workers, and at least 1: workers may still be on their way."""
+        """Number of threads of all workers; at least 1, since workers may connect later."""
         return max(1, sum(self.client.nthreads().values()))
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers, each under a key of its own."""
+        """An executor on the workers. Equal calls are not merged into a single one."""
         return _Workers(self.client.get_executor(pure=False))
 
     def run(
         self, getdp: GetDP, job: Job, folder: Path,
         on_line: Callable[[str], None] | None = None, cancel: threading.Event | None = None,
     ) -> list[str]:
-        """Run a job like `halbach_fe.solver.getdp.run`, on some worker; lines come when it has
-        ended.
+        """Run a job on a worker, with the arguments and results of `halbach_fe.solver.getdp.run`.
+
+        ``on_line`` receives all lines of the log at once, when the run has ended.
+
+        Raises
+        ------
+        GetDPError
+            If the run failed, did not pass verification or was cancelled, or if the worker has
+            another GetDP.
+        SchedulerError
+            If Dask failed.
         """
         given = {path.name: path.read_bytes() for path in folder.iterdir()}
         try:
@@ -90,11 +119,11 @@ class Cluster:
                     time.sleep(POLL_S)
                 answer: Answer = future.result()
             finally:
-                with contextlib.suppress(Exception):  # the scheduler may be gone, and all with it
+                with contextlib.suppress(Exception):  # the scheduler may have been lost
                     future.cancel()
         except HalbachError:
             raise
-        except Exception as error:  # of Dask's own, by many names
+        except Exception as error:  # Dask has many types of errors without a common base
             raise _failed(self.address, error) from None
         for name, content in answer.files.items():
             (folder / name).write_bytes(content)
@@ -109,14 +138,19 @@ class Cluster:
 
 @contextmanager
 def connected(address: str) -> Iterator[Cluster]:
-    """The cluster of a Dask scheduler, as ``tcp://host:8786``.
+    """Connect to a Dask scheduler, and disconnect at the end of the context.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler, such as ``tcp://host:8786``.
 
     Raises
     ------
     ExtraMissingError
         If Dask is not installed.
     SchedulerError
-        If nobody answers there.
+        If no scheduler answers at the address, or if Dask fails within the context.
     """
     try:
         import dask
@@ -124,14 +158,15 @@ def connected(address: str) -> Iterator[Cluster]:
     except ImportError:
         raise ExtraMissingError("--scheduler needs Dask, which is not installed: "
                                 "`pip install halbach-fe[cluster]`.") from None
-    # a run's files are nowhere but here, so they go with the task
+    # The files of a run are part of its task, so large tasks are intended: silence Dask's warning.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TiB"})
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SchedulerError(
-            f"Input --scheduler must be the address of a running Dask scheduler, as "
-            f"tcp://host:8786; instead at {address}: {error}.") from None
+            f"Input --scheduler must be the address of a running Dask scheduler, such as "
+            f"tcp://host:8786; instead received {address} ({error}). Start the scheduler, or "
+            "correct its address.") from None
     try:
         yield Cluster(client, address)
     except Exception as error:
@@ -143,27 +178,28 @@ def connected(address: str) -> Iterator[Cluster]:
 
 
 def _failed(address: str, error: Exception) -> SchedulerError:
+    """Return the error for a failure of Dask itself."""
     return SchedulerError(f"The Dask scheduler {address} or its workers failed: "
                           f"{type(error).__name__}: {error} Look into their logs.")
 
 
 def _answer(getdp: GetDP, job: Job, given: dict[str, bytes]) -> Answer:
-    """Run a job in a folder of this worker."""
+    """Run a job on this worker, in a temporary folder with the files ``given`` by name."""
     import distributed
 
-    here = runner.find_getdp()
-    if replace(here, executable=getdp.executable) != getdp:
+    local = runner.find_getdp()
+    if replace(local, executable=getdp.executable) != getdp:
         return Answer([], {}, (
-            f"A worker has another GetDP: {here.version} with PETSc {here.petsc} in place of "
-            f"{getdp.version} with PETSc {getdp.petsc}, or one that is built otherwise. Install "
-            "the same on all machines."))
+            f"A worker has another GetDP: {local.version} with PETSc {local.petsc} in place of "
+            f"{getdp.version} with PETSc {getdp.petsc}, or another build of it. Install the same "
+            "GetDP on all machines."))
     cancel = threading.Event()
     worker = distributed.get_worker()
     key = worker.get_current_task()
     done = threading.Event()
 
     def watch() -> None:
-        """End GetDP when nobody waits for it any more."""
+        """End the run of GetDP when the task was cancelled, since no client waits for it."""
         while not done.wait(WATCH_S):
             task = worker.state.tasks.get(key)
             if task is None or task.state in ("cancelled", "released", "forgotten"):
@@ -176,7 +212,7 @@ def _answer(getdp: GetDP, job: Job, given: dict[str, bytes]) -> Answer:
             (folder / file).write_bytes(content)
         lines, failure = [], ""
         try:
-            lines = runner.run(here, job, folder, cancel=cancel)
+            lines = runner.run(local, job, folder, cancel=cancel)
         except GetDPError as error:
             failure = error.sentence
         finally:

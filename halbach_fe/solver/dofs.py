@@ -1,7 +1,9 @@
-"""What a GetDP run leaves on disk: the place of every unknown, and every solution.
+"""Readers of the files that a GetDP run leaves: its unknowns, solutions and matrix.
 
-The ``.pre`` file lists the unknowns by basis function and mesh entity, and for edge elements
-which edges and faces every element has; PETSc writes the solutions as big-endian binary vectors.
+The ``.pre`` file lists the unknowns (degrees of freedom) by basis function and mesh entity. If
+edges or faces have unknowns, it also lists the edges and faces of every element. PETSc writes
+solutions and matrices in its big-endian binary format, GetDP's SaveSolution writes solutions as
+text.
 """
 
 from __future__ import annotations
@@ -17,25 +19,29 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import GetDPError
 
 _VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
-_UNKNOWN = 1  # GetDP's kind of a degree of freedom that is solved for
+_UNKNOWN = 1  # the type that GetDP gives to a degree of freedom that is solved for
 MOST_ENTITIES = 100
-"""For each row of a list of unknowns; most nodes, edges and faces have one."""
+"""Largest entity or unknown number in a list of unknowns, relative to the number of its rows.
+
+Most nodes, edges and faces have a row, so that larger numbers are a sign of a damaged file. Arrays
+are sized by these numbers."""
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Where the unknowns of a system live.
+    """The unknowns of a system by mesh entity.
 
     Attributes
     ----------
     count : int
-    functions : tuple of ndarray
+        Number of unknowns.
+    functions : tuple of ndarray of int
         For each kind of basis function, in the order of the problem file: index of the unknown by
-        entity number, -1 where there is none (fixed, or no such entity). Nodes are numbered as in
-        the mesh, edges and faces by GetDP.
-    edges, faces : ndarray, shape (elements, edges of one) and (elements, faces of one)
-        In the mesh's order; the sign of an edge tells its direction. Empty where the problem has
-        none.
+        entity number, or -1 if the entity has no unknown (its value is fixed, or no entity has this
+        number). Nodes are numbered from 1 in the order of the mesh, edges and faces by GetDP.
+    edges, faces : ndarray of int, shape (elements, k)
+        Numbers of the k edges or faces of every element, in the mesh's order of elements; the sign
+        of an edge gives its direction. Without rows if the problem does not use edges or faces.
     """
 
     count: int
@@ -44,30 +50,42 @@ class Unknowns:
     faces: Ints
 
 
-# Edges and faces of an element, by meshio's name of its type.
+# Number of edges and of faces of an element, by meshio's name of its type.
 _PARTS = {"triangle6": (3, 1), "quad": (4, 1), "tetra10": (6, 4)}
 
 
 def read_unknowns(path: Path, cell_type: str) -> Unknowns:
-    """Read the ``.pre`` file of a mesh of one type of elements; raise GetDPError if it is none."""
+    """Read the ``.pre`` file of a run on a mesh of one type of elements.
+
+    Parameters
+    ----------
+    path : Path
+    cell_type : str
+        meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
+
+    Raises
+    ------
+    GetDPError
+        If the file cannot be read or is damaged.
+    """
     edges, faces = _PARTS[cell_type]
     try:
         text = path.read_text(encoding="ascii")
         rows = _section(text, "DofData", skip=5)
         table = np.array([line.split()[:5] for line in rows], float)
         if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
-            raise ValueError("an entity or unknown beyond all others")
+            raise ValueError("an entity or unknown has an impossibly large number")
         table = table.astype(int)
         count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
         if count < 1:
             raise ValueError("no unknowns")
         functions = []
         for kind in np.unique(table[:, 0]):
-            mine = table[table[:, 0] == kind]
-            index = np.full(np.abs(mine[:, 1]).max() + 1, -1)
-            solved = mine[mine[:, 3] == _UNKNOWN]
+            of_kind = table[table[:, 0] == kind]
+            index = np.full(np.abs(of_kind[:, 1]).max() + 1, -1)
+            solved = of_kind[of_kind[:, 3] == _UNKNOWN]
             if not ((solved[:, 4] >= 1) & (solved[:, 4] <= count)).all():
-                raise ValueError(f"an unknown that is none of {count}")
+                raise ValueError(f"the number of an unknown is not within 1 to {count}")
             index[np.abs(solved[:, 1])] = solved[:, 4] - 1
             functions.append(index)
         return Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
@@ -78,26 +96,41 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
 
 
 def _section(text: str, name: str, skip: int) -> list[str]:
+    """Return the lines of a section of a ``.pre`` file, without its first ``skip`` lines."""
     body = text.partition(f"${name}")[2].partition(f"$End{name}")[0]
     return body.split("\n")[skip + 1:-1]
 
 
 def _entities(text: str, name: str, count: int) -> Ints:
-    """Entities of the elements that have ``count`` of them (others are faces of the boundary)."""
+    """Return the edges or faces (elements, count) of all elements that have ``count`` of them.
+
+    The elements with other numbers of edges or faces are those of the boundary.
+    """
     rows = [line.split() for line in _section(text, name, skip=1)]
     wanted = [row[2:] for row in rows if row[1] == str(count)]
     return np.array(wanted, int).reshape(-1, count)
 
 
 def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> NDArray[np.floating]:
-    """The last ``solves`` solutions of a run, (solves, unknowns), mapped from the file.
+    """Return the last ``solves`` solutions in a file of PETSc vectors.
 
-    ``before`` is how many others there are.
+    Parameters
+    ----------
+    path : Path
+    unknowns, solves : int
+    before : int
+        Number of other solutions that come first in the file, such as the steps of Newton's method.
+
+    Returns
+    -------
+    ndarray, shape (solves, unknowns)
+        Mapped from the file, not copied: the solutions of many sources may exceed the memory.
 
     Raises
     ------
     GetDPError
-        If the file does not hold just these solves, or values that are not finite.
+        If the file does not hold exactly ``before + solves`` solutions, or holds values that are
+        not finite.
     """
     size = 8 + 8 * unknowns
     try:
@@ -119,16 +152,16 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
 
 
 def read_saved(path: Path, unknowns: int, count: int) -> Floats:
-    """Solutions (count, unknowns) that GetDP's SaveSolution wrote into a ``.res`` file as text.
+    """Return the solutions (count, unknowns) that GetDP's SaveSolution wrote into a ``.res`` file.
 
     Raises
     ------
     GetDPError
-        If the file does not hold just these, or values that are not finite.
+        If the file does not hold exactly ``count`` solutions, or holds values that are not finite.
     """
     try:
         parts = path.read_text(encoding="ascii").split("$Solution")[1:]
-        # a comment and a line of numbers, then a value a line
+        # after the rest of the $Solution line and a line of numbers, every line holds one value
         solutions = np.array([np.array(part.partition("$End")[0].split("\n")[2:-1], float)
                               for part in parts])
     except (OSError, ValueError) as error:
@@ -142,12 +175,18 @@ def read_saved(path: Path, unknowns: int, count: int) -> Floats:
 
 
 def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
-    """A matrix (unknowns, unknowns) that PETSc wrote in binary; raise GetDPError if it is none."""
+    """Return the matrix (unknowns, unknowns) in a file of PETSc's binary format.
+
+    Raises
+    ------
+    GetDPError
+        If the file does not hold a matrix of this size, or holds values that are not finite.
+    """
     try:
         raw = np.fromfile(path, np.uint8)
         head = raw[:16].view(">i4")
         if len(raw) < 16 or tuple(head[:3]) != (_MATRIX, unknowns, unknowns):
-            raise ValueError("another header")
+            raise ValueError("another header than that of a matrix of this size")
         lengths = raw[16:16 + 4 * unknowns].view(">i4").astype(np.int64)
         start, count = 16 + 4 * unknowns, int(head[3])
         columns = raw[start:start + 4 * count].view(">i4").astype(np.int64)
@@ -155,7 +194,8 @@ def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
         if lengths.sum() != count or len(values) != count or len(raw) != start + 12 * count:
             raise ValueError("truncated")
         if (lengths < 0).any() or (columns < 0).any() or (columns >= unknowns).any():
-            raise ValueError("entries outside the matrix")  # scipy would follow them
+            # scipy does not check indices, and would read and write outside its arrays
+            raise ValueError("entries outside the matrix")
     except (OSError, ValueError) as error:
         raise GetDPError(f"GetDP's matrix {path.name} cannot be read ({error}).") from None
     if not np.isfinite(values).all():

@@ -1,4 +1,7 @@
-"""Fields that are not the magnet's own: background, neighbouring magnets, magnetized objects."""
+"""Fields of external sources: background, neighbouring magnets, magnetized objects.
+
+They are added in vacuum: the magnet's permeability and iron do not react to them.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,11 @@ from halbach_fe.study.magnet import Neighbour
 from halbach_fe.study.materials import MU_0
 
 EXACT = 12
-"""Gauss points per panel for the field as exact as it is computed anywhere."""
+"""Number of Gauss points per panel of a block's outline, for errors of about 1e-12 of the field."""
 
 
 def external_field(magnet: Magnet, points: Floats) -> Floats:
-    """B (n, 3) in T at points (n, 3) in m of what the study has outside the magnet."""
+    """Return B (n, 3) in T of the study's external sources at points (n, 3) in m."""
     external = magnet.external
     field = np.tile(external.background_T, (len(points), 1)).astype(float)
     for neighbour in external.neighbours:
@@ -29,14 +32,33 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
 def neighbour_field(
     magnet: Magnet, neighbour: Neighbour, points: Floats, order: int = EXACT
 ) -> Floats:
-    """B (n, 3) in T of a magnet like the study's, in vacuum, by ``order`` Gauss points a panel."""
+    """Return B of a second magnet with the study's blocks, shifted along z and turned about z.
+
+    Its permeability is that of vacuum, and its remanence is scaled by ``neighbour.factor``.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    neighbour : Neighbour
+    points : ndarray, shape (n, 3), in m
+    order : int
+        Gauss points per panel of a block's outline.
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T
+    """
     turn = rotation_about_z(np.radians(neighbour.turn_deg))
-    seen = (points - [0.0, 0.0, neighbour.z_m]) @ turn
-    return np.asarray(neighbour.factor * field_of(magnet.blocks, seen, order) @ turn.T)
+    local_points = (points - [0.0, 0.0, neighbour.z_m]) @ turn
+    return np.asarray(neighbour.factor * field_of(magnet.blocks, local_points, order) @ turn.T)
 
 
 def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:
-    """B (n, 3) in T of a point dipole with a moment in A m^2 (Jackson, 3rd ed., eq. 5.56)."""
+    """Return B (n, 3) in T of a point dipole at points (n, 3) in m.
+
+    ``position`` (3,) is in m and ``moment`` (3,) in A m^2. See J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., eq. 5.56.
+    """
     offset = points - position
     distance = np.linalg.norm(offset, axis=1)[:, None]
     direction = offset / distance

@@ -41,7 +41,8 @@ def test_coarse_meshes_are_told_from_fine_ones(short_dipole, session):
         "kind": "circles", "radius_m": 0.05, "angles": 5, "z_min_m": -0.1, "z_max_m": 0.1,
         "count": 3}}
     study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.012, observation=observation)
-    fine, coarse = verify(build_magnet(study), session), verify(refined(study, 0.4), session)
+    fine, coarse = verify(build_magnet(study), session), verify(
+        refined(build_magnet(study), 0.4), session)
     assert fine.route == "azimuthal_modes"
     assert coarse.error_pointwise > 3 * fine.error_pointwise
     assert fine.error_pointwise < 1e-3

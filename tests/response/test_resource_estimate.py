@@ -71,23 +71,24 @@ def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
     study = studies[name]
     kind = MESHES[choose_route(build_magnet(study), observation_of(study).points)]
     build = mesh.build_meridian if kind == "meridian" else mesh.build_mesh
-    real = mesh.verify_mesh(build(study, tmp_path))
-    found = resource_estimate.counted(build_magnet(study), kind)
+    real = mesh.verify_mesh(build(build_magnet(study), tmp_path))
+    found = mesh.count_mesh(build_magnet(study), kind)
     assert (found.elements, found.inner, found.axis) == (len(real.cells), real.inner, real.axis)
+    assert (found.radius, found.half_length) == pytest.approx((real.radius, real.half_length))
 
 
 @pytest.mark.parametrize(("source", "finer"), [("quadrupole", 1), ("mri", 2), ("nonlinear-2d", 1)])
 def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
-    study = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
-    kind = "cross_section" if study.dimension == 2 else "extruded"
+    magnet = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
+    kind = "cross_section" if magnet.dimension == 2 else "extruded"
     monkeypatch.setattr(cross_section, "COUNTED", np.inf)
-    real, rim = geo.plane_size(build_magnet(study), kind)
+    real, rim = geo.plane_size(magnet, kind)
     monkeypatch.setattr(cross_section, "COUNTED", real / 4)
-    found, its_rim = geo.plane_size(build_magnet(study), kind)
+    found, its_rim = geo.plane_size(magnet, kind)
     assert found != real
     assert within(COUNT_FACTOR, found, real)
     assert within(1.5, its_rim, rim)  # a few of thousands
-    assert not within(COUNT_FACTOR, geo.plane_size(refined(build_magnet(study), 1.15), kind)[0],
+    assert not within(COUNT_FACTOR, geo.plane_size(refined(magnet, 1.15), kind)[0],
                       real)
 
 
@@ -135,17 +136,16 @@ def weighed(getdp, tmp_path):
                        "mesh__block_size_m": 0.05})])
 def test_the_memory_of_getdp(dipole, short_dipole, weighed, route, changes):
     study = (dipole if route == "cross_section" else short_dipole)(**changes)
-    points = observation_of(study).points
+    observation = observation_of(study)
     session, scales = weighed
-    finite_element_part(build_magnet(study), points, session, columns=False)
+    finite_element_part(build_magnet(study), observation.points, session, columns=False)
     peak = scales.peak
-    foretold = [max(one.memory_GiB
-                    for one in resource_estimate.nominal(build_magnet(variant), points, jobs=1))
-                for variant in (study, refined(build_magnet(study), 1.5),
-                                refined(build_magnet(study), 1 / 1.5))]
-    assert {problem.route for problem in resource_estimate.nominal(build_magnet(study), points,
-                                                                   jobs=1)} == {
-        route}
+    magnet = build_magnet(study)
+    runs = [[one for one in resource_estimate.estimate_solve(variant, observation, 1).problems
+             if one.what == "the study's mesh"]
+            for variant in (magnet, refined(magnet, 1.5), refined(magnet, 1 / 1.5))]
+    foretold = [max(one.memory_GiB for one in some) for some in runs]
+    assert {one.route for one in runs[0]} == {route}
     assert within(MEMORY_FACTOR, foretold[0], peak)
     assert not within(MEMORY_FACTOR, foretold[1], peak)
     assert not within(MEMORY_FACTOR, foretold[2], peak)
@@ -154,8 +154,8 @@ def test_the_memory_of_getdp(dipole, short_dipole, weighed, route, changes):
 def test_finer_and_more_takes_more(studies):
     study = studies["symmetry"]
     observation = observation_of(study)
-    base, finer = (resource_estimate.estimate_solve(build_magnet(one), observation, 1)
-                   for one in (study, refined(build_magnet(study), 1.5)))
+    base, finer = (resource_estimate.estimate_solve(one, observation, 1)
+                   for one in (build_magnet(study), refined(build_magnet(study), 1.5)))
     more_jobs = resource_estimate.estimate_solve(build_magnet(study), observation, 2)
     columns = resource_estimate.estimate_infer(build_magnet(study), observation, 1)
     for name in ("memory_GiB", "disk_GiB", "own_memory_GiB"):

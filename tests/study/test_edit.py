@@ -164,6 +164,9 @@ def test_a_file_that_cannot_be_changed_is_written_anew(monkeypatch):
 def test_impossible_studies_are_refused():
     study = parse_study(tomllib.loads(PLAIN))
     gap = EFFECTS["azimuthal_gap"]
-    narrow = gap.apply(study, gap.places(study)[0], [-1e-3])
+    with pytest.raises(StudyError, match=r"angular_gap_deg.*greater than or equal to 0"):
+        gap.apply(study, gap.places(study)[0], [-1e-3])
+    block = study.array.block.model_copy(update={"angular_gap_deg": -0.1})
+    narrow = study.model_copy(update={"array": study.array.model_copy(update={"block": block})})
     with pytest.raises(StudyError, match=r"angular_gap_deg.*greater than or equal to 0"):
         edited_text(PLAIN, [(narrow, "")])
