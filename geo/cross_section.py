@@ -8,6 +8,7 @@ import gmsh
 import numpy as np
 
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geo.element_size import set_element_sizes
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -90,7 +91,7 @@ def draw(
     _check_shared(surfaces)
     solid = {entity for pieces in surfaces.values() for entity in pieces}
     surfaces[tags.AIR_TAG] = [entity for _, entity in children[0] if entity not in solid]
-    _set_sizes(magnet)
+    set_element_sizes(magnet)
     return surfaces
 
 
@@ -142,7 +143,7 @@ def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> 
 def _equilateral(magnet: Magnet, radius: float) -> float:
     """Return the number of equilateral triangles of the wanted size that fill the disk.
 
-    The size depends on the radius as `_set_sizes` has it.
+    The size depends on the radius as `set_element_sizes` has it.
     """
     mesh, bore = magnet.study.mesh, magnet.array.inner_radius_m
     r = np.concatenate([[0.0], np.geomspace(bore, radius, 2000)])
@@ -190,30 +191,3 @@ def _surface(outline: Outline) -> int:
         else:
             curves.append(occ.addLine(*ends))
     return int(occ.addPlaneSurface([occ.addCurveLoop(curves)]))
-
-
-def _set_sizes(magnet: Magnet) -> None:
-    """Set the element sizes in Gmsh.
-
-    The size is constant in the bore and in the magnet, and grows linearly outside. The sizes are
-    Gmsh fields, because a Python callback would swallow Ctrl-C during meshing.
-    """
-    block_size = magnet.study.mesh.block_size_m
-    bore_size = magnet.study.mesh.bore_size_m or block_size
-    rise, outer_radius = magnet.study.mesh.growth - 1, magnet.radius
-    field = gmsh.model.mesh.field
-    constant, growing, bore = field.add("MathEval"), field.add("MathEval"), field.add("Cylinder")
-    field.setString(constant, "F", f"{block_size:.17g}")
-    field.setString(growing, "F",
-                    f"{block_size:.17g} + {rise:.17g} * (sqrt(x^2 + y^2) - {outer_radius:.17g})")
-    outside = field.add("Max")
-    field.setNumbers(outside, "FieldsList", [constant, growing])
-    finer = bore_size < block_size
-    for name, value in (("Radius", magnet.array.inner_radius_m * (1 - 1e-9)), ("ZAxis", 1.0),
-                        ("VIn", bore_size), ("VOut", 1e22 if finer else 0.0)):
-        field.setNumber(bore, name, value)
-    size = field.add("Min" if finer else "Max")
-    field.setNumbers(size, "FieldsList", [bore, outside])
-    field.setAsBackgroundMesh(size)
-    for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
-        gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)

@@ -1,1 +1,1 @@
-"""The update of a magnet by its measurements."""
+"""The inference of block magnetizations from measurements."""

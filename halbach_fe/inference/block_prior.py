@@ -1,15 +1,17 @@
 """The prior from moments of single blocks, measured before the magnet was assembled.
 
-A block alone demagnetizes itself. With H = -N M in it, the mean over its volume V,
-``B = mu_0 mu H + B_r`` gives ``m/V = (1 + (mu - 1) N)^-1 B_r / mu_0``, so that the model's
-parameter is ``M = B_r / (mu_0 mu) = mu^-1 (1 + (mu - 1) N) m / V``, mu and N being tensors. That
-the block is then magnetized uniformly is a mistake of second order in mu - 1: for a lone sector of
-the FASER dipole M comes out too large by 7e-5 at mu = 1.05 and 2e-3 at 1.3 (NGSolve, order 4),
-where leaving out N would be wrong by 1.5e-2 and 8e-2.
+The moment m of a block is corrected for the self-demagnetization of the single block. With the mean
+H = -N M over its volume V, ``B = mu_0 mu H + B_r`` gives ``m/V = (1 + (mu - 1) N)^-1 B_r / mu_0``.
+The parameter of the model is therefore ``M = B_r / (mu_0 mu) = mu^-1 (1 + (mu - 1) N) m / V``,
+where mu and N are tensors. The formula assumes that the block is magnetized uniformly, an error of
+second order in mu - 1: for a single sector of the FASER dipole M is too large by 7e-5 at mu = 1.05
+and by 2e-3 at mu = 1.3 (NGSolve, order 4). Without the correction the errors would be 1.5e-2 and
+8e-2.
 
 Deviations from the nominal magnetization are taken along it, across it in the plane of the ring,
-and along z. Where every block's place is known, its own measurement is its prior. Where it is not,
-the blocks of one type are samples of a normal distribution.
+and along z. If the place of every block is known, the prior of a block is its own measurement.
+Otherwise the measured blocks of a type are samples of a normal distribution, which is the prior of
+all blocks of that type.
 """
 
 from __future__ import annotations
@@ -42,12 +44,15 @@ DIRECTIONS = ("along", "across", "z")
 """Axes of deviations: along the nominal magnetization, across it in the ring's plane, and z."""
 
 MIN_SAMPLES = 3
+"""Smallest number of measured blocks of a type from which its distribution is estimated."""
+
 NOT_NORMAL = 0.05
-"""Adjusted p-value below which samples are called not normal: one healthy table in twenty."""
+"""Adjusted p-value below which samples count as not normal. A table of normally distributed blocks
+is suspected in 5 % of all cases."""
 
 FAR = 0.5
-"""Deviation over the nominal magnetization that no good block has: 50 %, or 29 degrees. It stands
-for another unit, other axes, or another type."""
+"""Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
+block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +62,15 @@ class TypeSamples:
     Attributes
     ----------
     label : str
+        Name of the type.
     deviations : ndarray, shape (n, d)
-        From the nominal magnetization and relative to it, along `DIRECTIONS`; across it they are
-        angles in rad.
+        Relative deviations from the nominal magnetization, along `DIRECTIONS`; the deviations
+        across it are angles in rad.
     intensity : float or None
-        Of the shrinkage, if the covariance is that of the samples.
+        Intensity of the shrinkage of the covariance, if it is estimated from the samples.
     p : ndarray, shape (d,)
-        Anderson and Darling's p-values, adjusted for all types and directions; NaN if not tested.
+        p-values of the Anderson-Darling test for each direction, adjusted for the number of types
+        and directions; NaN if a direction was not tested.
     """
 
     label: str
@@ -73,21 +80,22 @@ class TypeSamples:
 
     @property
     def normal(self) -> bool:
-        """Whether no direction is unlikely to be normal; true too where nothing was tested."""
+        """Whether the test rejects normality in no direction; True if nothing was tested."""
         return not (self.p < NOT_NORMAL).any()
 
 
 @dataclass(frozen=True)
 class MeasuredPrior:
-    """What a table of blocks tells about a study's magnetizations.
+    """The prior of a study's magnetizations that follows from a table of measured blocks.
 
     Attributes
     ----------
     gaussian : Gaussian
-        Of the parameters, block by block, in A/m.
+        Prior of the parameters, block by block, in A/m.
     nominal : ndarray, shape (parameters,), in A/m
+        Nominal magnetization.
     placed : bool
-        Whether it is each block's own measurement, instead of that of its type.
+        Whether the prior of a block is its own measurement, not the distribution of its type.
     types : tuple of TypeSamples
     """
 
@@ -98,24 +106,33 @@ class MeasuredPrior:
 
     @property
     def count(self) -> int:
-        """Measured blocks."""
-        return sum(len(one.deviations) for one in self.types)
+        """Number of measured blocks."""
+        return sum(len(samples.deviations) for samples in self.types)
 
 
 def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     """Turn a table of measured blocks into the prior of a study.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    table : BlockTable
+
+    Returns
+    -------
+    MeasuredPrior
 
     Raises
     ------
     MeasurementError
         If the table does not fit the study.
     StudyError
-        If the blocks of a type are not alike in the study.
+        If the study's blocks of a type differ from each other.
 
     Warns
     -----
     HalbachWarning
-        If a type's samples stand for its blocks, but do not look normal.
+        If the prior is the distribution of the samples of a type that do not look normal.
     """
     meant = _prior_as_meant(as_meant(magnet), table)
     size = magnet.dimension
@@ -129,7 +146,7 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
 
 
 def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
-    """The same of a magnet whose blocks were mounted as meant."""
+    """Return the prior of a magnet whose blocks are all mounted in their intended slots."""
     blocks, size = magnet.blocks, magnet.dimension
     slots = types_of(magnet)
     _check_types(magnet, table, slots)
@@ -166,34 +183,36 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
                               np.radians(magnet.study.prior.mounting_sd_deg),
                               magnet.study.prior.common_mode_sd)
     types = _tested(members, intensities)
-    odd = [one.label for one in types if not one.normal]
+    odd = [samples.label for samples in types if not samples.normal]
     if odd and not placed:
         warnings.warn(
             f"The measured blocks of type {', '.join(odd)} do not look normally distributed "
-            f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior takes them so: give "
-            "ring and slot of every block.", HalbachWarning, stacklevel=2)
+            f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior assumes that they "
+            "are: give ring and slot of every block.", HalbachWarning, stacklevel=2)
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     return MeasuredPrior(gaussian, nominal, placed, types)
 
 
 def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
-    """What a table tells of blocks that are not mounted yet, wherever in their type's slots.
+    """Return the magnetizations of measured blocks that are not mounted yet.
+
+    They are given in the axes of the block's faces, so that they hold for any slot of its type.
 
     Returns
     -------
     mean : ndarray, shape (rows, d), in A/m
-        Along the axes of the block's faces: x radially outward, y azimuthal, z, but of cuboids
-        that follow their magnetization x along that. A row without a place has its moment as
-        mounted in the first slot of its type.
+        x points radially outward, y is azimuthal, and z along the magnet. For cuboids that are
+        oriented along their magnetization, x points along it. The moment of a row without a place
+        is taken to be given in the axes of the first slot of its type.
     root : ndarray, shape (rows, d, d), in A/m
-        Of the covariance of each, the calibration of the coil not included.
+        Root of the covariance of each row, without the error of the coil's calibration.
 
     Raises
     ------
     MeasurementError
         If the table does not fit the study.
     StudyError
-        If the blocks of a type are not alike in the study.
+        If the study's blocks of a type differ from each other.
     """
     magnet = as_meant(magnet)
     blocks, slots, size = magnet.blocks, types_of(magnet), magnet.dimension
@@ -211,8 +230,20 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
 
 
 def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
-    """Moments (rows, 3) in A m^2 in the own axes of slots (rows,), from 0, ring by ring, that are
-    not those of the table: blocks keep their faces where a slot has them.
+    """Return the moments of blocks in the axes of new slots.
+
+    A block keeps the orientation of its faces relative to those of the slot.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    table : BlockTable
+    places : ndarray of int, shape (rows,)
+        New slot of each block, counted from 0, ring by ring.
+
+    Returns
+    -------
+    ndarray, shape (rows, 3), in A m^2
     """
     array, index = magnet.array, _block_of_rows(magnet, table, types_of(magnet))
 
@@ -228,7 +259,7 @@ def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
 def _tested(
     members: dict[str, Floats], intensities: dict[str, float | None]
 ) -> tuple[TypeSamples, ...]:
-    """The samples of every type with their tests of normality."""
+    """Return the samples of every type with their tests of normality."""
     p = holm(np.array([anderson_darling(column)[1] for samples in members.values()
                        for column in samples.T])).reshape(len(members), -1)
     return tuple(TypeSamples(label, samples, intensities[label], row)
@@ -236,20 +267,23 @@ def _tested(
 
 
 def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
-    """Slots of every type of block, by its label."""
+    """Return the slots of every type of block, by the label of the type."""
     return magnet.study.prior.types or {
         str(slot): (slot,) for slot in range(1, magnet.array.blocks_per_ring + 1)}
 
 
 def _frame(block: MagnetBlock) -> Floats:
-    """`DIRECTIONS` of a block as columns (3, 3), as long as its nominal magnetization in A/m."""
+    """Return `DIRECTIONS` as columns (3, 3) of the length of the nominal magnetization in A/m."""
     x, y, _ = block.easy_axis
     axes = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
     return axes * float(np.linalg.norm(block.magnetization))
 
 
 def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
-    """``mu^-1 (1 + (mu - 1) N)`` from axes turned about z to the array's, (3, 3)."""
+    """Return ``mu^-1 (1 + (mu - 1) N)`` (3, 3), with N the demagnetizing ``tensor`` of the block.
+
+    It maps vectors in axes that are turned about z by ``angle_deg`` to vectors in the array's axes.
+    """
     mu = block.recoil_tensor
     inside = np.eye(3) + (mu - np.eye(3)) @ tensor
     return np.asarray(np.linalg.solve(mu, inside) @ rotation_about_z(np.radians(angle_deg)))
@@ -258,7 +292,10 @@ def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
 def _conversions(
     magnet: Magnet, table: BlockTable, blocks: tuple[MagnetBlock, ...], index: Ints
 ) -> Floats:
-    """From measured moments in A m^2 to M in A/m along the array's axes, (rows, 3, 3)."""
+    """Return the matrices (rows, 3, 3) from measured moments in A m^2 to M in A/m.
+
+    M is along the array's axes. In 2D blocks get the length of the rings or of their volume.
+    """
     real = []
     for row, number in enumerate(index):
         block, volume = blocks[number], table.volume[row]
@@ -283,7 +320,10 @@ def _conversions(
 
 
 def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
-    """Moments (rows, 3) in A m^2 at the study's reference temperature, or as they are."""
+    """Return the moments (rows, 3) in A m^2 at the study's reference temperature.
+
+    They are not changed if the study has no temperature coefficient.
+    """
     coefficient = magnet.study.prior.temperature_coefficient_per_K
     reference = magnet.study.prior.reference_temperature_C
     if coefficient is None or reference is None:  # the study has both or neither
@@ -298,7 +338,7 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
 
 
 def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
-    """Types and places must be those of the study."""
+    """Raise a MeasurementError if a type or place is not in the study."""
     array = magnet.array
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
         if label not in slots:
@@ -318,11 +358,11 @@ def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, 
 
 
 def _check_complete(magnet: Magnet, table: BlockTable) -> None:
-    """If some blocks have a place, all must be there."""
+    """Raise a MeasurementError if some blocks have a place but not every place has a block."""
     array = magnet.array
-    wanted = {(ring, slot) for ring in range(1, array.rings + 1)
+    places = {(ring, slot) for ring in range(1, array.rings + 1)
               for slot in range(1, array.blocks_per_ring + 1)}
-    missing = sorted(wanted - set(table.places))
+    missing = sorted(places - set(table.places))
     if table.ring.any() and missing:
         raise MeasurementError(must_be(
             "places", table.source, "given for every block of the magnet, or for none",
@@ -330,14 +370,14 @@ def _check_complete(magnet: Magnet, table: BlockTable) -> None:
 
 
 def _block_of_rows(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
-    """Which of the study's blocks each row is, or, without a place, the first of its type."""
+    """Return the block number (rows,) of each row; without a place, the first of its type."""
     return np.array([
         max(ring - 1, 0) * magnet.array.blocks_per_ring + (slot or slots[label][0]) - 1
         for label, (ring, slot) in zip(table.type, table.places, strict=True)])
 
 
 def _check_near(table: BlockTable, deviations: Floats) -> None:
-    """Refuse a block that is nothing like the study's."""
+    """Raise a MeasurementError if a block deviates from its nominal magnetization by over `FAR`."""
     ratios = np.linalg.norm(deviations + np.eye(3)[0], axis=1)
     far = np.flatnonzero(np.linalg.norm(deviations, axis=1) > FAR)
     if not len(far):
@@ -356,7 +396,7 @@ def _check_near(table: BlockTable, deviations: Floats) -> None:
 
 
 def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
-    """Samples of a type must be enough, and tell how much they differ."""
+    """Raise a MeasurementError if a type has too few samples, or samples without any spread."""
     if len(deviations) < MIN_SAMPLES:
         raise MeasurementError(must_be(
             f"blocks of type {label}", table.source,
@@ -374,8 +414,10 @@ def _check_alike(
     magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float],
     hint: str
 ) -> None:
-    """Blocks of one type must be the same block, as seen from their own axes, which are turned by
-    ``axes`` of their slot: a moment must mean the same deviation from the nominal magnetization.
+    """Raise a StudyError if the study's blocks of a type differ, seen from their own axes.
+
+    The axes of a block are turned about z by the angle that ``axes`` returns for its slot. A moment
+    must mean the same deviation from the nominal magnetization for all blocks of a type.
     """
     blocks = magnet.blocks
     finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block

@@ -1,4 +1,4 @@
-"""From a study and a measured map to the updated magnet."""
+"""The inference: from a magnet and a measured map to the posterior of its magnetizations."""
 
 from __future__ import annotations
 
@@ -42,10 +42,12 @@ from halbach_fe.stats.linear_gaussian import predict
 from halbach_fe.stats.noise import NoiseCovariance
 
 LINEAR_ENOUGH = 0.3
-"""Of the error bar: what linearizing the iron may move a reading without a word."""
+"""Error that the linearization of the iron may cause in a reading, relative to its error bar; a
+larger error causes a warning."""
 
 LEFT_OUT = 0.02
-"""Of a variance, 1 % of a standard deviation: what may be left out without a word."""
+"""Relative change of a posterior variance (1 % of a standard deviation) that discarded information
+may cause; a larger change causes a warning."""
 
 
 def infer(
@@ -59,22 +61,38 @@ def infer(
     ----------
     magnet : Magnet
     data : Dataset
-        As `halbach_fe.measurement.field_map.read_map` returns it.
+        The measured map, see `halbach_fe.read_map`.
     session : Session
         Its folder receives the mesh, the run folders and the response matrix.
     blocks : BlockTable, optional
-        Measured blocks, whose prior takes the place of the study's.
+        Measured blocks, whose prior replaces the study's.
     prior : Gaussian, optional
-        Of the parameters in A/m, in place of both.
+        Prior of the parameters in A/m, which replaces those of the study and of ``blocks``.
     linearized_only : bool
-        Do not solve the updated magnet to see whether linearizing its iron was good enough.
+        Skip the solve of the updated magnet that checks whether its iron is linear enough.
     validation_map : Dataset, optional
-        Another map, which is only predicted; see `halbach_fe.measurement.observation.predicted_as`.
+        Another map, which is predicted but does not update the model; see
+        `halbach_fe.measurement.observation.study_for_validation_map`.
+
+    Returns
+    -------
+    InferenceResult
+        Prior and posterior of the magnetizations, and the readings that both predict.
 
     Raises
     ------
+    StudyError
+        If the study does not describe the noise of the readings.
     MeasurementError
-        If a map or the blocks do not fit the study.
+        If a map or the blocks do not fit the study, or points of a map are not in air within the
+        meshed region.
+    GetDPError
+        If GetDP fails, or its answer does not pass verification.
+
+    Warns
+    -----
+    HalbachWarning
+        If the iron is not linear enough, or discarded information may change the posterior.
 
     Examples
     --------
@@ -88,7 +106,7 @@ def infer(
     study = magnet.study
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
     observation, noise, readings, parts = _read_maps(magnet, data, validation_map)
-    keep = np.array(parts) != TRAINING
+    training = np.array(parts) == TRAINING
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
         names = [region.name for region in study.noise.regions]
@@ -98,40 +116,42 @@ def infer(
         model = response_matrix(magnet, observation, session)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
-    before = prior or (of_blocks.gaussian if of_blocks else nominal_prior(
+    prior_used = prior or (of_blocks.gaussian if of_blocks else nominal_prior(
         model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
         study.prior.common_mode_sd))
     errors = noise.with_independent_errors(model.error)
-    learnt = linear_gaussian.update(
-        model.matrix, (readings - model.offset)[~keep], errors.subset(~keep), before,
-        np.flatnonzero(~keep))
-    after = learnt.distribution
-    if learnt.discarded_information > LEFT_OUT:
+    update = linear_gaussian.update(
+        model.matrix, (readings - model.offset)[training], errors.subset(training), prior_used,
+        np.flatnonzero(training))
+    posterior = update.distribution
+    if update.discarded_information > LEFT_OUT:
         warnings.warn(
-            f"Of so many parameters and readings of study {study.name} some combinations were left "
-            f"out, which together may change a variance by {learnt.discarded_information:.1g} of "
-            "itself.",
+            f"Study {study.name} has so many parameters and readings that some combinations of "
+            "readings were discarded, which may change a posterior variance by a fraction of up to "
+            f"{update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
     if magnet.is_nonlinear and not linearized_only:
-        _check_linearization(magnet, observation, session, model, after.mean, errors.sd)
+        _check_linearization(magnet, observation, session, model, posterior.mean, errors.sd)
     return InferenceResult(
         magnet=magnet, observation=observation, readings=readings, noise=noise, parts=parts,
-        regions=regions, response=model, prior=before, posterior=after,
-        prediction_prior=_predict(model, before), prediction_posterior=_predict(model, after),
-        prior_conflict=learnt.prior_conflict, parameters_learnt=learnt.parameters_learnt,
-        log_evidence=learnt.log_evidence,
+        regions=regions, response=model, prior=prior_used, posterior=posterior,
+        prediction_prior=_predict(model, prior_used),
+        prediction_posterior=_predict(model, posterior),
+        prior_conflict=update.prior_conflict, parameters_learnt=update.parameters_learnt,
+        log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None,
-        left_out=learnt.discarded_information)
+        left_out=update.discarded_information)
 
 
 def observation_of(
     magnet: Magnet, data: xr.Dataset, blocks: BlockTable | None = None,
     validation_map: xr.Dataset | None = None,
 ) -> Observation:
-    """What `infer` would update with and predict, its inputs checked as there.
+    """Return the observation of all readings of `infer`, with the same checks of its inputs.
 
-    What uncertain positions add to the noise, the slow part of reading a map, is left out.
+    The noise that uncertain positions cause is left out, because its computation is the slow part
+    of reading a map.
     """
     if blocks is not None:
         prior_from_blocks(magnet, blocks)
@@ -144,18 +164,22 @@ def observation_of(
 def _read_maps(
     magnet: Magnet, data: xr.Dataset, validation_map: xr.Dataset | None
 ) -> tuple[Observation, NoiseCovariance, Floats, tuple[str, ...]]:
-    """A map, and one that is only predicted: with noise, readings in T, and the part of each."""
+    """Return the observation, noise, readings in T, and parts of a map and a validation map.
+
+    The part of a reading is `TRAINING`, `HELD_OUT` or, in the validation map, `HELD_OUT_MAP`.
+    """
     observation, noise, readings = _read_map(magnet, data,
                                              excluded_components(magnet.study, data.sizes["point"]))
-    keep = held_out_readings(magnet.study, observation)
-    parts = tuple(np.where(keep, HELD_OUT, TRAINING).tolist())
+    held_out = held_out_readings(magnet.study, observation)
+    parts = tuple(np.where(held_out, HELD_OUT, TRAINING).tolist())
     if validation_map is not None:
-        other, its_noise, its_readings = _read_map(
+        validation, validation_noise, validation_readings = _read_map(
             magnet.with_study(study_for_validation_map(magnet.study, validation_map)),
             validation_map, np.zeros((validation_map.sizes["point"], 3), bool), "held-out map")
-        observation, noise = concatenate(observation, other), noise.stacked_with(its_noise)
-        readings = np.concatenate([readings, its_readings])
-        parts += (HELD_OUT_MAP,) * len(other)
+        observation = concatenate(observation, validation)
+        noise = noise.stacked_with(validation_noise)
+        readings = np.concatenate([readings, validation_readings])
+        parts += (HELD_OUT_MAP,) * len(validation)
     heights = observation.points[:, 2]
     if magnet.dimension == 2 and np.ptp(heights) > 0:
         raise MeasurementError(must_be(
@@ -168,8 +192,9 @@ def _read_maps(
 def _read_map(
     magnet: Magnet, data: xr.Dataset, left_out: NDArray[np.bool_], where: str = "map"
 ) -> tuple[Observation, NoiseCovariance, Floats]:
-    """A map as the study observes it but for components (n, 3) that are left out, with its noise
-    and its readings in T.
+    """Return the study's observation of a map, its noise, and its readings in T.
+
+    ``left_out`` (n, 3) marks the components of the map that are not used.
     """
     data = in_si_and_magnet_axes(magnet.study.instrument, data)
     observation = observe(
@@ -189,6 +214,7 @@ def _read_map(
 
 
 def _predict(model: Response, parameters: Gaussian) -> Prediction:
+    """Return the prediction of all readings from a distribution of the magnetizations in A/m."""
     mean, sd = predict(model.matrix, parameters)
     return Prediction(model.offset + mean, sd, lambda rows: model.matrix[rows] @ parameters.root,
                       parameters.root.shape[1])
@@ -198,12 +224,12 @@ def _check_linearization(
     magnet: Magnet, observation: Observation, session: Session, model: Response, mean: Floats,
     sigma: Floats,
 ) -> None:
-    """Warn if iron is so far from linear that the posterior's readings show it."""
+    """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
     folder = replace(session, folder=session.folder / "posterior")
     true = newton_readings(magnet, observation, folder, mean[None])[0]
     worst = float((np.abs(model.offset + model.matrix @ mean - true) / sigma).max())
     if worst > LINEAR_ENOUGH:
         warnings.warn(
-            f"The iron is linearized about the nominal magnet, which moves a reading of the updated"
-            f" one by {worst:.2g} of its error bar: study {magnet.name} needs the non-linear "
+            "The iron is linearized about the nominal magnet, which changes a reading of the "
+            f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the non-linear "
             "posterior.", HalbachWarning, stacklevel=2)

@@ -1,7 +1,7 @@
-"""From a study and a measured map to the updated magnet: the inference, and how well it predicts.
+"""The result of an inference, and scores of how well it predicts the readings.
 
-Readings are split into those that update the model and those held out; both are predicted by the
-prior and by the posterior, with error bars, and compared region by region.
+Some readings (training) update the model, the others are held out. Prior and posterior predict all
+of them, with error bars, and the predictions are compared with the readings region by region.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 
 ALL_READINGS = "all"
-"""The one region of a study without noise regions."""
+"""Name of the only region of a study without noise regions."""
 
 TRAINING, HELD_OUT, HELD_OUT_MAP = "training", "held out", "held-out map"
+"""The parts of the readings: those that update the model, those of the same map that are held out,
+and those of a validation map."""
 
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
@@ -45,14 +47,16 @@ PREDICTION_COLUMNS = (
 
 @dataclass(frozen=True)
 class Prediction:
-    """Readings as a model foretells them, without noise.
+    """The distribution of the readings that a model predicts, without their noise.
 
     Attributes
     ----------
     mean, sd : ndarray, shape (readings,), in T
     root : callable
-        Indices (c,) of readings to these rows (c, columns) of a root of their covariance, in T.
+        Returns the rows (c, columns), in T, of a root of the covariance for indices (c,) of
+        readings.
     columns : int
+        Number of columns of the root.
     """
 
     mean: Floats
