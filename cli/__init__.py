@@ -20,7 +20,7 @@ VERBS = {
     "tolerance": "tolerance", "demagnetization": "demagnetization",
     "simulate-measurement": "simulate_measurement", "import-map": "import_map", "export": "export",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
-"""Module of each verb."""
+"""Name of the module of each verb."""
 
 
 def module_of(verb: str) -> ModuleType:
@@ -29,9 +29,10 @@ def module_of(verb: str) -> ModuleType:
 
 
 def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
-    """The command line, with the options of some verbs; of the others only their first line.
+    """Return the parser of the command line, with the options of some verbs.
 
-    Only the modules of these verbs are imported: they may import much.
+    Of all other verbs it has only the help text. Only the modules of ``verbs`` are imported,
+    because some of them import large libraries.
     """
     codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
     top = argparse.ArgumentParser(
@@ -49,13 +50,13 @@ def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
 
 
 def _docstring(module: str) -> str:
-    """Docstring of a verb's module, without importing it."""
+    """Return the docstring of a verb's module, without importing the module."""
     source = Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
     return ast.get_docstring(ast.parse(source)) or ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; return its exit code (`halbach_fe.core.errors.EXIT_CODES`)."""
+    """Run the verb of a command line; return its exit code, see `EXIT_CODES` in core.errors."""
     words = sys.argv[1:] if argv is None else argv
     arguments = parser([word for word in words if word in VERBS][:1]).parse_args(words)
     return common.guarded(lambda: int(module_of(arguments.verb).run(arguments)))

@@ -1,7 +1,7 @@
-"""What the verbs share: options, progress, tables.
+"""Functions that all verbs share: options, exit codes, sessions, progress bars, tables.
 
-Modules of the command line import little at their top, so that help and completion come at once;
-what computes is imported by the functions that use it.
+Modules of the command line import little at their top, so that help and completion appear without
+delay. Functions that compute something import the modules that they need themselves.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 import math
+import mmap
 import multiprocessing
 import os
 import resource
@@ -44,37 +45,41 @@ if TYPE_CHECKING:
     from halbach_fe.solver.getdp_cache import Cache
     from halbach_fe.solver.session import Session
 
+BLAS_BUFFER_BYTES = 128 * 2**20
+"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread and
+library, on two threads."""
+
 MAX_ORDER = 100
-"""Of a multipole: beyond, nothing is left of it in the bore."""
+"""Highest order of a multipole. Higher orders are negligible in the bore."""
 
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """STUDY, -o, and the options of every verb that solves."""
+    """Add STUDY, -o, --json, and the options of every verb that solves."""
     add_study_and_output(parser)
     add_solver_arguments(parser)
     add_json_argument(parser)
 
 
 def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
-    """--dry-run."""
+    """Add --dry-run."""
     parser.add_argument("--dry-run", action="store_true",
                         help="estimate memory, time and disk; nothing is solved or written")
 
 
 def print_estimate(estimate: Estimate, as_json: bool) -> int:
-    """Print what a run will take, and warn if memory is not enough; return the exit code."""
+    """Print the estimated cost of a run, and warn if it needs too much memory; return 0."""
     from halbach_fe.response.resource_estimate import TIME_FACTOR
 
     if as_json:
         print_json(estimate.as_dict())
     else:
         print_table([{
-            "mesh": one.what, "route": one.route, "elements": str(one.elements),
-            "unknowns": str(one.unknowns), "processes": str(one.processes),
-            "solves each": str(one.solves), "GiB each": f"{one.memory_GiB:.2g}",
-            "s each": f"{one.seconds:.2g}"} for one in estimate.problems], "Runs of GetDP")
+            "mesh": problem.what, "route": problem.route, "elements": str(problem.elements),
+            "unknowns": str(problem.unknowns), "processes": str(problem.processes),
+            "solves each": str(problem.solves), "GiB each": f"{problem.memory_GiB:.2g}",
+            "s each": f"{problem.seconds:.2g}"} for problem in estimate.problems], "Runs of GetDP")
         available = estimate.available_GiB
-        print_table([{"what": what, "value": value} for what, value in {
+        print_table([{"quantity": quantity, "value": value} for quantity, value in {
             "route": estimate.route, "blocks": str(estimate.blocks),
             "readings": str(estimate.readings), "parameters": str(estimate.parameters),
             "GetDP processes": f"{estimate.processes}, up to {estimate.jobs} at a time",
@@ -90,26 +95,27 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
 
 
 def add_solver_arguments(parser: argparse.ArgumentParser) -> None:
-    """How GetDP is run: --jobs, --mpi, --time-limit, --scheduler, --cache, --getdp."""
+    """Add the options of GetDP's runs: --jobs, --mpi, --scheduler, --cache, --getdp and so on."""
     parser.add_argument("--jobs", type=positive, metavar="N",
-                        help="runs of GetDP at a time (default: 2, or one for each core of the "
-                        "--scheduler's workers)")
+                        help="number of GetDP runs at a time (default: 2, or with --scheduler the "
+                        "number of cores of its workers)")
     parser.add_argument("--mpi", type=positive, default=1, metavar="N",
-                        help="MPI processes that share each run, for solves that are too large for "
-                        "one (default: %(default)s)")
+                        help="number of MPI processes that share each run, for solves that are too "
+                        "large for a single process (default: %(default)s)")
     parser.add_argument("--scheduler", metavar="ADDRESS",
-                        help="Dask scheduler, whose workers run GetDP in place of this machine")
+                        help="Dask scheduler whose workers run GetDP instead of this machine")
     parser.add_argument("--cache", type=Path, metavar="DIR",
-                        help="folder where answers of GetDP are kept (default: $HALBACH_FE_CACHE, "
+                        help="folder of the cache of GetDP's answers (default: $HALBACH_FE_CACHE, "
                         "then ~/.cache/halbach-fe)")
-    parser.add_argument("--no-cache", action="store_true", help="neither use nor keep any")
+    parser.add_argument("--no-cache", action="store_true",
+                        help="neither read nor write the cache of GetDP's answers")
     parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
-                        help="for each GetDP process (default: %(default)g)")
+                        help="time limit of each GetDP process in s (default: %(default)g)")
     add_getdp_argument(parser)
 
 
 def add_study_and_output(parser: argparse.ArgumentParser) -> None:
-    """STUDY and -o."""
+    """Add STUDY and -o."""
     parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
                         help="folder for results; made if it does not exist")
@@ -121,7 +127,7 @@ def run_study(
 ) -> int:
     """Parse the command line of a shipped study and run it; return the exit code.
 
-    ``options`` adds the study's own.
+    ``options`` adds the study's own options to the parser.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.set_defaults(study=study)
@@ -134,43 +140,44 @@ def run_study(
 
 
 def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
-    """--getdp."""
+    """Add --getdp."""
     parser.add_argument("--getdp", metavar="PATH",
                         help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
 
 
 def digest(path: Path) -> str:
-    """A file's name and its SHA-256, for the provenance of a page."""
+    """Return the name of a file and its SHA-256, for the provenance of a page."""
     return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
 
 
 def digests(files: Mapping[str, Path | None]) -> dict[str, str]:
-    """`digest` of files by what they are, as far as they were given."""
-    return {what: digest(path) for what, path in files.items() if path is not None}
+    """Return the `digest` of each file by its description; None stands for a file not given."""
+    return {name: digest(path) for name, path in files.items() if path is not None}
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
-    """--json."""
+    """Add --json."""
     parser.add_argument("--json", action="store_true", help="print results as JSON")
 
 
 def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where multipoles are taken, which, and how small they should be."""
+    """Add the options of multipoles: their reference, and the limit of unwanted multipoles."""
     parser.add_argument("--reference-radius-m", type=positive_number, metavar="R",
-                        help="reference radius of the multipoles (default: that of the study's "
-                        "circle, or two thirds of the bore)")
+                        help="reference radius of the multipoles in m (default: that of the "
+                        "study's circle, or two thirds of the inner radius of the blocks)")
     parser.add_argument("--orders", type=orders, metavar="N..M",
-                        help="orders of unwanted multipoles, 1 the dipole, as 2..10 or 3,5,7; the "
-                        "magnet's own does not count (default: 1..10)")
+                        help="orders of the unwanted multipoles, 1 for the dipole, for example "
+                        "2..10 or 3,5,7; the magnet's main order is ignored (default: 1..10)")
     parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
-                        help="in 3D: multipoles of the circle at Z, in place of the field "
-                        "integrated along z")
+                        help="in 3D: multipoles on the circle at Z in m, instead of those of the "
+                        "field integrated along z")
     parser.add_argument("--limit-units", type=positive_number, metavar="U",
-                        help="largest unwanted multipole allowed, in units of 1e-4 of the main one")
+                        help="largest unwanted multipole that is allowed, in units of 1e-4 of the "
+                        "main multipole")
 
 
 def reference(arguments: argparse.Namespace) -> MultipoleReference:
-    """The reference that the options of `add_multipole_arguments` describe."""
+    """Return the reference that the options of `add_multipole_arguments` describe."""
     from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
 
     return MultipoleReference(arguments.reference_radius_m, arguments.orders or DEFAULT_ORDERS,
@@ -178,7 +185,7 @@ def reference(arguments: argparse.Namespace) -> MultipoleReference:
 
 
 def add_measurement_arguments(parser: argparse.ArgumentParser) -> None:
-    """--measurements and --blocks."""
+    """Add --measurements and --blocks."""
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
     parser.add_argument("--blocks", type=Path, metavar="CSV",
@@ -187,15 +194,16 @@ def add_measurement_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
-    """--held-out."""
+    """Add --held-out."""
     parser.add_argument("--held-out", type=Path, metavar="MAP",
-                        help="another map, which is only predicted, at positions of its own")
+                        help="another map at other positions, which is predicted but does not "
+                        "update the model")
 
 
 def measurements(
     arguments: argparse.Namespace,
 ) -> tuple[xr.Dataset, BlockTable | None, xr.Dataset | None]:
-    """Read the map, the table of blocks, and the map that is only predicted, as far as given."""
+    """Read the map, the block table and the held-out map; None stands for a file not given."""
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.field_map import read_map
 
@@ -206,20 +214,20 @@ def measurements(
 
 
 def add_seed_argument(parser: argparse.ArgumentParser) -> None:
-    """--seed."""
+    """Add --seed."""
     parser.add_argument("--seed", type=positive, default=1, metavar="N",
-                        help="of all random numbers (default: %(default)s)")
+                        help="seed of the random numbers (default: %(default)s)")
 
 
 def orders(text: str) -> tuple[int, ...]:
     """Parse orders of multipoles: ``2..10``, ``3,5,7``, or both."""
-    found: list[int] = []
+    numbers: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("..")
-        found += range(int(first), int(last or first) + 1)
-    if not found or min(found) < 1 or max(found) > MAX_ORDER:
+        numbers += range(int(first), int(last or first) + 1)
+    if not numbers or min(numbers) < 1 or max(numbers) > MAX_ORDER:
         raise argparse.ArgumentTypeError(f"must be orders from 1 to {MAX_ORDER}, not {text}")
-    return tuple(sorted(set(found)))
+    return tuple(sorted(set(numbers)))
 
 
 def count(text: str) -> int:
@@ -228,7 +236,7 @@ def count(text: str) -> int:
 
 
 def finite_number(text: str) -> float:
-    """Parse a number."""
+    """Parse a finite number."""
     value = float(text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"must be finite, not {text}")
@@ -256,9 +264,10 @@ def positive_number(text: str) -> float:
 
 
 def guarded(run: Callable[[], int]) -> int:
-    """Run something and return its exit code; errors become one sentence on stderr.
+    """Call a function and return its exit code; print errors as a single sentence on stderr.
 
-    A closed terminal and SIGTERM end it like Ctrl-C: GetDP is stopped, nothing is left half-made.
+    SIGTERM and the closing of the terminal act like Ctrl-C: GetDP is stopped, and no result is left
+    half-written.
     """
     signals = (signal.SIGTERM, signal.SIGHUP)
     previous = [signal.signal(number, signal.default_int_handler) for number in signals]
@@ -277,9 +286,9 @@ def guarded(run: Callable[[], int]) -> int:
     except BrokenPipeError:
         return 0
     except Exception as error:
-        if _for_want_of_memory(error):
+        if _is_out_of_memory(error):
             say(f"error: There is not enough memory ({str(error) or 'it ran out'}). --dry-run "
-                "foretells what solve, infer and verify need; use a coarser mesh, fewer readings "
+                "estimates what solve, infer and verify need; use a coarser mesh, fewer readings "
                 "or --jobs 1.")
             return OUT_OF_MEMORY
         traceback.print_exc()
@@ -290,28 +299,42 @@ def guarded(run: Callable[[], int]) -> int:
             signal.signal(number, handler)
 
 
-def _for_want_of_memory(error: Exception) -> bool:
-    """Whether that is the cause; of libraries and threads only the text tells."""
+def _is_out_of_memory(error: Exception) -> bool:
+    """Tell whether an error means that memory ran out.
+
+    Errors of loading a library and of starting a thread are recognized by their text only.
+    """
     return (isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
             or any(text in str(error) for text in (
                 "failed to map segment", "can't start new thread")))
 
 
 def _claim_buffers() -> None:
-    """Under a limit of memory, have OpenBLAS take what it needs while there is some: it keeps that,
-    and where it gets nothing it tries forever.
+    """If the memory of this process is limited, have OpenBLAS allocate its buffers now.
+
+    OpenBLAS keeps its buffers. If it cannot allocate them, it retries forever; so the memory for
+    them is asked for here first.
+
+    Raises
+    ------
+    MemoryError
+        If there is not enough for the buffers.
     """
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
         import numpy as np
         import scipy.linalg as linalg
 
-        some = np.eye(200)  # numpy and scipy have one each
-        linalg.cholesky(some @ some)
+        try:
+            mmap.mmap(-1, BLAS_BUFFER_BYTES).close()
+        except OSError:
+            raise MemoryError("the limit leaves too little for the linear algebra") from None
+        matrix = np.eye(200)
+        linalg.cholesky(matrix @ matrix)  # numpy and scipy each have their own OpenBLAS
 
 
 @contextmanager
 def session(arguments: argparse.Namespace) -> Iterator[Session]:
-    """Open a session in the output folder; progress is shown on a terminal's stderr."""
+    """Open a session in the output folder; show its progress on stderr if that is a terminal."""
     from halbach_fe.solver.dask_cluster import connected
     from halbach_fe.solver.getdp import find_getdp
     from halbach_fe.solver.session import Session
@@ -329,7 +352,7 @@ def session(arguments: argparse.Namespace) -> Iterator[Session]:
 
 
 def cache(arguments: argparse.Namespace) -> Cache | None:
-    """Where answers of GetDP are kept."""
+    """Return the cache of GetDP's answers, or None if it is switched off."""
     from halbach_fe.solver.getdp_cache import default_cache
 
     return None if arguments.no_cache else default_cache(arguments.cache)
@@ -337,7 +360,7 @@ def cache(arguments: argparse.Namespace) -> Cache | None:
 
 @contextmanager
 def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
-    """What runs independent functions: processes of this machine, or the --scheduler's workers."""
+    """Open an executor: processes of this machine, or the workers of --scheduler."""
     if arguments.scheduler:
         from halbach_fe.solver.dask_cluster import connected
 
@@ -348,7 +371,7 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
                                _begin_worker, (os.getpid(),))
     try:
         yield pool
-    except BaseException:  # what waits is not begun, and what runs is ended
+    except BaseException:  # drop the waiting calls, and end those that run
         pool.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.terminate()
@@ -357,7 +380,7 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
 
 
 def _begin_worker(parent: int) -> None:
-    """End this process when its parent has, however that ended."""
+    """Prepare a worker process that ends itself once its parent has ended for whatever reason."""
     _claim_buffers()
 
     def watch() -> None:
@@ -369,13 +392,16 @@ def _begin_worker(parent: int) -> None:
 
 
 def jobs(arguments: argparse.Namespace) -> int:
-    """How many runs of GetDP there are at a time on this machine."""
+    """Return the number of GetDP runs at a time on this machine."""
     return int(arguments.jobs or min(2, os.cpu_count() or 1))
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A function of done and total that shows them on a terminal's stderr."""
+def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar on stderr if that is a terminal.
+
+    The context is a function that takes the number of steps done and the total.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -389,7 +415,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
                   MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
                   disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
@@ -399,13 +425,13 @@ def print_json(value: object) -> None:
 
 
 def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
-    """Print rows of text on stdout, if there are any."""
+    """Print rows of text as a table on stdout; print nothing if there are no rows."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     def cell(value: str) -> Text:
-        """Names of files and columns are no markup, nor commands to the terminal."""
+        """Return a text that is neither interpreted as markup nor by the terminal."""
         return Text(printable(value, MAX_QUOTED))
 
     if not rows:
@@ -420,5 +446,5 @@ def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
 
 
 def say(text: str) -> None:
-    """Tell the user something that is not a result: on stderr."""
+    """Print a message that is not a result on stderr."""
     sys.stderr.write(text + "\n")

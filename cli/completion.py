@@ -16,13 +16,13 @@ SHELLS = ("bash", "zsh", "tcsh")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which shell."""
-    parser.add_argument("shell", choices=SHELLS, help="which one")
+    """Add this verb's options."""
+    parser.add_argument("shell", choices=SHELLS, help="shell for which the script is printed")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    import halbach_fe.cli  # the command line imports this verb when it is run
+    import halbach_fe.cli  # here, because the command line itself imports this module
 
     whole = halbach_fe.cli.parser()
     sys.stdout.write(shtab.complete(whole, shell=arguments.shell) + "\n")

@@ -1,8 +1,8 @@
-"""Map how near the blocks are to the knee of their demagnetization curve, at temperature.
+"""Map how near the blocks are to the knee of their demagnetization curve when they are hot.
 
-From the study's `demagnetization`: coercivity, coefficients and temperature of the material.
-Writes demagnetization.html and its figures, .json, .csv (by block) and .vtu (by cell, for
-ParaView).
+The study's table `demagnetization` states coercivity, coefficients and temperature of the material.
+Writes demagnetization.html and its figures, demagnetization.json, demagnetization.csv (a row per
+block) and demagnetization.vtu (cells, for ParaView).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve, write everything, print the blocks with the least margin."""
+    """Compute the map, write the results, print the blocks with the smallest margin."""
     from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.demagnetization import (
@@ -32,14 +32,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     magnet = build_magnet(read_study(arguments.study))
     with common.session(arguments) as session:
-        found = demagnetization_map(magnet, session, arguments.across or ACROSS)
-    write_demagnetization(found, arguments.output)
-    summary = demagnetization_summary(found)
+        result = demagnetization_map(magnet, session, arguments.across or ACROSS)
+    write_demagnetization(result, arguments.output)
+    summary = demagnetization_summary(result)
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table(worst_block_table(found.by_block()), "Blocks with the least margin")
-        common.say(f"{100 * found.share_beyond_now:.2g} % of the volume is past the knee at "
-                   f"{found.material.temperature_C:g} °C.")
+        common.print_table(worst_block_table(result.by_block()),
+                           "Blocks with the smallest margin")
+        common.say(f"{100 * result.share_beyond_now:.2g} % of the volume is past the knee at "
+                   f"{result.material.temperature_C:g} °C.")
         common.say(f"Report: {arguments.output / 'demagnetization.html'}")
     return 0

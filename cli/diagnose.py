@@ -1,7 +1,8 @@
-"""Find which effects a study lacks to explain a measured field map, and add them.
+"""Find which effects a study lacks to explain a measured field map, and add them to the study.
 
 Writes diagnosis.html and its figures, diagnosis.json, and study.diagnosed.toml: the study's own
-file with what was missing, which `solve` and `infer` run as it stands.
+file with the identified effects added, which `halbach-fe solve` and `halbach-fe infer` can use
+without further changes.
 """
 
 from __future__ import annotations
@@ -24,25 +25,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_measurement_arguments(parser)
     common.add_held_out_argument(parser)
     parser.add_argument("--effects", type=effects_of, metavar="NAME,NAME...",
-                        help="effects to choose from (default: the whole catalogue)")
+                        help="candidate effects (default: all effects of the catalogue)")
 
 
 def effects_of(text: str) -> list[Effect]:
-    """Parse names of effects."""
+    """Parse a comma-separated list of names of effects."""
     from halbach_fe.diagnosis.effects import catalogue
 
-    known = {effect.name: effect for effect in catalogue()}
+    effect_by_name = {effect.name: effect for effect in catalogue()}
     for name in text.split(","):
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0.5)
+        if name not in effect_by_name:
+            near = difflib.get_close_matches(name, effect_by_name, 1, 0.5)
             raise argparse.ArgumentTypeError(
                 f"no effect is called '{name}'"
-                + (f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"))
-    return [known[name] for name in dict.fromkeys(text.split(","))]
+                + (f"; did you mean {near[0]}?" if near
+                   else f"; there are {', '.join(effect_by_name)}"))
+    return [effect_by_name[name] for name in dict.fromkeys(text.split(","))]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Diagnose, write everything, print what was found."""
+    """Diagnose, write the results, print a summary."""
     from halbach_fe.diagnosis.diagnose import diagnose
     from halbach_fe.diagnosis.discriminating_measurements import separations
     from halbach_fe.diagnosis.summary import diagnosis_summary
@@ -53,23 +55,23 @@ def run(arguments: argparse.Namespace) -> int:
     text = arguments.study.read_text(encoding="utf-8")
     data, blocks, validation_map = common.measurements(arguments)
     with common.session(arguments) as session:
-        found = diagnose(study, data, session, blocks, arguments.effects, validation_map,
-                         common.say)
-        separating = separations(found, data, session, arguments.effects)
-    write_diagnosis(found, separating, study, text, arguments.output)
+        diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
+                             common.say)
+        separating = separations(diagnosis, data, session, arguments.effects)
+    write_diagnosis(diagnosis, separating, study, text, arguments.output)
     if arguments.json:
-        common.print_json(diagnosis_summary(found, separating))
+        common.print_json(diagnosis_summary(diagnosis, separating))
     else:
-        print_diagnosis(found, arguments.output)
+        print_diagnosis(diagnosis, arguments.output)
     return 0
 
 
-def print_diagnosis(found: Diagnosis, folder: Path) -> None:
-    """Print what was found."""
+def print_diagnosis(diagnosis: Diagnosis, folder: Path) -> None:
+    """Print the verdict, the missing effects, and the scores before and after."""
     from halbach_fe.report.diagnosis import change_table, found_table, verdict
 
-    common.say(" ".join(verdict(found)))
-    if found.found_anything:
-        common.print_table(found_table(found), "What the study lacks")
-    common.print_table(change_table(found), "The model before and after")
+    common.say(" ".join(verdict(diagnosis)))
+    if diagnosis.found_anything:
+        common.print_table(found_table(diagnosis), "Missing from the study")
+    common.print_table(change_table(diagnosis), "The model before and after")
     common.say(f"Report: {folder / 'diagnosis.html'}")

@@ -1,4 +1,4 @@
-"""Check this installation: versions, GetDP's build, a one-second solve against a closed form."""
+"""Check this installation: versions, GetDP's build, a short solve against a closed form."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ from halbach_fe.study.reader import parse_study
 PACKAGES = ("gmsh", "numpy", "scipy", "meshio", "h5py", "h5netcdf", "xarray", "pydantic", "jinja2",
             "matplotlib", "arviz", "rich")
 TOLERANCE = {"direct": 5e-3, "reaction": 5e-4}
-"""Of the bore field, on the coarse mesh used here: measured 1.5e-3 and 2e-5, times some safety."""
+"""Largest accepted error of each method, relative to the bore field, on the coarse mesh used here.
+The actual errors are 1.5e-3 and 2e-5."""
 
 REFERENCE_BLAS = "blas"
-"""Debian's folder of it; others are in openblas-pthread, blis-openmp and so on."""
+"""Name of the folder in which Debian has the reference BLAS. Other implementations are in folders
+such as openblas-pthread or blis-openmp."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     extra = {"errors": errors, "tolerances": TOLERANCE} if arguments.json else {}
     _show(findings | extra, arguments.json)
     if blas is not None and blas.parent.name == REFERENCE_BLAS:
-        common.say("warning: GetDP takes the reference BLAS, by which it factorizes 3D meshes four "
-                   "to five times slower than by OpenBLAS (Debian, Ubuntu: `apt-get install "
+        common.say("warning: GetDP uses the reference BLAS, with which it factorizes 3D meshes "
+                   "four to five times slower than with OpenBLAS (Debian, Ubuntu: `apt-get install "
                    "libopenblas0-pthread`).")
     for method, error in errors.items():
         if not error <= TOLERANCE[method]:
@@ -67,15 +69,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show(findings: Mapping[str, object], as_json: bool) -> None:
+    """Print the findings as JSON or as a table."""
     if as_json:
         common.print_json(findings)
     else:
-        common.print_table([{"what": key, "found": str(value)}
+        common.print_table([{"item": key, "value": str(value)}
                             for key, value in findings.items()])
 
 
 def solve_error(getdp: GetDP, method: str) -> float:
-    """Error of a 2D solve of a dipole with an iron ring, relative to its field."""
+    """Return the error of a 2D solve of a dipole with an iron ring, relative to its bore field."""
     inner, outer, mu, iron = 0.1, 0.18, 1.05, (0.19, 0.21, 500.0)
     study = parse_study({
         "name": "doctor", "dimension": 2, "solver": {"method": method},
@@ -86,9 +89,9 @@ def solve_error(getdp: GetDP, method: str) -> float:
         "mesh": {"block_size_m": 0.012},
         "observation": {"quantity": "flux_density", "positions": {
             "kind": "circles", "radius_m": 0.07, "angles": 12}}})
-    angle = np.radians(7 + 30.0 * np.arange(12))  # off the mesh's lines of symmetry
+    angle = np.radians(7 + 30.0 * np.arange(12))  # not on the lines of symmetry of the mesh
     points = 0.07 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     exact = layered_bore_field(ideal_sectors(1, 16, 1.0), inner, outer, mu, points[:, :2], iron)
     with tempfile.TemporaryDirectory() as folder:
-        found = solve_nominal(build_magnet(study), points, Session(getdp, Path(folder)))[:, :2]
-    return float(np.abs(found - exact).max() / np.abs(exact).max())
+        field = solve_nominal(build_magnet(study), points, Session(getdp, Path(folder)))[:, :2]
+    return float(np.abs(field - exact).max() / np.abs(exact).max())

@@ -1,7 +1,8 @@
-"""Write a map for another program.
+"""Write a map in the file format of another program.
 
-openpmd (openPMD-beamphysics field mesh, HDF5), bdsim (BDSIM's text, three-dimensional) and geant4
-(PurgMagTabulatedField3D's table) need a regular grid; csv and vtu take any points.
+The formats openpmd (openPMD-beamphysics field mesh, HDF5), bdsim (BDSIM's three-dimensional text
+format) and geant4 (table of Geant4's PurgMagTabulatedField3D) need points on a regular grid; csv
+and vtu accept any points.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from halbach_fe.measurement.formats import WRITERS, export_map
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     parser.add_argument("map", type=Path, metavar="MAP", help="map in m and T (CSV, HDF5 or VTU)")
-    parser.add_argument("--format", choices=WRITERS, required=True, help="of FILE")
+    parser.add_argument("--format", choices=WRITERS, required=True,
+                        help="format of FILE")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE",
                         help="file to write")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, write, say so."""
+    """Read the map, write it in the other format, and report its size."""
     data = read_map(arguments.map)
     export_map(data, arguments.format, arguments.output)
     common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")

@@ -1,8 +1,9 @@
-"""Convert a measured map of another make: to metres, tesla and the project's own columns.
+"""Convert a measured map from another file format, to metres, tesla and halbach-fe's own columns.
 
-Tables of columns (commas, semicolons, tabs or spaces, with a header or without), Opera's .table,
-text that COMSOL exports, and openPMD-beamphysics field meshes. What the file does not say (units,
-columns, coordinates that are the same everywhere) has to be given; nothing is guessed.
+Reads tables of columns (separated by commas, semicolons, tabs or spaces, with or without a header),
+Opera's .table files, text files exported by COMSOL, and openPMD-beamphysics field meshes. Units,
+columns and constant coordinates that the file does not state must be given as options; nothing is
+guessed.
 """
 
 from __future__ import annotations
@@ -26,86 +27,89 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="MAP",
                         help="map to write: .csv, .h5 or .vtu")
     parser.add_argument("--format", choices=READERS, default="",
-                        help="of FILE (default: as it begins)")
-    parser.add_argument("--length-unit", choices=LENGTHS, default="", help="of positions")
-    parser.add_argument("--field-unit", choices=FIELDS, default="", help="of B")
-    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="of phi")
+                        help="format of FILE (default: recognized from its beginning)")
+    parser.add_argument("--length-unit", choices=LENGTHS, default="", help="unit of the positions")
+    parser.add_argument("--field-unit", choices=FIELDS, default="", help="unit of B")
+    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
-                        help="what each column is: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, or - "
-                        "to leave it out; a unit may follow, Bx[mT]")
+                        help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, or "
+                        "- for a column that is ignored; a unit may follow, as in Bx[mT]")
     parser.add_argument("--component", choices=COMPONENTS, default="",
-                        help="which one a column B is")
+                        help="component of the field in a column B")
     parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",
-                        help="coordinates in m that the file leaves out, x=0,y=0")
+                        help="constant coordinates in m that the file does not contain, for "
+                        "example x=0,y=0")
     parser.add_argument("--origin-m", type=point, metavar="X,Y,Z",
-                        help="where the file's origin is, along the magnet's axes; write it "
-                        "--origin-m=-0.5,0,0")
-    parser.add_argument("--decimal-comma", action="store_true", help="0,5 is one half")
+                        help="position in m of the file's origin, along the magnet's axes; with a "
+                        "negative number write --origin-m=-0.5,0,0")
+    parser.add_argument("--decimal-comma", action="store_true",
+                        help="numbers have a decimal comma, as in 0,5")
     parser.add_argument("--encoding", default=DeclaredFormat.encoding,
-                        help="of text (default: UTF-8)")
+                        help="encoding of a text file (default: UTF-8)")
     common.add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, convert, write, print what was understood."""
-    said = DeclaredFormat(
+    """Read the file, convert it, write the map, and print how the file was understood."""
+    declared = DeclaredFormat(
         length_unit=arguments.length_unit, field_unit=arguments.field_unit,
         angle_unit=arguments.angle_unit, columns=arguments.columns,
         component=arguments.component, at=arguments.at, origin_m=arguments.origin_m,
         decimal_comma=arguments.decimal_comma, encoding=arguments.encoding)
-    found = import_map(arguments.file, said, arguments.format)
-    write_map(found.data, arguments.output)
-    shown = summary(found)
+    imported = import_map(arguments.file, declared, arguments.format)
+    write_map(imported.data, arguments.output)
+    properties = summary(imported)
     if arguments.json:
-        common.print_json(shown | {"map": str(arguments.output)})
+        common.print_json(properties | {"map": str(arguments.output)})
     else:
-        common.print_table([{"of the map": key, "": text(value)} for key, value in shown.items()],
-                           f"Read as {found.format}")
+        common.print_table([{"property": key, "value": text(value)}
+                            for key, value in properties.items()], f"Read as {imported.format}")
         common.say(f"Map: {arguments.output}")
     return 0
 
 
-def summary(found: ImportedFile) -> dict[str, object]:
-    """What was read, for people to check and for machines."""
-    points, field = points_of(found.data), found.data["B_T"].values
+def summary(file: ImportedFile) -> dict[str, object]:
+    """Return the properties of the imported map as plain data, for the user to check."""
+    points, field = points_of(file.data), file.data["B_T"].values
     measured = [i for i in range(3) if not np.isnan(field[:, i]).all()]
     return {
-        "format": found.format, "readings": len(points),
+        "format": file.format, "readings": len(points),
         "components": [COMPONENTS[i] for i in measured],
-        "length_units": list(found.imported.length_units),
-        "field_units": list(found.imported.field_units),
-        "ignored_columns": list(found.imported.ignored),
-        "points_without_reading": found.imported.dropped,
+        "length_units": list(file.imported.length_units),
+        "field_units": list(file.imported.field_units),
+        "ignored_columns": list(file.imported.ignored),
+        "points_without_reading": file.imported.dropped,
         "from_m": points.min(axis=0).tolist(), "to_m": points.max(axis=0).tolist(),
         "min_B_T": [float(np.nanmin(field[:, i])) for i in measured],
         "max_B_T": [float(np.nanmax(field[:, i])) for i in measured]}
 
 
 def text(value: object) -> str:
-    """A value for the table."""
+    """Return a value as text for the table."""
     if isinstance(value, list):
-        return ", ".join(f"{one:.6g}" if isinstance(one, float) else str(one) for one in value)
+        return ", ".join(
+            f"{element:.6g}" if isinstance(element, float) else str(element) for element in value)
     return str(value)
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Split names of columns."""
+    """Parse a comma-separated list of names of columns."""
     return tuple(name.strip() for name in text.split(","))
 
 
 def coordinates(text: str) -> dict[str, float]:
-    """Parse x=0,y=0."""
-    found: dict[str, float] = {}
+    """Parse coordinates such as ``x=0,y=0``."""
+    values: dict[str, float] = {}
     for part in text.split(","):
         axis, _, value = part.partition("=")
         if axis.strip() not in COMPONENTS:
             raise argparse.ArgumentTypeError(f"must be like x=0,y=0, not {text}")
-        found[axis.strip()] = coordinate(value)
-    return found
+        values[axis.strip()] = coordinate(value)
+    return values
 
 
 def point(text: str) -> tuple[float, float, float]:
-    """Parse X,Y,Z."""
+    """Parse a point ``X,Y,Z``."""
     values = [coordinate(part) for part in text.split(",")]
     if len(values) != 3:
         raise argparse.ArgumentTypeError(f"must be three numbers, not {text}")

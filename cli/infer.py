@@ -1,7 +1,8 @@
 """Update a study's block magnetizations with a measured field map.
 
-Writes posterior.h5, prediction.csv, summary.json, report.html and its figures, and if the map has
-full circles multipoles.csv; `halbach-fe multipoles` has those of any posterior.
+Writes posterior.h5, prediction.csv, summary.json, report.html and its figures, and, if the map has
+full circles, multipoles.csv. `halbach-fe multipoles` computes the multipoles from posterior.h5 for
+any map.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_measurement_arguments(parser)
     common.add_held_out_argument(parser)
     parser.add_argument("--samples", type=common.positive, metavar="N",
-                        help="for iron with an H(B) curve: sample the non-linear posterior with N "
-                        "draws of each of four chains, instead of linearizing")
+                        help="for iron with an H(B) curve: sample the non-linear posterior by four "
+                        "Markov chains of N draws each, instead of linearizing")
     parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
-                        help="of the random numbers of the chains (default: %(default)s)")
+                        help="seed of the random numbers of the chains (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Infer, write everything, print the table of errors before and after."""
+    """Infer, write the results, print the table of errors before and after."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer, observation_of
     from halbach_fe.inference.storage import inference_summary, write_inference
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         from halbach_fe.response.resource_estimate import estimate_infer
 
         if arguments.samples:
-            common.say("The chains of --samples are not counted.")
+            common.say("The estimate does not include the chains of --samples.")
         observation = observation_of(magnet, data, blocks, validation_map)
         return common.print_estimate(
             estimate_infer(magnet, observation, common.jobs(arguments)), arguments.json)
@@ -52,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.samples:
             from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 
-            write_inference(result, arguments.output)  # is there even if the chains fail
+            write_inference(result, arguments.output)  # to be kept even if the chains fail
             with common.workers(arguments) as pool:
                 sampled = sample_posterior(result, session, arguments.samples,
                                            seed=arguments.seed, say=common.say, mapped=pool.map)

@@ -1,8 +1,8 @@
 """Compute the multipoles of a magnet, with their standard deviations.
 
-Of the magnet that was measured, from the posterior that `halbach-fe infer` found; without one, from
-the study's prior. In 3D there are two tables: of the field integrated along z, and of the circle at
---at-z-m (default: in the middle). Writes multipoles.csv, multipoles.json, multipoles.html and its
+With --posterior they are those of the measured magnet, otherwise those that the study's prior
+predicts. A 3D magnet has two tables: of the field integrated along z, and of the circle at --at-z-m
+(default: the middle of the magnet). Writes multipoles.csv, multipoles.json, multipoles.html and its
 figures.
 """
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve, write everything, print the tables."""
+    """Compute the multipoles, write the results, print the tables."""
     from halbach_fe.api import multipoles
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
@@ -42,8 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(multipoles_summary(study, tables, limit))
     else:
-        for model, found in tables:
-            common.print_table(text_table(**found), "Multipoles in units of 1e-4, " + (
+        for model, columns in tables:
+            common.print_table(text_table(**columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
                 "of the cross-section" if model.z is None else f"at z = {model.z:g} m"))
         common.say(f"Report: {arguments.output / 'multipoles.html'}")

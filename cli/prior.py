@@ -1,7 +1,7 @@
 """Turn moments of single blocks, measured in a Helmholtz coil, into a prior.
 
 Writes prior.h5 (mean and covariance), prior.json, prior.html and its figure. `halbach-fe infer
---blocks` uses the same prior.
+--blocks` uses the same prior directly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Estimate, write everything, print the table of types."""
+    """Estimate the prior, write the results, print the table of types."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.block_prior import prior_from_blocks
     from halbach_fe.measurement.block_table import read_blocks

@@ -9,7 +9,7 @@ from halbach_fe.study.model import Study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Nothing to add."""
+    """Add no options: this verb has none."""
 
 
 def run(arguments: argparse.Namespace) -> int:

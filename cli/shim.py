@@ -1,7 +1,8 @@
 """Choose blocks to swap, turn or replace so that unwanted multipoles become small.
 
-From the posterior of the block magnetizations, as `halbach-fe infer` finds it. Writes shim.json,
-shim.html and its figures, and study.shimmed.toml, the study with the blocks where they then are.
+The moves are chosen from the posterior of the block magnetizations, which is computed as by
+`halbach-fe infer`. Writes shim.json, shim.html and its figures, and study.shimmed.toml, the study
+with the blocks in their new places.
 """
 
 from __future__ import annotations
@@ -19,22 +20,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
     parser.add_argument("--blocks", type=Path, metavar="CSV",
-                        help="moments of the single blocks, in place of the study's prior")
+                        help="measured moments of the single blocks, whose prior replaces the "
+                        "study's")
     common.add_multipole_arguments(parser)
     parser.add_argument("--swaps", type=common.count, default=8, metavar="N",
-                        help="swaps of two blocks at most (default: %(default)s)")
+                        help="largest number of swaps of two blocks (default: %(default)s)")
     parser.add_argument("--turns", type=common.count, default=8, metavar="N",
-                        help="blocks turned in their places at most (default: %(default)s)")
-    parser.add_argument("--replace", type=common.count, default=0, metavar="N",
-                        help="blocks replaced by nominal ones, or of the stock, at most "
+                        help="largest number of blocks turned in their slots "
                         "(default: %(default)s)")
+    parser.add_argument("--replace", type=common.count, default=0, metavar="N",
+                        help="largest number of blocks replaced by blocks of the stock, or without "
+                        "--stock by new ones (default: %(default)s)")
     parser.add_argument("--stock", type=Path, metavar="CSV",
                         help="table of measured blocks that may replace others")
     common.add_seed_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Infer, choose, write everything, print moves and multipoles."""
+    """Infer, choose the moves, write the results, print moves and multipoles."""
     from halbach_fe.api import shim
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer
@@ -45,24 +48,24 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.stock and not arguments.replace:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
-                         "replaced; instead it is alone. Add --replace.")
+                         "replaced; instead --replace is missing. Add --replace.")
     magnet = build_magnet(read_study(arguments.study))
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     with common.session(arguments) as session:
         result = infer(magnet, data, session, blocks)
-        found = shim(result, session, common.reference(arguments), arguments.swaps,
+        moves = shim(result, session, common.reference(arguments), arguments.swaps,
                      arguments.turns, arguments.replace, arguments.limit_units, stock,
                      arguments.seed)
     if result.prior_conflict > result.conflict_limit:
-        common.say("warning: prior and map conflict, so that error bars mean little: something is "
-                   "missing from the model (halbach-fe diagnose).")
-    write_shim(found, result, arguments.study.read_text(encoding="utf-8"), arguments.output)
+        common.say("warning: prior and map conflict, so that the error bars are not reliable: an "
+                   "effect is missing from the model. Run halbach-fe diagnose.")
+    write_shim(moves, result, arguments.study.read_text(encoding="utf-8"), arguments.output)
     if arguments.json:
-        common.print_json(shim_summary(found, result))
+        common.print_json(shim_summary(moves, result))
     else:
-        common.print_table(move_table(found), "Moves")
-        common.print_table(text_table(before=found.before, after=found.after),
+        common.print_table(move_table(moves), "Moves")
+        common.print_table(text_table(before=moves.before, after=moves.after),
                            "Multipoles in units of 1e-4")
         common.say(f"Report: {arguments.output / 'shim.html'}")
     return 0

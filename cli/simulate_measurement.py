@@ -1,9 +1,10 @@
-"""Simulate a measurement campaign of a magnet whose blocks are not quite what was ordered.
+"""Simulate a measurement campaign of a magnet whose blocks deviate from their nominal values.
 
-Magnetizations are drawn from the study's prior; the field is by magpylib and NGSolve, never by
+Magnetizations are drawn from the study's prior. magpylib and NGSolve compute the field, never
 halbach-fe's own model. Writes blocks.csv (single blocks in a Helmholtz coil), map.csv, held-out.csv
-(half a step between the map's points), truth/truth.json, sealed: the maps name its SHA-256, and
-campaign.html with its figures, which show nothing of the truth.
+(points halfway between those of the map), truth/truth.json, and campaign.html with its figures,
+which do not reveal the truth. The maps name the SHA-256 of truth.json, so that the truth cannot be
+changed afterwards.
 """
 
 from __future__ import annotations
@@ -31,24 +32,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         for name, effect in EFFECTS.items())
     common.add_study_and_output(parser)
     parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
-                        help="of all random numbers (default: %(default)s)")
+                        help="seed of the random numbers (default: %(default)s)")
     parser.add_argument("--coil-sd", type=common.positive_number, default=COIL_SD, metavar="F",
-                        help="noise of a block's measured moment, relative (default: %(default)g)")
+                        help="noise of the measured moment of a block, relative to the moment "
+                        "(default: %(default)g)")
     parser.add_argument("--hide", type=_effect, action="append", default=[],
                         metavar="NAME[=VALUE,...]",
-                        help="an effect that the truth has and the study does not, of a random "
-                        "size unless its values are given; again for several")
+                        help="hide an effect: the simulated magnet has it, the study does not; "
+                        "its size is random unless VALUE is given; may be repeated")
     parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
-                        help="hide K effects of the field or the instrument, drawn at random")
+                        help="hide K effects of the field or the instrument that are drawn at "
+                        "random")
     parser.add_argument("--element-size", type=common.positive_number, metavar="M",
-                        help="largest element of NGSolve in m (default: a third of the blocks' "
-                        "thickness, in 2D half of that)")
+                        help="size in m of the largest elements of NGSolve (default: a third of "
+                        "the blocks' thickness, in 2D half of that)")
     parser.add_argument("--order", type=common.positive, metavar="N",
-                        help="order of NGSolve's elements (default: 3, in 2D 5)")
+                        help="order of NGSolve's elements (default: 3 in 3D, 5 in 2D)")
     common.add_json_argument(parser)
 
 
 def _effect(text: str) -> RequestedEffect:
+    """Parse ``NAME`` or ``NAME=VALUE,...``."""
     try:
         return parse_hidden_effect(text)
     except ValueError as error:
@@ -56,8 +60,8 @@ def _effect(text: str) -> RequestedEffect:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Simulate, write everything, print what was written."""
-    from halbach_fe.report.campaign import write_campaign_page  # matplotlib loads when needed
+    """Simulate the campaign, write the results, print a summary."""
+    from halbach_fe.report.campaign import write_campaign_page  # imports matplotlib
 
     study = read_study(arguments.study)
     elements = Elements(arguments.element_size, arguments.order)
@@ -76,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table([{"what": key, "value": str(value)} for key, value in summary.items()])
+        common.print_table([{"quantity": key, "value": str(value)}
+                            for key, value in summary.items()])
         common.say(f"Report: {arguments.output / 'campaign.html'}")
     return 0

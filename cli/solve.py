@@ -1,8 +1,8 @@
 """Compute the field of a study's nominal magnet at the study's positions.
 
 Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
-field_map.vtu (open it in ParaView), readings.csv with the study's observation, multipoles.csv if it
-has circles, report.html, and the GetDP run folders, which can be run by hand.
+field_map.vtu (for ParaView), readings.csv with the readings of the study, multipoles.csv if the
+study's positions are circles, report.html, and the run folders of GetDP, which can be run by hand.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve, write the maps, print a summary."""
+    """Solve the field, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.response.solution import solve, study_observation, write_solution
     from halbach_fe.solver.runs import newton_history
@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table([{"what": key, "value": str(value)} for key, value in summary.items()])
+        common.print_table([{"quantity": key, "value": str(value)}
+                            for key, value in summary.items()])
         common.say(f"Report: {arguments.output / 'report.html'}")
     return 0

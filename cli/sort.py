@@ -1,7 +1,8 @@
 """Assign measured blocks to slots so that unwanted multipoles become small.
 
-Within each type of block, before the magnet is assembled; there may be more blocks than slots.
-Writes blocks.sorted.csv, sort.json, sort.html and its figures.
+Blocks are sorted before the magnet is assembled. Each goes to a slot of its own type; the table may
+have more blocks than there are slots. Writes blocks.sorted.csv, sort.json, sort.html and its
+figures.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Sort, write everything, print the multipoles."""
+    """Sort the blocks, write the results, print the multipoles."""
     from halbach_fe.api import sort
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.block_table import read_blocks
@@ -32,11 +33,11 @@ def run(arguments: argparse.Namespace) -> int:
     magnet = build_magnet(read_study(arguments.study))
     table = read_blocks(arguments.blocks)
     with common.session(arguments) as session, common.progress_bar("sorting") as show:
-        found = sort(magnet, table, session, common.reference(arguments), arguments.seed, show)
-    write_sorted(found, arguments.limit_units, arguments.output)
+        assignment = sort(magnet, table, session, common.reference(arguments), arguments.seed, show)
+    write_sorted(assignment, arguments.limit_units, arguments.output)
     if arguments.json:
-        common.print_json(sort_summary(found, arguments.limit_units))
+        common.print_json(sort_summary(assignment, arguments.limit_units))
     else:
-        common.print_table(order_table(found), "Multipoles in units of 1e-4")
+        common.print_table(order_table(assignment), "Multipoles in units of 1e-4")
         common.say(f"Report: {arguments.output / 'sort.html'}")
     return 0

@@ -1,6 +1,7 @@
-"""Draw magnets from the study's prior: what multipoles to expect, and how many are good enough.
+"""Predict the multipoles of magnets whose blocks are drawn from the study's prior.
 
-Writes tolerance.json, tolerance.html and its figures.
+With --limit-units also the share of the magnets that meet the limit. Writes tolerance.json,
+tolerance.html and its figures.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
     parser.add_argument("--blocks", type=Path, metavar="CSV",
-                        help="moments of the single blocks, in place of the study's prior")
+                        help="measured moments of the single blocks, whose prior replaces the "
+                        "study's")
     common.add_multipole_arguments(parser)
     parser.add_argument("--draws", type=common.positive, default=10_000, metavar="N",
-                        help="magnets to draw (default: %(default)s)")
+                        help="number of magnets to draw (default: %(default)s)")
     common.add_seed_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw, write everything, print the quantiles."""
+    """Draw magnets, write the results, print the quantiles."""
     from halbach_fe.api import tolerance
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.block_table import read_blocks
@@ -33,14 +35,14 @@ def run(arguments: argparse.Namespace) -> int:
     magnet = build_magnet(read_study(arguments.study))
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     with common.session(arguments) as session:
-        found = tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
-                          arguments.limit_units, arguments.seed)
-    write_tolerance(found, arguments.output)
+        result = tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
+                           arguments.limit_units, arguments.seed)
+    write_tolerance(result, arguments.output)
     if arguments.json:
-        common.print_json(tolerance_summary(found))
+        common.print_json(tolerance_summary(result))
     else:
-        common.print_table(quantile_table(found), "Multipoles |c_n| in units of 1e-4")
-        if found.share is not None:
-            common.say(f"{100 * found.share:.3g} % of the magnets are within the limit.")
+        common.print_table(quantile_table(result), "Multipoles |c_n| in units of 1e-4")
+        if result.share is not None:
+            common.say(f"{100 * result.share:.3g} % of the magnets are within the limit.")
         common.say(f"Report: {arguments.output / 'tolerance.html'}")
     return 0

@@ -1,8 +1,9 @@
 """Estimate the error of a study's field: refinement, a farther boundary, the dual formulation.
 
-Solves the nominal array at the study's positions on a coarser, its own and a finer mesh, with the
-boundary farther away, and where there is one by the dual formulation. Writes verification.json,
-verification.csv (what changes at every point), verification.html and its figures.
+Solves the nominal array at the study's positions on a coarser mesh, the study's own and a finer
+one, with the boundary farther away, and by the dual formulation if the route has one. Writes
+verification.json, verification.csv (changes of the field at every point), verification.html and
+its figures.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Verify, write, print."""
+    """Estimate the error, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.verification import (
         difference_table,
@@ -35,14 +36,16 @@ def run(arguments: argparse.Namespace) -> int:
         return common.print_estimate(estimate_verify(magnet, common.jobs(arguments)),
                                      arguments.json)
     with common.session(arguments) as session:
-        found = verify(magnet, session, say=lambda what: common.say(f"solving {what}"))
-    write_verification(magnet, found, arguments.output, {
+        verification = verify(magnet, session,
+                              say=lambda purpose: common.say(f"solving {purpose}"))
+    write_verification(magnet, verification, arguments.output, {
         "GetDP": session.getdp.version, "study file": common.digest(arguments.study)})
     if arguments.json:
-        common.print_json(found.plain())
+        common.print_json(verification.plain())
     else:
-        common.print_table(difference_table(found),
-                           f"Route {found.route}; relative to {found.main_field_T:.4g} T")
-        common.say(verification_verdict(magnet, found))
+        common.print_table(
+            difference_table(verification),
+            f"Route {verification.route}; relative to {verification.main_field_T:.4g} T")
+        common.say(verification_verdict(magnet, verification))
         common.say(f"Report: {arguments.output / 'verification.html'}")
     return 0

@@ -231,5 +231,5 @@ def _check_linearization(
     if worst > LINEAR_ENOUGH:
         warnings.warn(
             "The iron is linearized about the nominal magnet, which changes a reading of the "
-            f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the non-linear "
-            "posterior.", HalbachWarning, stacklevel=2)
+            f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the "
+            "non-linear posterior.", HalbachWarning, stacklevel=2)

@@ -1,10 +1,11 @@
-"""The posterior of a magnet with iron that saturates, by samples.
+"""Markov chains that sample the posterior of a magnet with saturating iron.
 
-The target is the finite-element posterior itself: every likelihood is a non-linear solve, by the
-condensed engine. Laplace's approximation at the mode proposes; every tenth move is by the prior and
-reaches the tails that it may lack. Draws are compared with GetDP's own Newton method before
-they are handed out, and chains that are too short are refused. Work is stored chunk by chunk: an
-interrupted run goes on where it was.
+The target is the posterior of the finite-element model itself: every likelihood is a non-linear
+solve of the condensed model. Most moves are proposed from Laplace's approximation at the mode.
+Every tenth move is proposed from the prior, to reach tails that the approximation may lack. Some
+draws are compared with GetDP's own Newton method before the result is returned, and chains that are
+too short are refused. The chains are stored chunk by chunk, so that an interrupted run continues
+where it stopped.
 """
 
 from __future__ import annotations
@@ -36,46 +37,61 @@ from halbach_fe.stats.convergence import (
 from halbach_fe.stats.pcn import Chain, Posterior, Proposal, laplace, prior_reference, sample
 
 CHUNK = 250
-"""Draws of every chain between two stored states."""
+"""Number of draws of every chain between two stored states."""
 
 LAPLACE_STEPS = (1.0, 1.0, 0.6, 1.0, 1.0, 0.3, 1.0, 1.0, 0.6)
-"""Long steps where the posterior is nearly normal; short ones leave the tails, where long ones
-are never accepted."""
+"""Step sizes of the moves that are proposed from Laplace's approximation, in turn. Long steps suit
+the region where the posterior is nearly normal. Short steps lead a chain out of the tails, where
+long ones are never accepted."""
 
 PRIOR_STEP = 0.1
+"""Step size of the moves that are proposed from the prior."""
+
 OVERDISPERSED = 2.0
-"""Chains start so many of Laplace's standard deviations away; R-hat is blind otherwise."""
+"""Spread of the starting points of the chains, in standard deviations of Laplace's approximation.
+R-hat detects chains that have not converged only if the starting points are overdispersed."""
 
 VERIFIED_DRAWS = 3
+"""Number of draws that are compared with GetDP's Newton method."""
+
 PREDICTED_DRAWS = 200
+"""Number of draws for which all readings are predicted."""
+
 LIKELIHOOD_ERROR = 1e-2
-"""What stopping a solve early may move the log of the likelihood by, about; n readings that miss by
-a standard deviation allow each to be off by this part of it over n."""
+"""Approximate error of the log likelihood that stopping a solve early may cause. If n readings
+deviate by about a standard deviation each, every reading may be wrong by this fraction of its
+standard deviation divided by n."""
 
 SMALLEST_TOLERANCE_T = 1e-9
+"""Smallest tolerance of a solve in T."""
+
 Map = Callable[..., Iterable[Any]]
-"""`map`, or that of a `concurrent.futures.Executor`."""
+"""Type of `map`, and of the method ``map`` of a `concurrent.futures.Executor`."""
 
 MIN_DRAWS = 20
+"""Smallest accepted number of draws of each chain."""
 
 
 @dataclass(frozen=True)
 class SampledPosterior:
-    """Draws of the posterior, and how good they are.
+    """Draws of the posterior, with diagnostics of their quality.
 
     Attributes
     ----------
     draws : ndarray, shape (chains, draws, parameters), in A/m
     parameters : tuple of str
+        Names of the parameters.
     accepted : float
-        Fraction of the proposals.
+        Fraction of the proposals that were accepted.
     solves : int
-        Likelihoods of the chains and of the search for the mode, interrupted runs included.
+        Number of likelihoods that the chains and the search for the mode evaluated, including those
+        of interrupted runs.
     agreement_T : float
-        Largest difference to GetDP's Newton method, draws of the posterior included.
-    diagnostics : Diagnostics
+        Largest difference from GetDP's Newton method in any reading, of magnetizations drawn from
+        the prior and from the posterior.
+    diagnostics : ConvergenceDiagnostics
     prediction : Prediction
-        Of all readings, held-out ones too.
+        Prediction of all readings, including the held-out ones.
     """
 
     draws: Floats
@@ -88,12 +104,12 @@ class SampledPosterior:
 
     @property
     def mean(self) -> Floats:
-        """(parameters,) in A/m."""
+        """Posterior mean (parameters,) in A/m."""
         return self.draws.mean(axis=(0, 1))
 
     @property
     def sd(self) -> Floats:
-        """(parameters,) in A/m."""
+        """Posterior standard deviation (parameters,) in A/m."""
         return self.draws.std(axis=(0, 1))
 
 
@@ -106,24 +122,38 @@ def sample_posterior(
 
     Parameters
     ----------
-    update : Update
-        The linearized one: its readings, noise and prior are used.
-    draws, chains : int
-        Draws of each chain, of which the first tenth is discarded; chains.
+    update : InferenceResult
+        The inference with linearized iron, whose readings, noise and prior are used.
+    session : Session
+        Its folder receives the chains and the runs of GetDP.
+    draws : int
+        Number of draws of each chain, of which the first tenth is discarded.
+    chains : int
+        Number of chains.
+    seed : int
+        Seed of the random numbers of the chains.
     effective : float
-        Effective samples that every parameter must reach.
+        Number of effective samples that every parameter must reach.
+    say : callable, optional
+        Called with a line of text about each step, to report progress.
     mapped : callable
-        Runs a function for every chain like `map`, one after another; that of an executor runs
-        them at a time, with the same result.
+        Calls a function for every chain, like `map`. The method ``map`` of an executor runs the
+        chains in parallel, with the same result.
+
+    Returns
+    -------
+    SampledPosterior
 
     Raises
     ------
     SamplingError
         If the mode is not found, or the chains are too short.
+    GetDPError
+        If the condensed model does not agree with GetDP.
     """
     if draws < MIN_DRAWS:
         raise SamplingError(f"Input draws must be at least {MIN_DRAWS} of each chain; instead "
-                            f"received {draws}. Some 1500 are usual.")
+                            f"received {draws}. About 1500 are usual.")
     model = nonlinear_model(update.magnet, update.observation, session,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
@@ -133,7 +163,8 @@ def sample_posterior(
     target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors,
                        update.prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
-    generators = [np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(chains)]
+    generators = [np.random.default_rng(part)
+                  for part in np.random.SeedSequence(seed).spawn(chains)]
     moves = [Proposal(reference, step) for step in LAPLACE_STEPS] + [
         Proposal(prior_reference(update.prior), PRIOR_STEP)]
     say(f"mode found; {chains} chains of {draws} draws")
@@ -148,7 +179,7 @@ def sample_posterior(
                   len(run.samples)) for run in runs]
         for run, (chain, generator, solves) in zip(
                 runs, mapped(_advance, *zip(*steps, strict=True)), strict=True):
-            run.go_on(chain, generator)
+            run.append(chain, generator)
             target.solves += solves
         _store(path, key, runs, model.parameters, target.solves)
         say(f"{len(runs[0].samples)} of {draws} draws")
@@ -159,8 +190,8 @@ def sample_posterior(
     chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
     predicted = model(chosen, tolerance)
     spread = (predicted - predicted.mean(axis=0)) / np.sqrt(len(predicted))
-    some = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
-    agreement = compare_with_newton(model, update.magnet, update.observation, session, some)
+    verified = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
+    agreement = compare_with_newton(model, update.magnet, update.observation, session, verified)
     return SampledPosterior(
         kept, model.parameters, float(np.mean([run.accepted for run in runs])),
         target.solves, max(agreement, model.agreement_T), diagnostics,
@@ -170,7 +201,7 @@ def sample_posterior(
 
 @dataclass(frozen=True)
 class _Readings:
-    """Those that update the model, by magnetization."""
+    """The map from magnetizations to the training readings; unlike a closure it can be pickled."""
 
     model: NonlinearModel
     tolerance_T: float
@@ -184,22 +215,36 @@ def _advance(
     target: Posterior, moves: Sequence[Proposal], count: int, generator: np.random.Generator,
     last: Floats, first: int,
 ) -> tuple[Chain, np.random.Generator, int]:
-    """Some more steps of a chain, on any machine; with its generator and the solves they took."""
-    own = replace(target)  # counts from zero
+    """Return the next steps of a chain, its generator after them, and the number of solves.
+
+    The function runs in this process or in a worker on any machine, so that it returns the changed
+    generator.
+    """
+    own = replace(target)  # a copy, whose number of solves starts at zero
     return sample(own, moves, count, generator, last, first=first), generator, own.solves
 
 
 @dataclass
 class _Run:
-    """A chain in the making."""
+    """The state of a chain between two chunks.
+
+    Attributes
+    ----------
+    generator : numpy.random.Generator
+    last : ndarray
+        Last point of the chain, in the whitened coordinates of `Chain`.
+    samples : ndarray, shape (draws, parameters), in A/m
+    accepted : float
+        Fraction of the proposals that were accepted so far.
+    """
 
     generator: np.random.Generator
     last: Floats
     samples: Floats = field(default_factory=lambda: np.empty((0, 0)))
     accepted: float = 0.0
 
-    def go_on(self, chain: Chain, generator: np.random.Generator) -> None:
-        """Append; the generator is where the chain left it."""
+    def append(self, chain: Chain, generator: np.random.Generator) -> None:
+        """Append the steps of a chain, and keep the generator in the state after them."""
         self.generator = generator
         before = len(self.samples)
         self.samples = np.vstack([self.samples, chain.samples]) if before else chain.samples
@@ -209,7 +254,7 @@ class _Run:
 
 
 def _key(update: InferenceResult, model: NonlinearModel, chains: int, seed: int) -> str:
-    """Digest of all that the chains depend on, but their length."""
+    """Return a digest of everything that the chains depend on, except their length."""
     digest = hashlib.sha256(f"{chains} {seed}".encode() + code_digest(__name__))
     iron = model.condensed
     noise = update.noise.covariance
@@ -224,7 +269,11 @@ def _key(update: InferenceResult, model: NonlinearModel, chains: int, seed: int)
 def _store(
     path: Path, key: str, runs: list[_Run], parameters: tuple[str, ...], solves: int
 ) -> None:
-    """As ArviZ reads it: group ``posterior``, dimensions chain and draw."""
+    """Store the chains in a NetCDF file with the layout that ArviZ reads.
+
+    The group ``posterior`` has the dimensions chain and draw. The group ``state`` has what is
+    needed to continue.
+    """
     posterior = xr.Dataset(
         {"magnetization": (("chain", "draw", "parameter"), np.array([r.samples for r in runs]),
                            {"units": "A/m"})},
@@ -244,7 +293,11 @@ def _store(
 
 
 def _resume(path: Path, key: str, runs: list[_Run]) -> int:
-    """Go on from what an interrupted run stored, if it is of the same inputs; its solves."""
+    """Continue the stored chains of an interrupted run; return the number of its solves.
+
+    The stored chains are ignored, and 0 is returned, if they belong to other inputs or the file is
+    missing or damaged.
+    """
     count = len(runs)
     try:
         state = untrusted.read_dataset(path, "state")
@@ -256,11 +309,12 @@ def _resume(path: Path, key: str, runs: list[_Run]) -> int:
         stored = untrusted.read_dataset(path, "posterior")["magnetization"]
         samples = untrusted.finite_array(stored, (count, stored.shape[1], len(runs[0].last)))
         generators = [np.random.default_rng() for _ in runs]
-        for generator, words in zip(generators, json.loads(state.attrs["generators"]), strict=True):
-            generator.bit_generator.state = words
+        states = json.loads(state.attrs["generators"])
+        for generator, generator_state in zip(generators, states, strict=True):
+            generator.bit_generator.state = generator_state
     except MemoryError:
         raise
-    except Exception:  # what is damaged, in whatever way, is as good as nothing
+    except Exception:  # a file that is damaged in any way is treated as missing
         return 0
     for number, run in enumerate(runs):
         run.last, run.samples, run.accepted = last[number], samples[number], float(accepted[number])
@@ -268,36 +322,39 @@ def _resume(path: Path, key: str, runs: list[_Run]) -> int:
     return solves
 
 
-def sampled_summary(found: SampledPosterior) -> dict[str, object]:
-    """What a script wants to know of the samples."""
+def sampled_summary(sampled: SampledPosterior) -> dict[str, object]:
+    """Return the main figures of the samples as plain data, the content of sampled.json."""
     return {
-        "chains": found.draws.shape[0], "draws": found.draws.shape[1],
-        "solves": found.solves, "accepted": found.accepted,
-        "largest_r_hat": float(found.diagnostics.r_hat.max()),
-        "smallest_bulk_ess": float(found.diagnostics.bulk.min()),
-        "smallest_tail_ess": float(found.diagnostics.tail.min()),
-        "largest_mcse_over_sd": float((found.diagnostics.mcse / found.sd).max()),
-        "agreement_with_getdp_T": found.agreement_T,
+        "chains": sampled.draws.shape[0], "draws": sampled.draws.shape[1],
+        "solves": sampled.solves, "accepted": sampled.accepted,
+        "largest_r_hat": float(sampled.diagnostics.r_hat.max()),
+        "smallest_bulk_ess": float(sampled.diagnostics.bulk.min()),
+        "smallest_tail_ess": float(sampled.diagnostics.tail.min()),
+        "largest_mcse_over_sd": float((sampled.diagnostics.mcse / sampled.sd).max()),
+        "agreement_with_getdp_T": sampled.agreement_T,
     }
 
 
-def write_sampled(found: SampledPosterior, folder: Path) -> None:
-    """Write sampled.json and sampled.csv, a row a parameter; the draws are in chains.nc."""
-    text = json.dumps(sampled_summary(found), indent=1, allow_nan=False)
+def write_sampled(sampled: SampledPosterior, folder: Path) -> None:
+    """Write sampled.json, and sampled.csv with a row per parameter; the draws are in chains.nc."""
+    text = json.dumps(sampled_summary(sampled), indent=1, allow_nan=False)
     write_text(folder / "sampled.json", text + "\n")
-    columns = (found.parameters, found.mean, found.sd, found.diagnostics.r_hat,
-               found.diagnostics.bulk, found.diagnostics.tail, found.diagnostics.mcse)
+    columns = (sampled.parameters, sampled.mean, sampled.sd, sampled.diagnostics.r_hat,
+               sampled.diagnostics.bulk, sampled.diagnostics.tail, sampled.diagnostics.mcse)
     rows = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
     write_text(folder / "sampled.csv", "\n".join([
         "parameter,mean_A_per_m,sd_A_per_m,r_hat,bulk_ess,tail_ess,mcse_A_per_m", *rows, ""]))
 
 
-def with_samples(update: InferenceResult, found: SampledPosterior) -> InferenceResult:
-    """The update with the samples' prediction, and their mean and covariance as its posterior."""
-    flat = found.draws.reshape(-1, found.draws.shape[2])
+def with_samples(update: InferenceResult, sampled: SampledPosterior) -> InferenceResult:
+    """Return an inference with its posterior and predictions replaced by those of samples.
+
+    The new posterior is the normal distribution with the mean and covariance of the samples.
+    """
+    flat = sampled.draws.reshape(-1, sampled.draws.shape[2])
     root = (flat - flat.mean(axis=0)).T / np.sqrt(len(flat) - 1)
     values, vectors = np.linalg.eigh(root @ root.T)
-    from_samples = replace(update.posterior, mean=found.mean,
+    from_samples = replace(update.posterior, mean=sampled.mean,
                            root=vectors * np.sqrt(np.maximum(values, 0)))
     return replace(update, kind="samples", posterior=from_samples,
-                   prediction_posterior=found.prediction)
+                   prediction_posterior=sampled.prediction)

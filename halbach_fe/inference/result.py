@@ -67,13 +67,26 @@ class Prediction:
 
 @dataclass(frozen=True)
 class RegionScore:
-    """How prior and posterior predict the readings of one region.
+    """Scores of the predictions of prior and posterior for the readings of a region and a part.
 
-    Relative errors are ``|measured - predicted| / |measured|``, of readings that are not 0;
-    standardized residuals are those over the standard deviation of prediction and noise, coverage
-    the fraction within their 95 % band; chi2 is per reading, by the full covariance of both.
-    Coverage and chi2 are None for training readings, which the posterior has seen, and whose
-    standardized residuals by it are therefore smaller than 1.
+    Attributes
+    ----------
+    region, part : str
+        Noise region and part (training, held out, held-out map) of the readings.
+    readings : int
+        Number of readings.
+    median_relative_error_prior, median_relative_error_posterior : float or None
+        Median of ``|measured - predicted| / |measured|`` over the readings that are not 0.
+    rms_standardized_prior, rms_standardized_posterior : float
+        Root mean square of the standardized residuals: measured minus predicted, divided by the
+        standard deviation of prediction, noise and solver together. That of the posterior is below
+        1 for training readings, to which the posterior was fitted.
+    coverage95_prior, coverage95_posterior : float or None
+        Fraction of the standardized residuals within their central 95 % band; None for training
+        readings.
+    chi2_prior, chi2_posterior : float or None
+        Chi-squared per reading by the full covariance of prediction, noise and solver; None for
+        training readings.
     """
 
     region: str
@@ -91,12 +104,53 @@ class RegionScore:
 
 @dataclass(frozen=True)
 class InferenceResult(ShownInNotebook):
-    """A study, a map, and what the one says about the other.
+    """The posterior of a magnet's magnetizations after a measurement, and its predictions.
 
-    ``parts`` and ``regions`` are those of each reading: training, held out, or of a map that is
-    only predicted; and the noise region. ``measured_blocks`` is how many blocks the prior was
-    measured of; None if it is the study's. ``left_out`` is that of
-    `halbach_fe.stats.linear_gaussian.LinearPosterior`.
+    Attributes
+    ----------
+    magnet : Magnet
+    observation : Observation
+        How B at points becomes readings; all readings, training and held out.
+    readings : ndarray, shape (readings,), in T
+        Measured values.
+    noise : NoiseCovariance
+        The noise covariance of the readings.
+    parts : tuple of str
+        Part of each reading: ``training``, ``held out`` or, if the reading is from a validation
+        map, ``held-out map``.
+    regions : tuple of str
+        Noise region of each reading.
+    response : Response
+        The linear model of the readings.
+    prior, posterior : Gaussian
+        Distributions of the magnetizations (parameters,) in A/m.
+    prediction_prior, prediction_posterior : Prediction
+        Their predictions of all readings.
+    prior_conflict : float
+        Chi-squared per training reading of the prior's prediction. It is about 1 if prior, model
+        and noise are right; see `conflict_limit`.
+    parameters_learnt : float
+        Effective number of parameters that the readings determine.
+    log_evidence : float
+        Logarithm of the marginal likelihood of the training readings.
+    kind : {"closed form", "linearized", "samples"}
+        How the posterior was computed: in closed form, by linearization of the iron, or by Markov
+        chains.
+    measured_blocks : int or None
+        Number of measured blocks from which the prior follows; None if it is the study's prior.
+    left_out : float
+        Upper bound of the relative change of a posterior variance by discarded information, see
+        `halbach_fe.stats.linear_gaussian.LinearPosterior`.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> result = hf.infer(magnet, hf.read_map("map.csv"), hf.Session.open("results"))
+    >>> list(result.magnetizations)
+    ['nominal', 'prior_mean', 'prior_sd', 'posterior_mean', 'posterior_sd']
+    >>> result.prior_conflict < result.conflict_limit
+    True
     """
 
     magnet: Magnet
@@ -124,9 +178,7 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def magnetizations(self) -> xr.Dataset:
-        """Block magnetizations in A/m by parameter: nominal, and mean and standard deviation of
-        prior and posterior.
-        """
+        """Nominal magnetizations, and mean and sd of prior and posterior, in A/m by parameter."""
         values = {
             "nominal": self.response.nominal, "prior_mean": self.prior.mean,
             "prior_sd": self.prior.sd, "posterior_mean": self.posterior.mean,
@@ -137,8 +189,9 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def predictions(self) -> xr.Dataset:
-        """All readings with their noise, and what prior and posterior predict of them: the columns
-        of prediction.csv, by reading.
+        """All readings with their noise, and the predictions of prior and posterior.
+
+        The variables are the columns of prediction.csv.
         """
         prior, posterior = self.prediction_prior, self.prediction_posterior
         columns = dict(zip(PREDICTION_COLUMNS, (
@@ -151,12 +204,12 @@ class InferenceResult(ShownInNotebook):
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:
-        """Which readings (readings,) the update has not seen."""
+        """Mask (readings,) of the readings that did not update the model."""
         return np.array(self.parts) != TRAINING
 
     @cached_property
     def errors(self) -> NoiseCovariance:
-        """What readings may differ by from the model: their noise and the solver's error."""
+        """Covariance of the readings about the model: their noise and the solver's error."""
         return self.noise.with_independent_errors(self.response.error)
 
     @property
@@ -166,38 +219,40 @@ class InferenceResult(ShownInNotebook):
 
     @cached_property
     def scores(self) -> tuple[RegionScore, ...]:
-        """Scores by region, and by part."""
+        """Scores of the predictions by region and part."""
         noise = self.study.noise
         names = [region.name for region in noise.regions] if noise else []
         predictions = {"prior": self.prediction_prior, "posterior": self.prediction_posterior}
-        known = {name: (one, self.relative_error(one), self.standardized(one))
-                 for name, one in predictions.items()}
+        errors = {
+            name: (prediction, self.relative_error(prediction), self.standardized(prediction))
+            for name, prediction in predictions.items()}
         return tuple(
-            self._score(region, part, chosen, known)
+            self._score(region, part, chosen, errors)
             for region in dict.fromkeys(names or [ALL_READINGS])
             for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)
             if (chosen := self.chosen(region, part)).any())
 
     def chosen(self, region: str, part: str) -> NDArray[np.bool_]:
-        """Which readings (readings,) are in a region and a part."""
+        """Return the mask (readings,) of the readings in a region and a part."""
         return (np.array(self.regions) == region) & (np.array(self.parts) == part)
 
     @property
     def conflict_limit(self) -> float:
-        """`prior_conflict` beyond which chance is no explanation: five standard deviations."""
+        """Limit of `prior_conflict` beyond which chance is no explanation: five sd above 1."""
         return 1 + 5 * float(np.sqrt(2 / np.sum(~self.held_out)))
 
     def relative_error(self, prediction: Prediction) -> Floats:
-        """``|measured - predicted| / |measured|`` of every reading; NaN for one of exactly 0."""
+        """Return ``|measured - predicted| / |measured|`` (readings,); NaN for readings of 0."""
         measured = np.where(self.readings != 0, np.abs(self.readings), np.nan)
         return np.asarray(np.abs(self.readings - prediction.mean) / measured)
 
     def standardized(self, prediction: Prediction) -> Floats:
-        """Measured less predicted over the standard deviation of prediction, noise and solver
-        together, (readings,).
+        """Return the standardized residuals (readings,) of a prediction.
 
-        Of held-out readings whose noise is correlated with that of training readings, as that of
-        another component of the same point, with what the latter foretell taken off.
+        They are measured minus predicted, divided by the standard deviation of prediction, noise
+        and solver together. The noise of a held-out reading may be correlated with that of training
+        readings, for example of another component at the same point. Its expectation from the
+        training readings is then subtracted from the residual.
         """
         result = (self.readings - prediction.mean) / np.hypot(prediction.sd, self.sigma)
         if self.errors.covariance[self.held_out][:, ~self.held_out].nnz:
@@ -209,44 +264,59 @@ class InferenceResult(ShownInNotebook):
         return result
 
     def whitened(self, prediction: Prediction, chosen: NDArray[np.bool_]) -> Floats:
-        """Residuals (chosen,) of some readings, whitened by the covariance of prediction, noise
-        and solver together: independent and standard normal if all is well and the posterior has
-        not seen them.
+        """Return the residuals (chosen,) of some readings, whitened.
+
+        The covariance is that of prediction, noise and solver together. The whitened residuals are
+        independent and standard normal if model and noise are right and the readings were not used
+        to update the model.
         """
         return whitened(*self._unseen(prediction, chosen), prediction.columns)
 
     def _unseen(
         self, prediction: Prediction, chosen: NDArray[np.bool_]
     ) -> tuple[Floats, NoiseCovariance, Callable[[Ints], Floats]]:
-        """Residuals of some readings, their noise, and rows of a root of the prediction's
-        covariance; of what is left of each when all that the noise of other, training readings
-        foretells is taken off. Only then are noise and prediction independent.
+        """Return residuals, noise and prediction of some readings, given the other training ones.
+
+        The noise of the chosen readings may be correlated with that of training readings. Its
+        conditional expectation, a linear combination of the residuals of the latter, is subtracted
+        from the residuals and from the prediction, and the noise is the conditional one. Only then
+        are noise and prediction independent.
+
+        Returns
+        -------
+        residuals : ndarray, shape (chosen,), in T
+        noise : NoiseCovariance
+        root : callable
+            Rows of a root of the prediction's covariance, for indices of chosen readings.
         """
         seen = np.flatnonzero(~self.held_out & ~chosen)
-        told, noise = self.errors.conditional(chosen, seen)
+        regression, noise = self.errors.conditional(chosen, seen)
         residual, index = self.readings - prediction.mean, np.flatnonzero(chosen)
 
         def root(rows: Ints) -> Floats:
-            own, from_ = prediction.root(index[rows]), told[rows]
-            if from_.nnz:
-                needed = np.unique(from_.indices)
-                own = own - from_[:, needed] @ prediction.root(seen[needed])
+            own, weights = prediction.root(index[rows]), regression[rows]
+            if weights.nnz:
+                needed = np.unique(weights.indices)
+                own = own - weights[:, needed] @ prediction.root(seen[needed])
             return own
 
-        return residual[chosen] - told @ residual[seen], noise, root
+        return residual[chosen] - regression @ residual[seen], noise, root
 
     def _score(
         self, region: str, part: str, chosen: NDArray[np.bool_],
-        known: Mapping[str, tuple[Prediction, Floats, Floats]],
+        errors: Mapping[str, tuple[Prediction, Floats, Floats]],
     ) -> RegionScore:
-        """Score of some readings, from each prediction's relative and standardized errors."""
+        """Return the score of the chosen readings.
+
+        ``errors`` holds each prediction with its relative errors and standardized residuals.
+        """
         figures: dict[str, Any] = {}
-        for name, (prediction, relative, standardized) in known.items():
-            errors = relative[chosen & ~np.isnan(relative)]
+        for name, (prediction, relative, standardized) in errors.items():
+            finite = relative[chosen & ~np.isnan(relative)]
             residuals = np.abs(standardized[chosen])
             unseen = part != TRAINING
             figures |= {
-                f"median_relative_error_{name}": float(np.median(errors)) if len(errors) else None,
+                f"median_relative_error_{name}": float(np.median(finite)) if len(finite) else None,
                 f"rms_standardized_{name}": float(np.sqrt(np.mean(residuals**2))),
                 f"coverage95_{name}": float(np.mean(residuals <= COVERAGE_Z)) if unseen else None,
                 f"chi2_{name}": float(

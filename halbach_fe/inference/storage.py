@@ -1,4 +1,4 @@
-"""Files of an inference: posterior.h5, prediction.csv, summary.json."""
+"""The files of an inference: posterior.h5, prediction.csv and summary.json."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 
 WRITTEN_COVARIANCE = 2000
-"""Parameters, at most, whose covariance is written too: 32 MB."""
+"""Largest number of parameters for which the full covariance (then 32 MB) is written too."""
 
 
 def write_inference(update: InferenceResult, folder: Path) -> None:
     """Write posterior.h5, prediction.csv and summary.json."""
     magnetization = update.magnetizations
     magnetization.attrs["study"] = update.study.model_dump_json()
-    known = {"prior": update.prior, "posterior": update.posterior}
-    for name, one in known.items():
-        magnetization.update(_stored_root(name, one, update.prior))
+    distributions = {"prior": update.prior, "posterior": update.posterior}
+    for name, distribution in distributions.items():
+        magnetization.update(_stored_root(name, distribution, update.prior))
         if len(update.response.parameters) <= WRITTEN_COVARIANCE:
-            magnetization[f"{name}_covariance"] = (("parameter", "parameter_2"), one.covariance,
-                                                   {"units": "A2/m2"})
+            magnetization[f"{name}_covariance"] = (
+                ("parameter", "parameter_2"), distribution.covariance, {"units": "A2/m2"})
     write_hdf5(magnetization, folder / "posterior.h5")
     readings = update.predictions
     write_text(folder / "prediction.csv", csv_text(
@@ -45,41 +45,45 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
 
 
 def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
-    """Prior and posterior of the magnetizations in A/m, by these names, from a posterior.h5.
+    """Read ``prior`` and ``posterior`` of the magnetizations in A/m from a file posterior.h5.
 
     Raises
     ------
     MeasurementError
-        If it is none, or not of this study's magnet.
+        If the file cannot be read as a posterior.h5, or belongs to another magnet.
     """
     nominal = np.concatenate([block.magnetization[:magnet.dimension] for block in magnet.blocks])
-    found: dict[str, Gaussian] = {}
+    distributions: dict[str, Gaussian] = {}
     try:
         data = untrusted.read_dataset(path)
         own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
         for name in ("prior", "posterior"):
-            found[name] = Gaussian(untrusted.finite_array(data[f"{name}_mean"], own.shape),
-                                   _read_root(data, name, found.get("prior"), len(own)))
+            distributions[name] = Gaussian(
+                untrusted.finite_array(data[f"{name}_mean"], own.shape),
+                _read_root(data, name, distributions.get("prior"), len(own)))
     except (OSError, KeyError, ValueError, TypeError):
         raise MeasurementError(must_be(
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
-            "none that can be read")) from None
+            "a file that cannot be read as such")) from None
     if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
         raise MeasurementError(must_be(
             "--posterior", str(path), f"that of the magnet of study {magnet.name}",
-            "that of another nominal magnet", "Use the study that was inferred."))
-    return found
+            "that of another nominal magnet", "Use the study of that inference."))
+    return distributions
 
 
-def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
-    """Variables of the root of a distribution's covariance: its rows as a sparse matrix, or what
-    the readings left of the prior's, see `CovarianceFactor`.
+def _stored_root(name: str, distribution: Gaussian, prior: Gaussian) -> dict[str, Any]:
+    """Return the variables of posterior.h5 that store the root of a distribution's covariance.
+
+    The root is stored as a sparse matrix. If it is the prior's root with its standard deviations
+    reduced along some directions (see `CovarianceFactor`), only the reduction is stored.
     """
-    if (isinstance(one.root, CovarianceFactor) and one is not prior
-            and one.root.outer is root_matrix(prior.root)):
-        return {f"{name}_directions": (("coordinate", "direction"), one.root.directions),
-                f"{name}_left": ("direction", one.root.remaining)}
-    rows = sparse.csr_array(root_matrix(one.root))
+    root = distribution.root
+    if (isinstance(root, CovarianceFactor) and distribution is not prior
+            and root.outer is root_matrix(prior.root)):
+        return {f"{name}_directions": (("coordinate", "direction"), root.directions),
+                f"{name}_left": ("direction", root.remaining)}
+    rows = sparse.csr_array(root_matrix(root))
     return {f"{name}_root": (f"{name}_entry", rows.data, {"units": "A/m"}),
             f"{name}_root_column": (f"{name}_entry", rows.indices),
             f"{name}_root_row_start": (f"{name}_row", rows.indptr, {"columns": rows.shape[1]})}
@@ -88,7 +92,13 @@ def _stored_root(name: str, one: Gaussian, prior: Gaussian) -> dict[str, Any]:
 def _read_root(
     data: xr.Dataset, name: str, prior: Gaussian | None, size: int
 ) -> Floats | CovarianceFactor:
-    """The root with ``size`` rows; KeyError, ValueError or TypeError if what is stored is none."""
+    """Return the stored root with ``size`` rows.
+
+    Raises
+    ------
+    KeyError, ValueError or TypeError
+        If the variables are missing or do not describe a root.
+    """
     if f"{name}_left" in data and prior is not None:
         left = data[f"{name}_left"]
         return CovarianceFactor(root_matrix(prior.root), untrusted.finite_array(
@@ -99,11 +109,12 @@ def _read_root(
         (untrusted.finite_array(values, values.shape), _whole(data[f"{name}_root_column"]),
          _whole(start)),
         shape=(size, int(start.attrs["columns"])))
-    rows.check_format()  # scipy would follow indices anywhere
+    rows.check_format()  # without it, scipy would follow indices outside of the arrays
     return stacked_root(rows)
 
 
 def _whole(data: xr.DataArray) -> Ints:
+    """Return stored whole numbers as integers; ValueError if they are not whole or too large."""
     values = untrusted.finite_array(data, data.shape)
     if (np.abs(values) > np.iinfo(np.int32).max).any() or (values % 1 != 0).any():
         raise ValueError("it must be whole numbers")
@@ -111,7 +122,7 @@ def _whole(data: xr.DataArray) -> Ints:
 
 
 def inference_summary(update: InferenceResult) -> dict[str, object]:
-    """What a script wants to know of an update."""
+    """Return the main figures of an inference as plain data, the content of summary.json."""
     shift = update.posterior.mean - update.prior.mean
     return {
         "study": update.study.name,

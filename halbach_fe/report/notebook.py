@@ -1,4 +1,4 @@
-"""What a notebook shows of a result: its main figure, or a table."""
+"""The HTML that a notebook shows for a result: its main figure, or a table."""
 
 from __future__ import annotations
 
@@ -41,8 +41,14 @@ DOTS_PER_INCH = 100
 
 @singledispatch
 def html_of(result: object) -> str:
-    """Return the main figure or table of a result as HTML, complete without other files."""
-    raise TypeError(f"a {type(result).__name__} has no figure")
+    """Return the main figure or table of a result as HTML that needs no other file.
+
+    Raises
+    ------
+    TypeError
+        If the result is of a type without figure or table.
+    """
+    raise TypeError(f"a {type(result).__name__} has no figure or table")
 
 
 @html_of.register
@@ -71,19 +77,19 @@ def _(diagnosis: Diagnosis) -> str:
 
 
 @html_of.register
-def _(found: MultipoleTables) -> str:
-    return "".join(picture(multipole_figure(known, None), "Multipoles in units of 1e-4")
-                   for _, known in found.tables)
+def _(result: MultipoleTables) -> str:
+    return "".join(picture(multipole_figure(multipoles, None), "Multipoles in units of 1e-4")
+                   for _, multipoles in result.tables)
 
 
 @html_of.register
-def _(found: Verification) -> str:
-    return table(difference_table(found))
+def _(verification: Verification) -> str:
+    return table(difference_table(verification))
 
 
 @html_of.register
 def _(plan: MeasurementPlan) -> str:
-    return table([{"figure": name, "value": str(value)}
+    return table([{"quantity": name, "value": str(value)}
                   for name, value in plan_summary(plan).items()])
 
 
@@ -93,18 +99,18 @@ def _(shim: Shim) -> str:
 
 
 @html_of.register
-def _(found: SortedBlocks) -> str:
-    return table(order_table(found))
+def _(assignment: SortedBlocks) -> str:
+    return table(order_table(assignment))
 
 
 @html_of.register
-def _(found: Tolerance) -> str:
-    return table(quantile_table(found))
+def _(tolerance: Tolerance) -> str:
+    return table(quantile_table(tolerance))
 
 
 @html_of.register
-def _(found: DemagnetizationMap) -> str:
-    return table(worst_block_table(found.by_block()))
+def _(demagnetization: DemagnetizationMap) -> str:
+    return table(worst_block_table(demagnetization.by_block()))
 
 
 @html_of.register
@@ -115,7 +121,7 @@ def _(campaign: SimulatedCampaign) -> str:
 
 
 def picture(figure: Figure, text: str) -> str:
-    """Return a figure as an image element; ``text`` stands for it where it cannot be seen."""
+    """Return a figure as an HTML image element with an alternative text."""
     raw = io.BytesIO()
     figure.savefig(raw, format="png", dpi=DOTS_PER_INCH)
     data = base64.b64encode(raw.getvalue()).decode("ascii")
@@ -123,7 +129,7 @@ def picture(figure: Figure, text: str) -> str:
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Return rows of text as an HTML table; nothing if there are none."""
+    """Return rows of text as an HTML table; an empty text if there are no rows."""
     if not rows:
         return ""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])

@@ -1,4 +1,4 @@
-"""The files of a result: its tables, and its page with all figures."""
+"""The files of a result: its tables, and its HTML page with all figures."""
 
 from __future__ import annotations
 
@@ -38,26 +38,34 @@ from halbach_fe.synthetic.simulate import SimulatedCampaign, write_campaign
 
 
 def provenance(getdp: str | None = None) -> dict[str, str]:
-    """Versions of the programs, as a page ends with."""
-    found = {"halbach-fe": metadata.version("halbach-fe")}
-    return found if getdp is None else found | {"GetDP": getdp}
+    """Return the versions of the programs, which are shown at the end of a page."""
+    versions = {"halbach-fe": metadata.version("halbach-fe")}
+    return versions if getdp is None else versions | {"GetDP": getdp}
 
 
 @singledispatch
 def write_report(result: object, folder: str | Path) -> Path:
-    """Write a result's files into a folder: its tables, and its page with all figures.
+    """Write the files of a result into a folder: its tables, and its HTML page with all figures.
 
     Parameters
     ----------
     result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, MeasurementPlan, \
 Shim, SortedBlocks, Tolerance, DemagnetizationMap or SimulatedCampaign
+        The result of a function of `halbach_fe`.
     folder : str or Path
-        Made if it does not exist.
+        Folder for the files; it is made if it does not exist.
 
     Returns
     -------
     Path
-        Of the page, which needs no network and no other file.
+        Path of the page, which needs no network and no other file.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    TypeError
+        If ``result`` is of any other type.
 
     Examples
     --------
@@ -67,12 +75,11 @@ Shim, SortedBlocks, Tolerance, DemagnetizationMap or SimulatedCampaign
     >>> hf.write_report(solution, "results").name
     'report.html'
     """
-    raise TypeError(f"no report can be written of a {type(result).__name__}")
+    raise TypeError(f"there is no report for a {type(result).__name__}")
 
 
 @write_report.register
 def _(result: Solution, folder: str | Path) -> Path:
-
     write_solution(result, Path(folder))
     write_solution_report(result, Path(folder), provenance(result.getdp))
     return Path(folder) / "report.html"
@@ -144,23 +151,30 @@ def _(result: SimulatedCampaign, folder: str | Path) -> Path:
 
 
 def write_diagnosis(
-    found: Diagnosis, separations: Sequence[Separation], study: Study, text: str, folder: Path,
+    diagnosis: Diagnosis, separations: Sequence[Separation], study: Study, text: str, folder: Path,
     assumptions: Sequence[str] = (),
 ) -> Path:
-    """Write summary and page of a diagnosis, and the study with what it lacked.
+    """Write summary and page of a diagnosis, and the study with the identified effects added.
 
     Parameters
     ----------
+    diagnosis : Diagnosis
     separations : sequence of Separation
-        Which further measurements would tell rival effects apart.
+        Further measurements that would distinguish rival effects.
     study : Study
-        As it was given.
+        The study before the diagnosis.
     text : str
-        Of its file, whose comments are kept in study.diagnosed.toml.
+        Text of the study's file, whose comments are kept in study.diagnosed.toml.
+    folder : Path
     assumptions : sequence of str
-        Said at the top of the page.
+        Sentences that are shown at the top of the page.
+
+    Returns
+    -------
+    Path
+        Path of the page.
     """
-    write_summary(found, separations, folder)
-    write_diagnosis_report(found, separations, folder, assumptions)
-    write_study(text, study, found, folder)
+    write_summary(diagnosis, separations, folder)
+    write_diagnosis_report(diagnosis, separations, folder, assumptions)
+    write_study(text, study, diagnosis, folder)
     return folder / "diagnosis.html"

@@ -1,1 +1,1 @@
-"""Magnetostatics: from a magnet to B at points, exactly in vacuum and by finite elements."""
+"""Magnetostatics: B of a magnet at points, in closed form in vacuum and by finite elements."""

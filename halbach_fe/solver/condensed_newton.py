@@ -377,12 +377,12 @@ def condense(
     surface = np.flatnonzero(touches)
     schur = np.empty((len(surface), len(surface)))
     condensed = np.empty((outputs.shape[0], len(surface)))
-    coupling, seen = coupling[:, surface], outputs[:, rest]
+    coupling, other_outputs = coupling[:, surface], outputs[:, rest]
     for first in range(0, len(surface), COLUMNS_AT_ONCE):
         part = slice(first, first + COLUMNS_AT_ONCE)
         solved = inner.solve(coupling[:, part].toarray())
         schur[:, part] = coupling.T @ solved
-        condensed[:, part] = own[:, surface[part]].toarray() - seen @ solved
+        condensed[:, part] = own[:, surface[part]].toarray() - other_outputs @ solved
     schur = (schur + schur.T) / 2
     rows, columns = np.repeat(surface, len(surface)), np.tile(surface, len(surface))
     dense = sparse.csr_array((schur.ravel(), (rows, columns)), shape=(len(iron), len(iron)))

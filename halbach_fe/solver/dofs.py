@@ -140,7 +140,7 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
     total = before + solves
     if len(raw) != total * size:
         raise GetDPError(f"GetDP's file {path.name} holds {len(raw)} bytes in place of {total} "
-                         f"solutions of {unknowns} unknowns; a full disk looks like this.")
+                         f"solutions of {unknowns} unknowns; a full disk can cause this.")
     heads = raw.reshape(total, size)[:, :8].copy().view(">i4")
     if not (heads == [_VECTOR, unknowns]).all():
         raise GetDPError(f"GetDP's file {path.name} does not hold {total} PETSc vectors.")
@@ -168,7 +168,7 @@ def read_saved(path: Path, unknowns: int, count: int) -> Floats:
         raise GetDPError(f"GetDP's solutions {path.name} cannot be read ({error}).") from None
     if solutions.shape != (count, unknowns):
         raise GetDPError(f"GetDP's file {path.name} holds solutions {solutions.shape} in place of "
-                         f"{count} of {unknowns} unknowns; a full disk looks like this.")
+                         f"{count} of {unknowns} unknowns; a full disk can cause this.")
     if not np.isfinite(solutions).all():
         raise GetDPError(f"GetDP's file {path.name} holds values that are not finite.")
     return solutions

@@ -180,8 +180,8 @@ def finite_element_part(
     def block(number: int, some: Ints | slice) -> Floats:
         placement = symmetry.images[number]
         first = 1 + size * symmetry.sources.index(placement.source)
-        seen = np.moveaxis(fields[first:first + size, index[number][some]], 0, 2)
-        return placement.from_source(seen)
+        source_fields = np.moveaxis(fields[first:first + size, index[number][some]], 0, 2)
+        return placement.from_source(source_fields)
 
     tangent = fields[0, here]
     return ElementFields(_superposition_tolerance(magnet, route, placed),

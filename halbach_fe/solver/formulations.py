@@ -10,8 +10,8 @@ boundary (the files in pro/ derive them):
 * ``scalar_potential_3d.pro``: psi = mu_0 phi, int mu_r grad psi . grad v = int B_r . grad v, nodal
   elements of second order; psi = 0 on the boundary, so that H x n = 0.
 
-The first two are dual to the third: their boundary conditions bound the effect of the outer
-boundary from opposite sides.
+The scalar potential is the dual of the vector potential. The difference between their solutions
+shows the error that the outer boundary causes by its finite distance.
 """
 
 from __future__ import annotations

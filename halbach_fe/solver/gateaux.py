@@ -43,10 +43,10 @@ def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Sess
     """
     blocks = magnet.blocks
     if not 0 <= block < len(blocks):
-        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)}; "
-                         f"instead received {block + 1}.")
-    # Solve for B itself by a vector potential: the exact field and the reaction are only defined
-    # outside the materials, and the gradient of the scalar potential is H there, not B.
+        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)} "
+                         f"blocks; instead received number {block + 1}. Correct the number.")
+    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
+    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
     direct = magnet.with_(solver__method="direct", solver__route="auto")
     formulation = formulation_of(direct, choose_route(direct, points))
     if magnet.is_nonlinear:

@@ -1,10 +1,10 @@
-"""The one module that runs GetDP, and that believes nothing it says.
+"""Running GetDP, and verification of every run; only this module starts GetDP.
 
 GetDP ends with exit code 0 after many failures: an unconverged solver, a region that the mesh
-lacks, a misspelt ``-setnumber``, a point outside the mesh. So every run happens in a private
-folder, with short relative names (a path over 256 characters overflows a buffer of GetDP), and
-its exit code, every line of its log, the number of unknowns, the residual of every solve and
-every number of its output are checked before the result is handed on.
+lacks, a misspelt ``-setnumber``, a point outside the mesh. Therefore every run happens in a private
+folder, with short relative names (a path over 256 characters overflows a buffer of GetDP). The exit
+code, every line of the log, the number of unknowns, the residual of every linear solve and every
+number of the output are checked before a result is returned.
 """
 
 from __future__ import annotations
@@ -30,25 +30,31 @@ from halbach_fe.core.errors import GetDPError, GetDPNotFoundError
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
 LOG_NAME = "getdp.log"
 MAX_NAME = 200
-"""GetDP keeps paths in 256 characters, and appends to them."""
+"""Largest accepted length of a file name. GetDP keeps paths in buffers of 256 characters, and
+appends to them."""
 
 MAX_RELATIVE_RESIDUAL = 1e-8
-"""A direct solve leaves 1e-13; 1e-8 of the source is still 1e-4 of the smallest error we state."""
+"""Largest accepted residual of a linear solve, relative to its first residual. A direct solver
+leaves 1e-13. A residual of 1e-8 of the source is still 1e-4 of the smallest error bar that is
+reported."""
 
 DIRECT_SOLVER = (
     "-petsc_prealloc", "200",
     "-ksp_type", "preonly", "-pc_type", "cholesky", "-pc_factor_mat_solver_type", "mumps",
 )
-"""The matrices are symmetric: Cholesky takes half the memory of LU. Rows longer than those
-preallocated make assembling many times slower."""
+"""PETSc options of the direct solver, MUMPS. The matrices are symmetric, so that a Cholesky
+factorization takes half the memory of LU. If rows were longer than preallocated, the assembly would
+be many times slower."""
 
 CONJUGATE_GRADIENTS = (
     "-petsc_prealloc", "400",
     "-ksp_type", "cg", "-pc_type", "sor", "-pc_sor_local_symmetric", "-ksp_rtol", "1e-10",
     "-ksp_max_it", "5000",
 )
-"""For large scalar potentials of second order in 3D. Incomplete Cholesky is faster where it works,
-but loses definiteness on fine meshes. Sweeps are local to each MPI process; there are no others."""
+"""PETSc options for large scalar potentials of second order in 3D: conjugate gradients with
+symmetric SOR as preconditioner. Incomplete Cholesky converges faster if it works, but loses
+definiteness on fine meshes. The sweeps of SOR are local to each MPI process, since PETSc has no
+parallel SOR."""
 
 NEWTON_STEPS = (
     "-petsc_prealloc", "400",
@@ -56,25 +62,29 @@ NEWTON_STEPS = (
     "-mg_levels_pc_type", "sor", "-mg_levels_pc_sor_local_symmetric", "-ksp_rtol", "1e-4",
     "-ksp_max_it", "5000",
 )
-"""For large scalar potentials again: a step of Newton's method need not be exact, its convergence
-is judged by the residual itself. With 160 000 unknowns and thin iron nine steps take 170 s, a
-quarter of what `CONJUGATE_GRADIENTS` take."""
+"""PETSc options for the steps of Newton's method, also for large scalar potentials. A step need not
+be exact, because the convergence of Newton's method is judged by the non-linear residual. With
+160 000 unknowns and thin iron nine steps take 170 s, a quarter of the time of
+`CONJUGATE_GRADIENTS`."""
 
 NEWTON_RESIDUAL = 1e-3
-"""Of such a step: that of a preconditioner is not that of the equations."""
+"""Largest accepted relative residual of the linear solve in such a step. It exceeds ``-ksp_rtol``,
+because PETSc's test applies to the preconditioned residual."""
 
 _ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
-"""Open MPI, which Debian's GetDP is built with, otherwise starts a daemon for every run; it can
-outlive a killed run, and costs 8 s where the machine's own name does not resolve."""
+"""Environment of a run in one process. Debian's GetDP is built with Open MPI, which would otherwise
+start a daemon for every run; the daemon can outlive a killed run, and costs 8 s on a machine whose
+own host name does not resolve."""
 
 _TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
              "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"}
-"""For `mpirun`: containers have no other user than root, and who asks knows the cores."""
+"""Environment of a run by `mpirun`. Containers often have no user but root, and the number of
+processes is the user's choice, even if it exceeds the cores that Open MPI counts."""
 
 _INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp libopenblas0-pthread`), or name it "
             f"with --getdp or {ENVIRONMENT_VARIABLE}.")
 _COLOURS = re.compile(r"\x1b\[\d*m")
-_NAMED_FAILURES = (  # pattern in the log, what it means
+_NAMED_FAILURES = (  # pattern in the log, and its meaning
     (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
     (r"[Nn]o space left", "the disk is full"),
     (r"Newton's method did not converge", "Newton's method did not converge"),
@@ -88,7 +98,16 @@ _NAMED_FAILURES = (  # pattern in the log, what it means
 
 @dataclass(frozen=True)
 class GetDP:
-    """A GetDP executable and what it says of itself."""
+    """A GetDP executable and its build, as ``getdp -info`` prints it.
+
+    Attributes
+    ----------
+    executable : Path
+    version : str
+    build_options : tuple of str
+    petsc : str
+        Version of PETSc; empty if it is not printed.
+    """
 
     executable: Path
     version: str
@@ -103,26 +122,26 @@ class Job:
     Attributes
     ----------
     problem, mesh : str
-        Names inside the run folder.
+        Names of files inside the run folder.
     resolution : str
-        The resolution to solve.
-    numbers : mapping
-        ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
+        Name of the Resolution in the problem file.
     outputs : tuple of str
         Files that the run must write.
+    numbers : mapping
+        ``-setnumber`` constants; each must be declared by a DefineConstant of the problem.
     solutions, matrix : str or None
-        Files for the solution of every linear system, and the last one's matrix, see
-        `halbach_fe.solver.dofs`.
+        Files to which PETSc writes the solution of every linear system, and the matrix of the last
+        one; `halbach_fe.solver.dofs` reads them. None if they are not wanted.
     unknowns : int or None
-        Number of unknowns that the system must have; None where it cannot be foretold.
+        Number of unknowns that the system must have; None if it is not known in advance.
     solves : int
-        Linear solves that the log must show, each with its residuals.
+        Smallest number of linear solves that the log must show, each with its residuals.
     options : tuple of str
         PETSc options of the linear solver.
     linear_residual : float
-        That every linear solve must leave at most, over the first.
+        Largest accepted last residual of a linear solve, relative to its first residual.
     time_limit_s : float
-        The run is ended after so many seconds.
+        The run is killed after this time.
     threads : int
         Threads of the linear algebra.
     processes : int
@@ -146,51 +165,60 @@ class Job:
 
     @property
     def large(self) -> tuple[str, ...]:
-        """Files of solutions and matrices, which only this program reads."""
+        """Names of the large files of solutions and matrices, which only halbach-fe reads."""
         saved = [name for name in self.outputs if name.endswith(".res")]
         return tuple(name for name in (self.solutions, self.matrix, *saved) if name)
 
 
 Run = Callable[
     [GetDP, Job, Path, Callable[[str], None] | None, threading.Event | None], list[str]]
-"""What runs a job like `run` does."""
+"""A function with the arguments and results of `run`, such as
+`halbach_fe.solver.dask_cluster.Cluster.run`."""
 
 
 def find_getdp(named: str | Path | None = None) -> GetDP:
-    """Find GetDP: as named, else in the environment variable, else on PATH; ask what it is.
+    """Find the GetDP executable and read its version and build from ``getdp -info``.
+
+    Parameters
+    ----------
+    named : str or Path, optional
+        The executable; by default that of $HALBACH_FE_GETDP, then of PATH.
 
     Raises
     ------
     GetDPNotFoundError
-        If there is none, or what is there does not answer like GetDP.
+        If no executable is path, or if it does not answer like GetDP.
     """
     wanted = str(named) if named else os.environ.get(ENVIRONMENT_VARIABLE) or "getdp"
-    found = shutil.which(wanted)
-    if found is None:
+    path = shutil.which(wanted)
+    if path is None:
         raise GetDPNotFoundError(f"GetDP was not found: `{wanted}` is no executable. {_INSTALL}")
     try:
-        answer = subprocess.run([found, "-info"], capture_output=True, text=True, timeout=30,
+        answer = subprocess.run([path, "-info"], capture_output=True, text=True, timeout=30,
                                 errors="replace", check=False, env=os.environ | _ALONE)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise GetDPNotFoundError(
-            f"GetDP at {found} does not answer ({error}). {_INSTALL}") from None
-    said = dict(re.findall(r"^(.+?)\s*:\s*(.*)$", answer.stdout + answer.stderr, re.MULTILINE))
-    if answer.returncode != 0 or "Version" not in said:
-        raise GetDPNotFoundError(f"{found} does not answer like GetDP. {_INSTALL}")
-    return GetDP(executable=Path(found).resolve(), version=said["Version"],
-                 build_options=tuple(said.get("Build options", "").split()),
-                 petsc=said.get("PETSc version", ""))
+            f"GetDP at {path} does not answer ({error}). {_INSTALL}") from None
+    build = dict(re.findall(r"^(.+?)\s*:\s*(.*)$", answer.stdout + answer.stderr, re.MULTILINE))
+    if answer.returncode != 0 or "Version" not in build:
+        raise GetDPNotFoundError(f"{path} does not answer like GetDP. {_INSTALL}")
+    return GetDP(executable=Path(path).resolve(), version=build["Version"],
+                 build_options=tuple(build.get("Build options", "").split()),
+                 petsc=build.get("PETSc version", ""))
 
 
 def blas_of(getdp: GetDP) -> Path | None:
-    """The system's BLAS that a GetDP loads; None if it has one of its own, or nobody tells."""
+    """Return the system's BLAS library that a GetDP loads.
+
+    None if GetDP contains a BLAS of its own, or if ``ldd`` cannot be run.
+    """
     try:
         answer = subprocess.run(["ldd", str(getdp.executable)], capture_output=True, text=True,
                                 timeout=30, errors="replace", check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    found = re.search(r"^\s*libblas\S* => (/\S+)", answer.stdout, re.MULTILINE)
-    return Path(found[1]).resolve() if found else None
+    match = re.search(r"^\s*libblas\S* => (/\S+)", answer.stdout, re.MULTILINE)
+    return Path(match[1]).resolve() if match else None
 
 
 def run(
@@ -200,15 +228,24 @@ def run(
     on_line: Callable[[str], None] | None = None,
     cancel: threading.Event | None = None,
 ) -> list[str]:
-    """Run a job in ``folder``, verify how it went, and return its log.
+    """Run a job, verify its log and output files, and return the lines of the log.
 
-    The log is kept as ``getdp.log`` in the folder. ``on_line`` sees every line as it comes;
-    setting ``cancel`` ends the run.
+    Parameters
+    ----------
+    getdp : GetDP
+    job : Job
+    folder : Path
+        The run folder with all input files. Output files and the log, ``getdp.log``, are written
+        there.
+    on_line : callable, optional
+        Called with every line of the log as soon as GetDP prints it.
+    cancel : threading.Event, optional
+        The run is killed when this event is set.
 
     Raises
     ------
     GetDPError
-        With what went wrong, by name, and where the log is.
+        Names the failure and the place of the log.
     """
     _check_before(job, folder)
     arguments = [
@@ -220,13 +257,13 @@ def run(
     written = job.outputs
     if job.solutions is not None:
         arguments += ["-ksp_view_solution", f"binary:{job.solutions}::append",
-                      "-viewer_binary_skip_info"]  # PETSc's own note of the options beside it
+                      "-viewer_binary_skip_info"]  # without PETSc's .info file beside the solutions
         written = (*written, job.solutions)
     if job.matrix is not None:
         arguments += ["-ksp_view_mat", f"binary:{job.matrix}"]
         written = (*written, job.matrix)
     for output in written:
-        (folder / output).unlink(missing_ok=True)  # GetDP would append to, or leave, a stale one
+        (folder / output).unlink(missing_ok=True)  # GetDP may append to or leave an older file
     lines = _execute(arguments, job, folder, on_line, cancel)
     _check_log(lines, job, folder)
     for output in written:
@@ -236,14 +273,14 @@ def run(
 
 
 def read_vectors(path: Path, points: Floats) -> Floats:
-    """Read GetDP's SimpleTable of vectors at points, and verify it.
+    """Read a table of vectors at points that GetDP printed as SimpleTable, and verify it.
 
     Parameters
     ----------
     path : Path
-        Rows ``x y z`` and three components.
+        The file; its columns are x, y, z and three components.
     points : ndarray, shape (n, 3), in m
-        Where the vector was asked for.
+        The points at which GetDP was asked to print the vectors.
 
     Returns
     -------
@@ -252,21 +289,21 @@ def read_vectors(path: Path, points: Floats) -> Floats:
     Raises
     ------
     GetDPError
-        Wrong number of rows or columns, other points, values that are not finite, or the zeros
-        that stand for a point outside the mesh.
+        If the number of rows or columns is wrong, the points differ, values are not finite, or a
+        vector is exactly zero, which GetDP prints for a point outside the mesh.
     """
     where = path.parent
     try:
         lines = path.read_text(encoding="ascii").splitlines()
         table = np.loadtxt(lines, ndmin=2, comments=None) if "".join(lines).strip() else (
-            np.empty((0, 0)))  # of nothing NumPy warns
+            np.empty((0, 0)))  # NumPy would warn about an empty file
     except (ValueError, OSError) as error:
         raise _failure(f"{path.name} is not a table of six columns ({error}); a point outside the "
-                       "mesh looks like this, and so does a full disk", where) from None
+                       "mesh or a full disk can cause this", where) from None
     if table.shape != (len(points), 6):
         raise _failure(f"{path.name} holds {table.shape[0]} rows of {table.shape[1]} columns in "
-                       f"place of {len(points)} of 6; a point outside the mesh looks "
-                       "like this, and so does a full disk", where)
+                       f"place of {len(points)} of 6; a point outside the mesh or a full disk can "
+                       "cause this", where)
     scale = max(1e-9, float(np.abs(points).max()))
     if not np.allclose(table[:, :3], points, rtol=0, atol=1e-9 * scale):
         raise _failure(f"{path.name} was evaluated at other points than asked for", where)
@@ -282,7 +319,7 @@ def read_vectors(path: Path, points: Floats) -> Floats:
 
 
 def declared_constants(folder: Path) -> set[str]:
-    """Names in the DefineConstant blocks of all problem files of a folder."""
+    """Return the names in the DefineConstant blocks of all problem files of a folder."""
     names: set[str] = set()
     for path in folder.glob("*.pro"):
         text = re.sub(r"//[^\n]*", "", path.read_text(encoding="utf-8"))
@@ -292,6 +329,7 @@ def declared_constants(folder: Path) -> set[str]:
 
 
 def _check_before(job: Job, folder: Path) -> None:
+    """Check the names, files and constants of a job before GetDP is started."""
     for name in (job.problem, job.mesh, *job.outputs):
         if len(name) > MAX_NAME:
             raise _failure(f"the name {name[:30]}... has {len(name)} characters, and GetDP's "
@@ -306,8 +344,10 @@ def _check_before(job: Job, folder: Path) -> None:
 
 
 def _launcher(job: Job) -> list[str]:
-    """What GetDP is started by: so that it ends when its starter does, however that ends, and
-    under MPI if several processes share the run.
+    """Return the command that GetDP's own command line is appended to.
+
+    The operating system then kills GetDP when its parent process ends, in whatever way. With
+    several processes ``mpirun`` starts GetDP.
     """
     tether = _tether()
     return tether if job.processes == 1 else [*tether, "mpirun", "-n", str(job.processes), *tether]
@@ -315,7 +355,11 @@ def _launcher(job: Job) -> list[str]:
 
 @cache
 def _tether() -> list[str]:
-    """util-linux has it since 2.33; others may have a `setpriv` without."""
+    """Return the command that ties a process to its parent, or nothing if it is not available.
+
+    ``setpriv`` of util-linux has the option ``--pdeathsig`` since version 2.33; other systems may
+    have a ``setpriv`` without it.
+    """
     tether = ["setpriv", "--pdeathsig", "KILL"]
     try:
         tried = subprocess.run([*tether, "true"], capture_output=True, check=False, timeout=30)
@@ -328,10 +372,11 @@ def _execute(
     arguments: list[str], job: Job, folder: Path,
     on_line: Callable[[str], None] | None, cancel: threading.Event | None,
 ) -> list[str]:
+    """Run a command to its end, save its log, and return the log's lines if it succeeded."""
     threads = str(job.threads)
     environment = os.environ | (_ALONE if job.processes == 1 else _TOGETHER) | {
         "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
-    environment.pop("PETSC_OPTIONS", None)  # nobody would know of them afterwards
+    environment.pop("PETSC_OPTIONS", None)  # options must come from the job, or none records them
     lines: list[str] = []
     if job.processes > 1 and shutil.which("mpirun") is None:
         raise _failure("`mpirun` was not found (Debian: openmpi-bin)", folder)
@@ -355,16 +400,16 @@ def _execute(
 
     reader = threading.Thread(target=read, daemon=True)
     deadline = time.monotonic() + job.time_limit_s
-    ended = ""
+    reason = ""
     try:
         reader.start()
         while process.poll() is None:
             if cancel is not None and cancel.is_set():
-                ended = "it was cancelled"
+                reason = "it was cancelled"
             elif time.monotonic() > deadline:
-                ended = (f"it was still running after the time limit of {job.time_limit_s:g} s; "
-                         "use a coarser mesh or raise --time-limit")
-            if ended:
+                reason = (f"it was still running after the time limit of {job.time_limit_s:g} s; "
+                          "use a coarser mesh or raise --time-limit")
+            if reason:
                 break
             time.sleep(0.02)
     finally:
@@ -373,42 +418,49 @@ def _execute(
         if reader.is_alive():
             reader.join(timeout=10)
         _save_log(folder, arguments, lines)
-    if ended:
-        raise _failure(ended, folder)
+    if reason:
+        raise _failure(reason, folder)
     if process.returncode < 0:
         name = signal.Signals(-process.returncode).name
         hint = {"SIGKILL": "; out of memory?", "SIGXFSZ": "; a file grew over its limit"}
         raise _failure(f"it crashed ({name}{hint.get(name, '')})", folder)
     if process.returncode:
-        complaint = next((line for line in lines if re.match(r"\s*Error\s*:", line)), "")
-        said = complaint.partition(":")[2].strip() or (lines[-1].strip() if lines else "nothing")
+        error_line = next((line for line in lines if re.match(r"\s*Error\s*:", line)), "")
+        quoted = error_line.partition(":")[2].strip() or (
+            lines[-1].strip() if lines else "nothing")
         name = _name_of("\n".join(lines), f"exit code {process.returncode}")
-        raise _failure(f"{name}: '{said[:200]}'", folder)
+        raise _failure(f"{name}: '{quoted[:200]}'", folder)
     return lines
 
 
 def _kill(process: subprocess.Popen[str]) -> None:
+    """Kill a process with all its children; it leads a process group of its own."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
 def _save_log(folder: Path, arguments: list[str], lines: list[str]) -> None:
+    """Write the log: GetDP's options in the first line, then all that it printed."""
     text = "\n".join([" ".join(arguments[1:]), *lines, ""])
-    with contextlib.suppress(OSError):  # the failure that filled the disk is the one to report
+    with contextlib.suppress(OSError):  # if the disk is full, report the failure of the run
         (folder / LOG_NAME).write_text(text, encoding="utf-8")
 
 
 def _check_log(lines: list[str], job: Job, folder: Path) -> None:
+    """Check the log of a run that ended with exit code 0.
+
+    Warnings are failures too: GetDP only warns of an unconverged iteration, for example.
+    """
     for line in lines:
         if re.match(r"\s*(Warning|Error)\s*:", line):
-            said = line.partition(":")[2].strip()
-            raise _failure(f"{_name_of(said, 'GetDP warned')}: '{said[:200]}'", folder)
+            quoted = line.partition(":")[2].strip()
+            raise _failure(f"{_name_of(quoted, 'GetDP warned')}: '{quoted[:200]}'", folder)
     text = "\n".join(lines)
     if job.processes > 1 and f", {job.processes} nodes," not in text:
         raise _failure(
-            f"it did not run in the {job.processes} MPI processes asked for: `mpirun` must be of "
-            "the MPI that GetDP is built with (Debian: openmpi-bin)", folder)
+            f"it did not run in the {job.processes} MPI processes asked for: `mpirun` must belong "
+            "to the MPI that GetDP is built with (Debian: openmpi-bin)", folder)
     sizes = [int(n) for n in re.findall(r"System \d+/\d+: (\d{1,15}) Dofs", text)]
     if not sizes or 0 in sizes:
         raise _failure("the system has no unknowns: is the mesh empty?", folder)
@@ -416,17 +468,17 @@ def _check_log(lines: list[str], job: Job, folder: Path) -> None:
         raise _failure(
             f"the system has {sizes[0]} unknowns where the mesh gives {job.unknowns}: a boundary "
             "condition, a gauge or a region is missing", folder)
-    found = _check_residuals(lines, job.linear_residual, folder)
-    if found < job.solves:
-        raise _failure(f"its log shows the residuals of {found} of {job.solves} solves", folder)
+    count = _check_residuals(lines, job.linear_residual, folder)
+    if count < job.solves:
+        raise _failure(f"its log shows the residuals of {count} of {job.solves} solves", folder)
 
 
 def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
-    """Every linear solve must have brought its residual down; return how many there were."""
+    """Check that every linear solve reduced its residual enough; return the number of solves."""
     first: float | None = None
-    found = 0
+    count = 0
     last = np.nan
-    for line in [*lines, "  0 KSP Residual norm 0"]:
+    for line in [*lines, "  0 KSP Residual norm 0"]:  # iteration 0 ends the solve before it
         match = re.search(r"(\d{1,9}) KSP Residual norm (\S+)", line)
         if not match:
             continue
@@ -435,14 +487,15 @@ def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
             if first is not None and not last <= largest * first:
                 raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
                                "linear solver did not converge", folder)
-            found += first is not None
+            count += first is not None
             first, last = residual, np.inf
         else:
             last = residual
-    return found
+    return count
 
 
 def _residual(text: str, folder: Path) -> float:
+    """Return a residual of the log as a finite number."""
     with contextlib.suppress(ValueError):
         if np.isfinite(residual := float(text)):
             return residual
@@ -451,13 +504,15 @@ def _residual(text: str, folder: Path) -> float:
 
 
 def _name_of(text: str, otherwise: str) -> str:
+    """Return the meaning of the first known failure in a text of the log."""
     return next((name for pattern, name in _NAMED_FAILURES if re.search(pattern, text)), otherwise)
 
 
-def _failure(what: str, folder: Path) -> GetDPError:
+def _failure(reason: str, folder: Path) -> GetDPError:
+    """Return the error of a run, with a hint if the disk is full and the log if there is one."""
     hint = ""
     if shutil.disk_usage(folder).free < 10_000_000:
         hint = " The disk is full: free some space."
     log = folder / LOG_NAME
-    return GetDPError(f"GetDP did not give a result that can be trusted: {what}.{hint}",
+    return GetDPError(f"GetDP did not give a result that can be trusted: {reason}.{hint}",
                       log if log.is_file() else None)

@@ -1,11 +1,11 @@
-"""GetDP's answers, kept by all that they depend on.
+"""A cache of results of GetDP, with all inputs of a run as the key.
 
-An entry is a folder, named by the SHA-256 of everything GetDP was given: the files of its run
-folder (mesh, problem, generated part), the options and constants of the job, and GetDP's version
-and build. It holds what GetDP wrote, and a manifest with the SHA-256 of every file; those are
-compared whenever it is used. Entries appear whole (a rename) and belong to nobody, so that several
-processes may share a cache. When it is larger than its limit, the entries that were not used for
-longest go.
+An entry is a folder. Its name is the SHA-256 of all inputs of the run: the files of the run folder
+(mesh, problem, generated data), the options and constants of the job, and the version and build of
+GetDP. The entry holds the files that GetDP wrote, and a manifest with the SHA-256 of each of them,
+which is verified whenever the entry is used. Entries are complete when they become visible (by a
+rename), and no process owns them, so that several processes may share a cache. When the cache
+exceeds its size limit, the least recently used entries are removed.
 """
 
 from __future__ import annotations
@@ -30,13 +30,17 @@ from halbach_fe.core.temporary_files import remove_orphans, temporary_name
 from halbach_fe.solver.getdp import LOG_NAME, GetDP, Job
 
 FOLDER_VARIABLE = "HALBACH_FE_CACHE"
+"""Environment variable with the folder of the cache."""
+
 LIMIT_VARIABLE = "HALBACH_FE_CACHE_LIMIT_GIB"
+"""Environment variable with the size limit of the cache in GiB; 0 switches the cache off."""
+
 DEFAULT_LIMIT_GIB = 20.0
 MANIFEST = "manifest.json"
 
 
 class Kept(BaseModel):
-    """A file of an entry."""
+    """A file of an entry, as the manifest describes it."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     bytes: NonNegativeInt
@@ -44,7 +48,7 @@ class Kept(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What an entry holds, and of what."""
+    """The files of an entry, and a description of the run that wrote them."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     problem: str
@@ -57,7 +61,16 @@ class Manifest(BaseModel):
 
 @dataclass(frozen=True)
 class Stored:
-    """An entry as `Cache.entries` finds it: its size, and when it was used, in s since 1970."""
+    """An existing entry.
+
+    Attributes
+    ----------
+    folder : Path
+    bytes : int
+        Size of all its files.
+    used : float
+        Time of the last use in s since 1970.
+    """
 
     folder: Path
     bytes: int
@@ -65,27 +78,30 @@ class Stored:
 
     @property
     def manifest(self) -> Manifest | None:
-        """What it says of itself; None if that cannot be read."""
+        """The manifest of the entry; None if it cannot be read."""
         return _manifest(self.folder)
 
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of entries, and how large it may grow."""
+    """A folder of entries, and the limit of its size in bytes."""
 
     folder: Path
     limit_bytes: float = DEFAULT_LIMIT_GIB * 2**30
 
     def entry(self, getdp: GetDP, job: Job, run_folder: Path) -> Entry:
-        """The place of a job's answer; ``run_folder`` holds what GetDP will be given."""
+        """Return the entry of a job, whether it exists already or not.
+
+        ``run_folder`` must hold exactly the input files of the run.
+        """
         digest = hashlib.sha256()
-        asked = asdict(job) | {"numbers": sorted(job.numbers.items())}
-        del asked["time_limit_s"]  # an answer is the same whenever it comes
-        said: list[object] = [getdp.version, *getdp.build_options, getdp.petsc]
-        with contextlib.suppress(OSError):  # one of the same version may be built anew
-            there = getdp.executable.stat()
-            said += [there.st_size, there.st_mtime_ns]
-        digest.update(json.dumps([asked, said], sort_keys=True).encode())
+        settings = asdict(job) | {"numbers": sorted(job.numbers.items())}
+        del settings["time_limit_s"]  # the result does not depend on it
+        build: list[object] = [getdp.version, *getdp.build_options, getdp.petsc]
+        with contextlib.suppress(OSError):  # the same version may be compiled again
+            status = getdp.executable.stat()
+            build += [status.st_size, status.st_mtime_ns]
+        digest.update(json.dumps([settings, build], sort_keys=True).encode())
         given = sorted(path.name for path in run_folder.iterdir())
         for name in given:
             digest.update(f"{name} {_digest(run_folder / name)}".encode())
@@ -94,16 +110,16 @@ class Cache:
                      getdp.version)
 
     def entries(self) -> list[Stored]:
-        """All entries, those used last first."""
-        found = []
+        """Return all entries, the most recently used first."""
+        entries = []
         for folder in self._folders():
             try:
                 size = sum(path.stat().st_size for path in folder.iterdir())
                 used = (folder / MANIFEST).stat().st_mtime
             except OSError:  # another process has just removed it, or it is damaged
                 size, used = 0, 0.0
-            found.append(Stored(folder, size, used))
-        return sorted(found, key=lambda one: -one.used)
+            entries.append(Stored(folder, size, used))
+        return sorted(entries, key=lambda entry: -entry.used)
 
     def clear(self) -> None:
         """Remove all entries."""
@@ -111,14 +127,15 @@ class Cache:
             _remove(folder)
 
     def trim(self) -> None:
-        """Remove entries until the rest is within the limit."""
+        """Remove the least recently used entries until the rest is within the limit."""
         total = 0
-        for one in self.entries():
-            total += one.bytes
+        for entry in self.entries():
+            total += entry.bytes
             if total > self.limit_bytes:
-                _remove(one.folder)
+                _remove(entry.folder)
 
     def _folders(self) -> Iterator[Path]:
+        """Yield the folders of all entries; remove what crashed processes left beside them."""
         for folder in sorted(self.folder.glob("[0-9a-f][0-9a-f]")):
             remove_orphans(folder)
             with contextlib.suppress(OSError):
@@ -128,7 +145,21 @@ class Cache:
 
 @dataclass(frozen=True)
 class Entry:
-    """The place of one answer."""
+    """The place in the cache for the result of one run.
+
+    Attributes
+    ----------
+    cache : Cache
+    folder : Path
+        Folder of the entry, which need not exist.
+    run_folder : Path
+        Folder of the run.
+    given : frozenset of str
+        Names of the run's input files.
+    job : Job
+    version : str
+        Version of GetDP.
+    """
 
     cache: Cache
     folder: Path
@@ -138,43 +169,46 @@ class Entry:
     version: str
 
     def restore(self, on_line: Callable[[str], None]) -> bool:
-        """Put a stored answer into the run folder and show its log; tell whether there was one.
+        """Copy the stored result into the run folder; return False if there is none.
 
-        One that is damaged is removed, with a warning.
+        ``on_line`` receives the lines of the stored log. A damaged entry is removed with a warning,
+        and counts as missing.
         """
-        if not os.path.isdir(self.folder):  # False too where it may not be looked at
+        if not os.path.isdir(self.folder):  # also False without the right to read the parent
             return False
         manifest = _manifest(self.folder)
         try:
             if manifest is None or LOG_NAME not in manifest.files:
                 raise ValueError("its manifest cannot be read")
-            for name, kept in manifest.files.items():
+            for name, stored in manifest.files.items():
                 if Path(name).name != name or name in self.given:
                     raise ValueError(f"it has a file {name!r}")
                 shutil.copyfile(self.folder / name, self.run_folder / name)
-                if _digest(self.run_folder / name) != kept.sha256:
+                if _digest(self.run_folder / name) != stored.sha256:
                     raise ValueError(f"{name} is not what was stored")
         except (OSError, ValueError) as error:
             for path in self.run_folder.iterdir():
                 if path.name not in self.given:
                     path.unlink()
             damaged = isinstance(error, ValueError | FileNotFoundError | IsADirectoryError)
-            # otherwise another process has removed it meanwhile, or it cannot be had
+            # otherwise another process has removed the entry meanwhile, or it may not be read
             if damaged and os.path.isdir(self.folder):
                 warnings.warn(f"An entry of the cache is damaged ({error}) and is computed again: "
                               f"{self.folder}", HalbachWarning, stacklevel=2)
                 _remove(self.folder)
             return False
-        with contextlib.suppress(OSError):  # it may be another's
+        with contextlib.suppress(OSError):  # the entry may belong to another user
             os.utime(self.folder / MANIFEST)
         log = (self.run_folder / LOG_NAME).read_text(encoding="utf-8")
-        for line in log.splitlines()[1:]:  # the first has the options
+        for line in log.splitlines()[1:]:  # the first line has the options of the run
             on_line(line)
         return True
 
     def store(self) -> bool:
-        """Keep what GetDP wrote into the run folder, unless it is there already; tell whether the
-        cache has grown.
+        """Store the files that GetDP wrote into the run folder; return whether the cache has grown.
+
+        It does not grow if the entry exists already, exceeds the limit of the cache by itself, or
+        cannot be written, which causes a warning.
         """
         if os.path.isdir(self.folder):
             return False
@@ -183,14 +217,15 @@ class Entry:
             return False
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
-            making = self.folder.with_name(  # of the mode that others may use it by
+            # not by tempfile.mkdtemp, whose folders only their owner may read
+            temporary = self.folder.with_name(
                 temporary_name(self.folder.name[:8]) + uuid.uuid4().hex)
-            making.mkdir()
+            temporary.mkdir()
             try:
-                self._fill(making, written)
-                making.rename(self.folder)
+                self._fill(temporary, written)
+                temporary.rename(self.folder)
             finally:
-                shutil.rmtree(making, ignore_errors=True)
+                shutil.rmtree(temporary, ignore_errors=True)
         except OSError as error:
             if not os.path.isdir(self.folder):  # otherwise another process was faster
                 warnings.warn(
@@ -200,45 +235,53 @@ class Entry:
             return False
         return True
 
-    def _fill(self, making: Path, written: list[Path]) -> None:
+    def _fill(self, temporary: Path, written: list[Path]) -> None:
+        """Copy files into a temporary folder, and write the manifest there."""
         files = {}
         for path in written:
-            shutil.copyfile(path, making / path.name)
+            shutil.copyfile(path, temporary / path.name)
             files[path.name] = Kept(bytes=path.stat().st_size, sha256=_digest(path))
         manifest = Manifest(
             problem=self.job.problem, resolution=self.job.resolution, unknowns=self.job.unknowns,
             solves=self.job.solves, getdp=self.version, files=files)
-        (making / MANIFEST).write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
+        (temporary / MANIFEST).write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
 
 
 def default_cache(folder: Path | None = None) -> Cache | None:
-    """The user's cache: in ``folder``, else as the environment says; None if its limit is 0.
+    """Return the user's cache, or None if the limit in the environment is 0.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        Folder of the cache; by default that of $HALBACH_FE_CACHE, else ``halbach-fe`` in
+        $XDG_CACHE_HOME or ``~/.cache``. None is also returned if the user has no home folder.
 
     Raises
     ------
     OutputError
-        If the limit in the environment is no number.
+        If the limit in the environment is not a number of at least 0.
     """
-    said = os.environ.get(LIMIT_VARIABLE, str(DEFAULT_LIMIT_GIB))
+    text = os.environ.get(LIMIT_VARIABLE, str(DEFAULT_LIMIT_GIB))
     try:
-        limit = float(said)
+        limit = float(text)
     except ValueError:
         limit = -1.0
     if not limit >= 0:
-        raise OutputError(f"{LIMIT_VARIABLE} must be the size of the cache in GiB, 0 for none; "
-                          f"instead it is '{said}'.")
+        raise OutputError(f"Environment variable {LIMIT_VARIABLE} must be the size of the cache in "
+                          f"GiB, 0 for no cache; instead received '{text}'. Correct or unset it.")
     if limit == 0:
         return None
     named = folder or os.environ.get(FOLDER_VARIABLE)
     if not named:
         home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        if home.startswith("~"):  # some have no home
+        if home.startswith("~"):  # the user has no home folder
             return None
         named = Path(home, "halbach-fe")
     return Cache(Path(named), limit * 2**30)
 
 
 def _manifest(folder: Path) -> Manifest | None:
+    """Return the manifest of an entry; None if it cannot be read."""
     try:
         return Manifest.model_validate_json((folder / MANIFEST).read_bytes())
     except (OSError, ValidationError):
@@ -246,15 +289,16 @@ def _manifest(folder: Path) -> Manifest | None:
 
 
 def _digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _remove(folder: Path) -> None:
-    """Remove an entry, so that nobody ever sees a part of it."""
-    going = folder.with_name(f"{temporary_name('going')}{time.monotonic_ns()}")
+    """Remove an entry, renamed first, so that no process ever sees an incomplete entry."""
+    removed = folder.with_name(f"{temporary_name('going')}{time.monotonic_ns()}")
     try:
-        folder.rename(going)
+        folder.rename(removed)
     except OSError:  # another process removes it
         return
-    shutil.rmtree(going, ignore_errors=True)
+    shutil.rmtree(removed, ignore_errors=True)

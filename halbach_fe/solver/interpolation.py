@@ -1,7 +1,11 @@
-"""B at points as a sparse operator on the unknowns of a finite-element solution.
+"""Evaluation of finite-element solutions at points, as sparse operators on the unknowns.
 
-Points are located once in the mesh's curved elements; then every solution costs one sparse
-product, where GetDP's own printing searches the mesh for every point of every solution.
+The points are located once in the curved elements of the mesh. Every solution then costs one sparse
+product, whereas GetDP's own Print searches the mesh for every point of every solution.
+
+The shape functions and their numbering are those of GetDP: nodal functions of second order (see
+O. C. Zienkiewicz, R. L. Taylor, The Finite Element Method), and edge functions of order 1 and 2 on
+tetrahedra. `compare_printed` verifies them against a few values that GetDP prints.
 """
 
 from __future__ import annotations
@@ -22,33 +26,38 @@ from halbach_fe.solver.dofs import Unknowns
 from halbach_fe.solver.mesh import VerifiedMesh
 
 SEARCHES = ((12, 1e-8), (128, 1e-8), (1024, 1e-8), (128, 0.05))
-"""How a point is looked for: in so many elements, by distance of their middle, and how far outside,
-in the element's own coordinates, it still counts as inside. The last is for points beside a curved
-face, which elements of second order do not quite meet."""
+"""Passes of the search for the element that holds a point: number of candidate elements, nearest
+centroids first, and tolerance in the element's reference coordinates within which a point outside
+counts as inside. The last pass is for points beside a curved face, which elements of second order
+only approximate."""
 
-_NEWTON_STEPS = 8  # elements are hardly curved: the first step is exact in most
+_NEWTON_STEPS = 8  # most elements are not curved, so that the first step is exact for them
 _SIMPLEX_EDGES = {2: ((0, 1), (1, 2), (2, 0)),
                   3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}  # as meshio orders them
 _TETRAHEDRON_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # as GetDP numbers them
 _TETRAHEDRON_FACES = ((0, 1, 3), (0, 1, 2), (0, 2, 3), (1, 2, 3))
 _QUADRANGLE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])  # corners
 _PROBE = {"triangle6": (0.3, 0.2), "tetra10": (0.3, 0.2, 0.1), "quad": (0.31, -0.17)}
-_QUADRANGLE_SIDES = ((1, -1), (0, -1), (0, 1), (1, 1))  # as GetDP numbers them: axis and its value
+# The sides in GetDP's order: the axis whose coordinate is constant on the side, and its value.
+_QUADRANGLE_SIDES = ((1, -1), (0, -1), (0, 1), (1, 1))
 
 
 @dataclass(frozen=True)
 class Located:
-    """Points in the elements of a mesh. One on a face belongs to both neighbours, between which
-    a derivative jumps: the mean of those found is taken.
+    """Points located in the elements of a mesh.
+
+    A point on a face belongs to both neighbouring elements. Derivatives of a solution jump there,
+    and the mean over the elements that hold the point is taken. A point therefore has one or
+    several instances (m >= n).
 
     Attributes
     ----------
-    cells : ndarray, shape (m,)
-        Index of an element among the mesh's.
+    cells : ndarray of int, shape (m,)
+        Index of the element that holds an instance, in the mesh's order.
     reference : ndarray, shape (m, d)
-        Coordinates of a point in it.
+        Reference coordinates of an instance in its element.
     mean : sparse array, shape (n, m)
-        From these m to the n points.
+        Operator from values at the m instances to their means at the n points.
     """
 
     cells: Ints
@@ -57,28 +66,35 @@ class Located:
 
 
 def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Located:
-    """Find the air elements, or with ``anywhere`` all, that hold each of the points (n, 3).
+    """Find the elements that hold each point.
 
-    In 2D, z is not looked at.
+    Parameters
+    ----------
+    mesh : VerifiedMesh
+    points : ndarray, shape (n, 3), in m
+        On a 2D mesh the third coordinate is ignored.
+    anywhere : bool
+        Whether to search all elements, and not only those of air. A point on the surface of a
+        magnet or of iron then gets a mean over both materials.
 
     Raises
     ------
     PointsOutsideError
-        If one is in none.
+        If a point lies in no element.
     """
     dimension = mesh.regions.dimension
     points = points[:, :dimension]
     air = np.flatnonzero(mesh.in_air | anywhere)
     nodes = mesh.points[mesh.cells[air]]
     tree = KDTree(nodes.mean(axis=1))
-    found: list[tuple[Ints, Ints, Floats]] = []  # points, elements, coordinates
+    hits: list[tuple[Ints, Ints, Floats]] = []  # points, elements, coordinates
     missing = np.arange(len(points))
     for count, slack in ((min(n, len(air)), slack) for n, slack in SEARCHES):
         nearest = tree.query(points[missing], count)[1].reshape(len(missing), count)
         held = np.zeros(len(missing), bool)
         for chosen in nearest.T:
             reference, inside = _invert(nodes[chosen], points[missing], slack)
-            found.append((missing[inside], air[chosen[inside]], reference[inside]))
+            hits.append((missing[inside], air[chosen[inside]], reference[inside]))
             held |= inside
         missing = missing[~held]
         if not len(missing):
@@ -88,19 +104,27 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
         raise PointsOutsideError(mesh.regions.study, (
             f"in its {'elements' if anywhere else 'air'}; instead {len(missing)} points lie in "
             f"none of its elements, the first at ({where}) m."))
-    rows = np.concatenate([row for row, _, _ in found])
+    rows = np.concatenate([row for row, _, _ in hits])
     share = 1 / np.bincount(rows, minlength=len(points))[rows]
     mean = sparse.csr_array((share, (rows, np.arange(len(rows)))), shape=(len(points), len(rows)))
-    return Located(np.concatenate([cell for _, cell, _ in found]),
-                   np.vstack([reference for _, _, reference in found]), mean)
+    return Located(np.concatenate([cell for _, cell, _ in hits]),
+                   np.vstack([reference for _, _, reference in hits]), mean)
 
 
 def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Located, Floats]:
-    """Points (m, 3) inside up to ``count`` of the elements of air that hold the located ones, or of
-    all air if none does: in matter a potential's gradient is not B.
+    """Choose probes at which GetDP prints the field, to verify our evaluation.
 
-    There B does not depend on which of two neighbours a point is taken to belong to. They are off
-    all planes of symmetry, where some of an element's functions or their slopes vanish.
+    There is one probe in each of up to ``count`` air elements, chosen from the elements that hold
+    ``located``, or from all of air if these are not in air: in other materials the gradient of a
+    scalar potential is not B. A probe lies inside its element, where B does not depend on a choice
+    between neighbours, and off the element's planes of symmetry, where some shape functions or
+    their derivatives vanish, so that an error in them would not show.
+
+    Returns
+    -------
+    probes : Located
+        m points.
+    places : ndarray, shape (m, 3), in m
     """
     cells = np.unique(located.cells)
     cells = cells[mesh.in_air[cells]]
@@ -116,11 +140,24 @@ def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Lo
 
 
 def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
-    """GetDP's Gauss points of elements, and the weights (m,) of integrals over them in m^d.
+    """Return GetDP's Gauss points of some elements, and the weights of integrals over the elements.
 
-    The rules, of 7 points on triangles and 15 on tetrahedra, are exact for polynomials of degree
+    The rules, with 7 points on triangles and 15 on tetrahedra, are exact for polynomials of degree
     5; see O. C. Zienkiewicz, R. L. Taylor, The Finite Element Method, and P. Keast, Comput.
-    Methods Appl. Mech. Engrg. 55 (1986) 339.
+    Methods Appl. Mech. Engrg. 55 (1986) 339. The same points as in GetDP give the same discrete
+    problem.
+
+    Parameters
+    ----------
+    mesh : VerifiedMesh
+    cells : ndarray of int
+        Indices of the elements.
+
+    Returns
+    -------
+    points : Located
+        m points.
+    weights : ndarray, shape (m,), in m^d
     """
     reference, weights = _RULES[mesh.cell_type]
     count = len(reference)
@@ -132,7 +169,11 @@ def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
 
 
 def _rule(groups: list[tuple[float, float, set[tuple[float, ...]]]]) -> tuple[Floats, Floats]:
-    """Points and weights from groups of a weight, a total and barycentric coordinates, permuted."""
+    """Assemble a quadrature rule on a reference simplex.
+
+    Every group is the relative weight of a point, the measure of the simplex, and the barycentric
+    coordinates of all points of the group. Returns points (n, d) and weights (n,).
+    """
     points, weights = [], []
     for weight, volume, coordinates_ in groups:
         for place in sorted(coordinates_):
@@ -142,6 +183,7 @@ def _rule(groups: list[tuple[float, float, set[tuple[float, ...]]]]) -> tuple[Fl
 
 
 def _orbit(*coordinates_: float) -> set[tuple[float, ...]]:
+    """Return all different permutations of barycentric coordinates."""
     return set(permutations(coordinates_))
 
 
@@ -160,16 +202,22 @@ _RULES = {
 
 
 def coordinates(mesh: VerifiedMesh, located: Located) -> Floats:
-    """Where located points are, (n, d) in m."""
+    """Return the positions (n, d) in m of located points."""
     values, _ = shape_functions(mesh.cell_type, located.reference)
     return np.asarray(located.mean @ np.einsum(
         "nk,nkd->nd", values, mesh.points[mesh.cells[located.cells]]))
 
 
 def shape_functions(kind: str, reference: Floats) -> tuple[Floats, Floats]:
-    """Values (n, k) and derivatives (n, k, d) of the functions of an element's nodes.
+    """Return values (n, k) and derivatives (n, k, d) of the shape functions of an element's nodes.
 
-    ``kind`` is meshio's ``triangle6``, ``tetra10`` or ``quad``, and so is the order of nodes.
+    Parameters
+    ----------
+    kind : str
+        meshio's name of the element type, ``triangle6``, ``tetra10`` or ``quad``. The order of the
+        k nodes is meshio's too.
+    reference : ndarray, shape (n, d)
+        Reference coordinates: 0 to 1 on simplices, -1 to 1 on quadrangles.
     """
     if kind == "quad":
         u, v = ((1 + reference[:, axis, None] * _QUADRANGLE[:, axis]) / 2 for axis in range(2))
@@ -183,14 +231,15 @@ def shape_functions(kind: str, reference: Floats) -> tuple[Floats, Floats]:
 
 
 def _bubbles(reference: Floats) -> tuple[Floats, Floats]:
-    """Values (n, 5) and derivatives (n, 5, 2) of GetDP's second-order functions on the sides and
-    the inside of a quadrangle (BF_Node_2E, BF_Node_2F).
+    """Return values (n, 5) and derivatives (n, 5, 2) of the second-order functions of quadrangles.
+
+    They are GetDP's BF_Node_2E on the four sides and BF_Node_2F inside.
     """
     factors = []
-    for along, value in _QUADRANGLE_SIDES:  # `along` is constant on the side
-        t, s = reference[:, 1 - along], 1 + value * reference[:, along]
+    for axis, value in _QUADRANGLE_SIDES:
+        t, s = reference[:, 1 - axis], 1 + value * reference[:, axis]
         slope = np.empty_like(reference)
-        slope[:, 1 - along], slope[:, along] = -2 * t * s**2, (1 - t**2) * 2 * value * s
+        slope[:, 1 - axis], slope[:, axis] = -2 * t * s**2, (1 - t**2) * 2 * value * s
         factors.append(((1 - t**2) * s**2, slope))
     u, v = reference.T
     factors.append(((1 - u**2) * (1 - v**2),
@@ -200,7 +249,7 @@ def _bubbles(reference: Floats) -> tuple[Floats, Floats]:
 
 
 def _barycentric(reference: Floats) -> tuple[Floats, Floats]:
-    """Barycentric coordinates (n, d + 1) and their constant slopes (d + 1, d)."""
+    """Return barycentric coordinates (n, d + 1) and their constant derivatives (d + 1, d)."""
     dimension = reference.shape[1]
     slopes = np.vstack([-np.ones(dimension), np.eye(dimension)])
     return np.column_stack([1 - reference.sum(axis=1), reference]), slopes
@@ -209,7 +258,23 @@ def _barycentric(reference: Floats) -> tuple[Floats, Floats]:
 def _invert(
     nodes: Floats, points: Floats, slack: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Coordinates of each point in its element with nodes (n, k, d), and whether it is inside."""
+    """Invert the map from reference coordinates to space by Newton's method.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (n, k, d), in m
+        Nodes of one element for every point.
+    points : ndarray, shape (n, d), in m
+    slack : float
+        Distance in reference coordinates up to which a point outside counts as inside.
+
+    Returns
+    -------
+    reference : ndarray, shape (n, d)
+        Reference coordinates of each point in its element.
+    inside : ndarray of bool, shape (n,)
+        False also if Newton's method has not converged, as for points far from the element.
+    """
     kind = {4: "quad", 6: "triangle6", 10: "tetra10"}[nodes.shape[1]]
     dimension = points.shape[1]
     reference = np.full((len(points), dimension), 0.0 if kind == "quad" else 1 / (dimension + 1))
@@ -229,7 +294,10 @@ def _invert(
 
 
 def _slopes(mesh: VerifiedMesh, located: Located, reference_slopes: Floats) -> Floats:
-    """Gradients (n, k, d) in space of functions whose slopes in the element are given."""
+    """Return gradients (n, k, d) in 1/m of functions from their derivatives in the element.
+
+    ``reference_slopes`` (n, k, d) are the derivatives with respect to the reference coordinates.
+    """
     _, geometry = shape_functions(mesh.cell_type, located.reference)
     jacobian = np.einsum("nkd,nke->nde", mesh.points[mesh.cells[located.cells]], geometry)
     return np.einsum("nke,ned->nkd", reference_slopes, np.linalg.inv(jacobian))
@@ -238,9 +306,16 @@ def _slopes(mesh: VerifiedMesh, located: Located, reference_slopes: Floats) -> F
 def nodal_operators(
     mesh: VerifiedMesh, located: Located, unknowns: Unknowns
 ) -> tuple[sparse.csr_array, list[sparse.csr_array]]:
-    """Value (n, unknowns) and each derivative of a second-order function at the points.
+    """Return the operators from the unknowns of a nodal function to its value and derivatives.
 
-    On quadrangles it has unknowns on nodes, edges and faces, elsewhere on nodes.
+    The function is of second order. On quadrangles it has unknowns on nodes, edges and faces, on
+    triangles and tetrahedra on nodes only.
+
+    Returns
+    -------
+    value : sparse array, shape (n, unknowns)
+    derivatives : list of sparse array, shape (n, unknowns), in 1/m
+        One for each of the d coordinates.
     """
     values, reference_slopes = shape_functions(mesh.cell_type, located.reference)
     index = unknowns.functions[0][mesh.cells[located.cells] + 1]  # GetDP counts nodes from 1
@@ -261,26 +336,35 @@ def nodal_operators(
 def curl_operators(
     mesh: VerifiedMesh, located: Located, unknowns: Unknowns
 ) -> list[sparse.csr_array]:
-    """Each component (n, unknowns) of the curl of a function on edges, and faces if any."""
+    """Return the operators from the unknowns of a vector function on tetrahedra to its curl.
+
+    The unknowns are circulations along edges (order 1) and, for order 2, also two per face.
+
+    Returns
+    -------
+    list of sparse array, shape (n, unknowns), in 1/m^2
+        One for each of the three components.
+    """
     weights, reference_slopes = _barycentric(located.reference)
     slopes = _slopes(mesh, located, np.broadcast_to(
         reference_slopes, (len(weights), *reference_slopes.shape)))
     edges, cells = unknowns.edges[located.cells], mesh.cells[located.cells]
     a, b = np.array(_TETRAHEDRON_EDGES).T
-    # the curl of w_a grad w_b - w_b grad w_a
+    # first order, edge from a to b: w_a grad w_b - w_b grad w_a with the curl 2 grad w_a x grad w_b
     curls = [2 * np.cross(slopes[:, a], slopes[:, b]) * np.sign(edges)[..., None]]
     index = [unknowns.functions[0][np.abs(edges)]]
     for number, function in enumerate(unknowns.functions[1:]):
-        # grad(w_b w_c) x grad w_a, a being the corner of the smallest number, or the second
+        # second order: the curl of a face function is grad(w_q w_r) x grad w_p. In the first
+        # function p is the corner with the smallest number, in the second function the next corner.
         order = np.argsort(cells[:, np.array(_TETRAHEDRON_FACES)], axis=2)
         corners = np.take_along_axis(
             np.broadcast_to(_TETRAHEDRON_FACES, order.shape), order, axis=2)
         turned = np.roll(corners, -number, axis=2)
         row = np.arange(len(cells))[:, None]
         w, s = weights, slopes
-        one, two, three = turned.transpose(2, 0, 1)
-        product = (w[row, two][..., None] * s[row, three] + w[row, three][..., None] * s[row, two])
-        curls.append(np.cross(product, s[row, one]))
+        p, q, r = turned.transpose(2, 0, 1)
+        product = (w[row, q][..., None] * s[row, r] + w[row, r][..., None] * s[row, q])
+        curls.append(np.cross(product, s[row, p]))
         index.append(function[np.abs(unknowns.faces[located.cells])])
     all_curls, all_index = np.concatenate(curls, axis=1), np.concatenate(index, axis=1)
     return [located.mean @ _sparse(all_curls[..., axis], all_index, unknowns.count)
@@ -288,7 +372,10 @@ def curl_operators(
 
 
 def _sparse(values: Floats, columns: Ints, unknowns: int) -> sparse.csr_array:
-    """Rows of values; a column of -1 is a function that vanishes."""
+    """Return the operator (n, unknowns) with ``values`` (n, k) in ``columns`` (n, k).
+
+    Column -1 marks a function without an unknown, whose coefficient is 0.
+    """
     rows = np.broadcast_to(np.arange(len(values))[:, None], values.shape)
     used = columns >= 0
     return sparse.csr_array((values[used], (rows[used], columns[used])),
@@ -296,13 +383,16 @@ def _sparse(values: Floats, columns: Ints, unknowns: int) -> sparse.csr_array:
 
 
 SOLUTIONS_AT_ONCE = 32
+"""Number of solutions that are read from the disk at a time, which limits the memory."""
+
 PRINTED_TOLERANCE = 1e-9
-"""Of the largest value. Both evaluate the same polynomials; where GetDP finds a point in a curved
-element by iteration, up to 1e-10 was measured. Another numbering shows at 1."""
+"""Tolerance relative to the largest printed value. Both programs evaluate the same polynomials.
+Where GetDP locates a point in a curved element by iteration, differences of up to 1e-10 were
+measured. Another numbering of the unknowns makes a relative difference of order 1."""
 
 
 def apply_operator(operator: sparse.csr_array, solutions: NDArray[np.floating]) -> Floats:
-    """Rows of an operator (n, unknowns) on all solutions (k, unknowns), as (k, n)."""
+    """Apply an operator (n, unknowns) to solutions (k, unknowns); the result has shape (k, n)."""
     result = np.empty((len(solutions), operator.shape[0]))
     for first in range(0, len(solutions), SOLUTIONS_AT_ONCE):
         part = slice(first, first + SOLUTIONS_AT_ONCE)
@@ -311,13 +401,21 @@ def apply_operator(operator: sparse.csr_array, solutions: NDArray[np.floating]) 
 
 
 def compare_printed(ours: Floats, printed: Path, places: Floats) -> None:
-    """Compare vectors (n, 3) at places (n, 3), by our evaluation of a solution, with what GetDP
-    itself printed of it.
+    """Verify our evaluation of a solution against the values that GetDP printed.
+
+    Parameters
+    ----------
+    ours : ndarray, shape (n, 3)
+        Vectors from our evaluation.
+    printed : Path
+        File in which GetDP printed the vectors of the same solution.
+    places : ndarray, shape (n, 3), in m
+        The points.
 
     Raises
     ------
     GetDPError
-        If they differ by more than the rounding of 16 printed digits.
+        If the values differ by more than `PRINTED_TOLERANCE`.
     """
     theirs = runner.read_vectors(printed, places)
     difference = np.abs(ours - theirs).max()

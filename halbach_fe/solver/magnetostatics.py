@@ -1,4 +1,14 @@
-"""Finite-element solves: from a study and its mesh to B at points, source by source."""
+"""Finite-element solves on the mesh of a magnet: B at points, source by source.
+
+GetDP solves the weak forms of `halbach_fe.solver.formulations`. A source is a remanence B_r in the
+blocks: that of the nominal array (source 0), or 1 T along one axis of one block. The matrix of a
+linear problem is the same for all its sources. Non-linear iron is solved by Newton's method, for
+samples of the array's magnetization, and linearized for single blocks.
+
+By the method ``reaction`` every problem is solved twice on the same mesh, with the real materials
+and with vacuum in their place, and the difference is the reaction of permeability and iron. The
+discretization error of the sources' own field, by far the largest error, cancels.
+"""
 
 from __future__ import annotations
 
@@ -45,13 +55,15 @@ from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.materials import MU_0
 
 NOMINAL_SOURCE = 0
+"""Number of the source that is the magnetization of the whole array, see pro/sources.pro."""
+
 FLUX_DENSITY_FILE = "flux_density.txt"
 NEWTON_FILE = "newton_flux_density.txt"
 SOLUTIONS_FILE = "solutions.bin"
 
 NEWTON_TOLERANCE = 1e-10
-"""Residual of Newton's method relative to the right-hand side: the last step, quadratic, ends far
-below; rounding leaves 1e-14 or so."""
+"""Newton's method stops at this residual relative to the right-hand side. Since convergence is
+quadratic, the last step usually ends far below; rounding leaves about 1e-14."""
 
 PROBLEM_INCLUDES = ("problem_data.pro", "sources.pro", "vector_potential.pro", "solve_sources.pro",
                     "solve_newton.pro")
@@ -61,18 +73,21 @@ def solve_sources(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> Floats:
-    """Finite-element part of the field of the nominal array and of single blocks, iron being
-    linear.
+    """Return the finite-element part of B of the nominal array and of single blocks.
 
-    For the method ``direct`` that is B itself. For ``reaction`` it is the difference of two
-    solves on one mesh, real materials minus vacuum, to be added to the exact field in vacuum;
-    the discretization error of the sources' own field, by far the largest, cancels.
+    The iron must be linear. For the method ``direct`` the result is B itself. For ``reaction`` it
+    is the difference of two solves on one mesh, real materials minus vacuum, to be added to the
+    exact field in vacuum.
 
     Parameters
     ----------
+    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
-        Numbers, from 0, of the blocks to solve for with 1 T along each axis.
+        Numbers, from 0, of the blocks to solve for with a remanence of 1 T along each of the D
+        axes, while all other blocks have none.
+    session : Session
+    formulation : Formulation
     anywhere : bool
         Whether points may lie in magnet and iron.
 
@@ -89,17 +104,30 @@ def solve_tangent(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Finite-element part of the field of a magnet with non-linear iron, and its derivative.
+    """Return the finite-element part of B with non-linear iron, and its Gateaux derivatives.
 
-    With ``anywhere`` points may lie in magnet and iron.
+    The derivatives solve the problem that is linearized at the nominal array: its weak form has the
+    differential reluctivity dH/dB (or the differential permeability dB/dH), and a change of the
+    remanence is its source.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    points : ndarray, shape (n, 3), in m
+    blocks : sequence of int
+        Numbers, from 0, of the blocks whose derivatives are wanted.
+    session : Session
+    formulation : Formulation
+    anywhere : bool
+        Whether points may lie in magnet and iron.
 
     Returns
     -------
     field : ndarray, shape (n, 3), in T
-        Of the nominal array, by Newton's method.
+        The nominal array, by Newton's method.
     derivative : ndarray, shape (1 + D len(blocks), n, 3), in T
-        There, along the nominal magnetization, then per tesla of each block along each axis: the
-        Gateaux problem, with the differential reluctivity dH/dB.
+        The derivative along the nominal magnetization, then the derivatives per tesla of remanence
+        of each block along each axis.
     """
     case = _case(magnet, points, blocks, session, formulation, anywhere)
 
@@ -108,7 +136,9 @@ def solve_tangent(
             _newton_task(case, nominal_samples(magnet), False, NEWTON_TOLERANCE, gateaux=True)]
 
     real, *vacuum = _run_variants(magnet, session, tasks)
-    if vacuum:  # of the nominal array, for the field, and for the derivative along it
+    if vacuum:
+        # In vacuum the problem is linear: subtract the nominal array's field from the field and
+        # from the derivative along the nominal magnetization, and each block's from its derivative.
         real = real - vacuum[0][[0, *range(len(vacuum[0]))]]
     return real[0], real[1:]
 
@@ -117,16 +147,22 @@ def solve_samples(
     magnet: Magnet, points: Floats, samples: Floats, session: Session, formulation: Formulation,
     cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
 ) -> Floats:
-    """Finite-element part of the field for samples of magnetization, by Newton's method.
+    """Return the finite-element part of B for samples of magnetization, by Newton's method.
 
     Parameters
     ----------
+    magnet : Magnet
     points : ndarray, shape (n, 3), in m
+        In air.
     samples : ndarray, shape (k, blocks, 3), in A/m
+        Magnetizations of all blocks.
+    session : Session
+    formulation : Formulation
     cold : bool
-        Whether every sample starts from zero, not from the one before.
+        Whether Newton's method starts from zero for every sample, instead of from the solution of
+        the sample before.
     tolerance : float
-        Of the residual, relative to the right-hand side.
+        Largest residual of a solution, relative to the right-hand side.
 
     Returns
     -------
@@ -135,7 +171,7 @@ def solve_samples(
     Raises
     ------
     NotConvergedError
-        With the residuals of the sample that failed.
+        If Newton's method fails; the error has the residuals of the sample that failed.
     """
     case = _case(magnet, points, (), session, formulation)
     return _difference(magnet, session, lambda vacuum, parts: [
@@ -143,19 +179,22 @@ def solve_samples(
 
 
 def nominal_samples(magnet: Magnet) -> Floats:
-    """The nominal magnetization as the only sample, (1, blocks, 3) in A/m."""
+    """Return the nominal magnetization as a single sample, (1, blocks, 3) in A/m."""
     return np.array([[block.magnetization for block in magnet.blocks]])
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A linear problem as GetDP assembled it, and its solutions.
+    """The linear system of a problem as GetDP assembled it, and its solutions.
 
     Attributes
     ----------
+    mesh : VerifiedMesh
+    unknowns : Unknowns
     matrix : sparse array, shape (unknowns, unknowns)
+        The stiffness, without the fixed degrees of freedom.
     solutions : ndarray, shape (1 + D blocks, unknowns)
-        Of the nominal array, and of all blocks per tesla along each axis.
+        The nominal array, then all blocks per tesla of remanence along each axis.
     """
 
     mesh: VerifiedMesh
@@ -165,29 +204,42 @@ class Assembly:
 
 
 def assemble(magnet: Magnet, session: Session, formulation: Formulation) -> Assembly:
-    """Have GetDP assemble and solve a study with linear iron, for all its blocks."""
-    place = np.zeros((1, 3))  # any in air: GetDP prints there what is compared
+    """Have GetDP assemble and solve the problem of a magnet with linear iron, for all blocks."""
+    place = np.zeros((1, 3))  # any point in air, where GetDP prints B to verify our evaluation
     blocks = range(len(magnet.blocks))
     case = _case(magnet, place, blocks, session, formulation)
     last = magnet.dimension * len(blocks)
-    kept: dict[str, Any] = {}
+    system: dict[str, Any] = {}
 
     def keep_matrix(folder: Path, unknowns: Unknowns, _: NDArray[np.floating]) -> None:
-        kept["unknowns"] = unknowns
-        kept["matrix"] = read_matrix(folder / MATRIX_FILE, unknowns.count)
+        system["unknowns"] = unknowns
+        system["matrix"] = read_matrix(folder / MATRIX_FILE, unknowns.count)
 
     def keep_solutions(_: Path, __: Unknowns, solutions: NDArray[np.floating]) -> None:
-        kept["solutions"] = np.array(solutions, float)
+        system["solutions"] = np.array(solutions, float)
 
-    # PETSc writes the matrix at every solve, so one run for it and one for the solutions
+    # PETSc writes the matrix anew at every solve, so the matrix has a run of its own with one solve
     alone = replace(_source_task(case, False, (0, 0), "-matrix", keep_matrix), matrix=True)
     run_tasks([alone, _source_task(case, False, (0, last), "", keep_solutions)], session)
-    return Assembly(case.real_mesh, **kept)
+    return Assembly(case.real_mesh, **system)
 
 
 @dataclass(frozen=True)
 class _Case:
-    """What the runs for a magnet on one mesh have in common."""
+    """The data that all runs for a magnet on one mesh share.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    mesh : VerifiedMesh or CountedMesh
+    points : ndarray, shape (n, 3), in m
+    blocks : sequence of int
+        Numbers, from 0, of the blocks that are sources of their own.
+    formulation : Formulation
+    anywhere : bool
+        Whether points may lie in magnet and iron.
+    time_limit_s : float
+    """
 
     magnet: Magnet
     mesh: VerifiedMesh | CountedMesh
@@ -199,22 +251,22 @@ class _Case:
 
     @property
     def real_mesh(self) -> VerifiedMesh:
-        """The mesh; one that is only counted cannot be solved on."""
+        """The mesh of a run that is solved; a `CountedMesh` serves estimates only."""
         assert isinstance(self.mesh, VerifiedMesh)
         return self.mesh
 
     @cached_property
     def located(self) -> Located:
-        """Elements of the points."""
+        """The elements that hold the points, and the points' coordinates in them."""
         return locate(self.real_mesh, self.points, self.anywhere)
 
     @cached_property
     def probes(self) -> tuple[Located, Floats]:
-        """Some of the points and their places, where GetDP prints what is compared."""
+        """Probes (p, 3) in m where GetDP prints B, to check our own evaluation."""
         return probes_of(self.real_mesh, self.located)
 
     def size(self, solves: int, newton: bool = False) -> RunSize:
-        """Size of a run with so many linear solves."""
+        """Return the size of a run with ``solves`` linear solves."""
         return RunSize(self.formulation.route, self.mesh.elements,
                        self.formulation.unknowns(self.mesh.inner), solves, newton=newton)
 
@@ -223,8 +275,12 @@ def _case(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> _Case:
+    """Mesh a magnet, verify the mesh and check that all points lie inside.
+
+    In a session that counts runs, only the numbers of mesh entities are estimated.
+    """
     if magnet.dimension == 2:
-        points = points * [1, 1, 0]  # the mesh's plane stands for every other
+        points = points * [1, 1, 0]  # the field does not depend on z, and the mesh is at z = 0
     mesh: VerifiedMesh | CountedMesh
     if session.counter is None:
         mesh = verify_mesh(build_mesh(magnet, make_folder(session.folder)))
@@ -237,7 +293,7 @@ def _case(
 def _difference(
     magnet: Magnet, session: Session, tasks: Callable[[bool, int], list[Task]]
 ) -> Floats:
-    """B by the study's method: of real materials, or that minus vacuum."""
+    """Return the field of real materials or, for the method ``reaction``, that minus vacuum."""
     real, *vacuum = _run_variants(magnet, session, tasks)
     return real - vacuum[0] if vacuum else real
 
@@ -247,17 +303,18 @@ def _run_variants(
 ) -> list[Floats]:
     """Run the tasks of each variant that the study's method needs, real materials first.
 
-    ``tasks`` makes those of real materials (False) or vacuum (True), in about so many parts.
+    ``tasks`` takes whether materials are replaced by vacuum, and the number of parallel runs among
+    which the sources should be divided. It returns the runs of that variant.
     """
     variants = [False] if magnet.study.solver.method == "direct" else [False, True]
-    made = [tasks(vacuum, max(1, session.jobs // len(variants))) for vacuum in variants]
-    results = run_tasks([task for part in made for task in part], session)
-    limits = np.cumsum([0, *(len(part) for part in made)])
+    by_variant = [tasks(vacuum, max(1, session.jobs // len(variants))) for vacuum in variants]
+    results = run_tasks([task for part in by_variant for task in part], session)
+    limits = np.cumsum([0, *(len(part) for part in by_variant)])
     return [np.concatenate(results[a:b]) for a, b in pairwise(limits)]
 
 
 def render(template: str, *, magnet: Magnet, **data: object) -> str:
-    """The generated part of a problem, as GetDP text."""
+    """Return the generated part of a problem as GetDP text, from a template in pro/."""
     source = resources.files(pro).joinpath(template).read_text("utf-8")
     environment = jinja2.Environment(
         variable_start_string="<<", variable_end_string=">>", block_start_string="<%",
@@ -271,7 +328,7 @@ def render(template: str, *, magnet: Magnet, **data: object) -> str:
 
 
 def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:
-    """The nominal array and all sources of a linear problem, in up to so many runs."""
+    """Return up to ``parts`` runs that solve a linear problem for all its sources."""
     last = case.magnet.dimension * len(case.blocks)
     limits = np.linspace(0, last + 1, min(last + 1, parts) + 1).astype(int)
     return [_source_task(case, vacuum, (int(a), int(b) - 1), f"-{number}" if number else "")
@@ -282,7 +339,10 @@ def _source_task(
     case: _Case, vacuum: bool, sources: tuple[int, int], suffix: str,
     keep: Callable[[Path, Unknowns, NDArray[np.floating]], None] | None = None,
 ) -> Task:
-    """The nominal array and sources of a linear problem; ``keep`` sees all solutions."""
+    """Return the run that solves a linear problem for the sources from first to last.
+
+    ``keep`` is called with the run folder, the unknowns and all solutions.
+    """
     count = sources[1] - sources[0] + 1
 
     def read(folder: Path) -> Floats:
@@ -308,7 +368,11 @@ def _newton_task(
     case: _Case, samples: Floats, vacuum: bool, tolerance: float, cold: bool = False,
     gateaux: bool = False,
 ) -> Task:
-    """Newton's method for samples (k, blocks, 3) in A/m; its fields, then derivatives if wanted."""
+    """Return the run of Newton's method for samples (k, blocks, 3) of magnetization in A/m.
+
+    Its result is the field of each sample, followed with ``gateaux`` by the derivatives at the last
+    sample.
+    """
     columns = 1 + case.magnet.dimension * len(case.blocks) if gateaux else 0
 
     def fill(folder: Path) -> Job:
@@ -345,11 +409,12 @@ def _newton_task(
 
 
 def _saved(case: _Case) -> str:
-    """The file that GetDP's SaveSolution writes."""
+    """Return the name of the file that GetDP's SaveSolution writes."""
     return f"{Path(case.formulation.problem).stem}.res"
 
 
 def _unknowns(case: _Case, folder: Path) -> Unknowns:
+    """Return the unknowns of a run."""
     return read_unknowns(folder / f"{Path(case.formulation.problem).stem}.pre",
                          case.real_mesh.cell_type)
 
@@ -357,20 +422,22 @@ def _unknowns(case: _Case, folder: Path) -> Unknowns:
 def _fields(
     case: _Case, unknowns: Unknowns, located: Located, solutions: NDArray[np.floating]
 ) -> Floats:
+    """Return B (solutions, n, 3) in T of all solutions at n located points."""
     operators = case.formulation.flux_density(case.real_mesh, located, unknowns)
     return np.stack([apply_operator(operator, solutions) for operator in operators], axis=2)
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What one run of GetDP shall solve for.
+    """The sources and materials that one run of GetDP solves for.
 
     Attributes
     ----------
     blocks : sequence of int
         Numbers, from 0, of the blocks that are sources of their own.
     sources : tuple of int
-        First and last source: 0 is the whole array, then come the axes of ``blocks``.
+        First and last source, both included. Source 0 is the whole array; the axes of the first of
+        ``blocks`` follow, then those of the next.
     vacuum : bool
         Whether all materials are replaced by vacuum.
     samples : ndarray, shape (k, blocks, 3), in A/m, or None
@@ -391,8 +458,17 @@ def fill_run_folder(
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there.
 
-    GetDP prints the first source's field at the ``places`` (n, 3) in m. Without a request it
-    solves for the nominal array.
+    Parameters
+    ----------
+    magnet : Magnet
+    mesh : VerifiedMesh
+    places : ndarray, shape (n, 3), in m
+        Points at which GetDP prints the field of the first source.
+    folder : Path
+        An existing folder.
+    formulation : Formulation
+    request : RunRequest, optional
+        By default the nominal array is solved for, with real materials.
     """
     request = request or RunRequest()
     blocks, sources, samples = request.blocks, request.sources, request.samples
@@ -420,7 +496,12 @@ def fill_run_folder(
 
 
 def check_inside(name: str, radius_m: float, half_length_m: float, points: Floats) -> None:
-    """Refuse points (n, 3) outside the mesh of a study, where GetDP would print zeros."""
+    """Refuse points (n, 3) in m outside the mesh of a study, where GetDP would print zeros.
+
+    Raises
+    ------
+    PointsOutsideError
+    """
     radius = np.hypot(points[:, 0], points[:, 1])
     outside = (radius > radius_m) | (np.abs(points[:, 2]) > half_length_m)
     if outside.any():

@@ -1,7 +1,8 @@
-"""Meshes on disk: built by `halbach_fe.geo`, and verified before anything is solved on them.
+"""Meshes of magnets: built by `halbach_fe.geo`, and verified before GetDP uses them.
 
-GetDP reads a truncated mesh, or one that lacks a region, without complaint; so what a mesh holds
-is read here, and the number of unknowns that GetDP must find is derived from it.
+GetDP reads a truncated mesh, or a mesh that lacks a region, without an error. Therefore every mesh
+is read back here and checked, and the number of unknowns that GetDP must report is derived from its
+numbers of nodes, edges and faces. For estimates these numbers are also computed without meshing.
 """
 
 from __future__ import annotations
@@ -24,13 +25,15 @@ from halbach_fe.geometry.regions import Regions
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
 MERIDIAN = "meridian"
-"""Prefix of the mesh of the (r, z) half-plane."""
+"""Prefix of the file names of the mesh of the (r, z) half-plane."""
 
 MERIDIAN_ELEMENTS = 12
 """Default number of elements across the blocks in the (r, z) half-plane."""
 
+# Dimension of a cell by meshio's name of its type.
 _DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad": 2, "tetra10": 3}
-# Corners of the parts of cells, by meshio's type; middles of edges do not count as corners.
+# By meshio's name of the cell type: number of corners (nodes in the middle of edges do not count),
+# and the corners of each edge and of each face.
 _CORNERS = {"line": 2, "line3": 2, "triangle6": 3, "quad": 4, "tetra10": 4}
 _EDGES = {"line": ((0, 1),), "line3": ((0, 1),), "triangle6": ((0, 1), (1, 2), (2, 0)),
           "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
@@ -41,7 +44,16 @@ _FACES = {"line": (), "line3": (), "triangle6": ((0, 1, 2),), "quad": ((0, 1, 2,
 
 @dataclass(frozen=True)
 class Entities:
-    """Numbers of nodes, of those that are corners, of edges and of faces."""
+    """Numbers of entities of a mesh, or of a part of it.
+
+    Attributes
+    ----------
+    nodes : int
+        All nodes, including those in the middle of edges.
+    corners : int
+        Nodes that are corners of elements.
+    edges, faces : int
+    """
 
     nodes: int
     corners: int
@@ -51,7 +63,7 @@ class Entities:
 
 @dataclass(frozen=True)
 class MeshFiles:
-    """A mesh and its region file."""
+    """Paths of a mesh and of the file that names its regions."""
 
     mesh: Path
     regions: Path
@@ -59,23 +71,26 @@ class MeshFiles:
 
 @dataclass(frozen=True)
 class VerifiedMesh:
-    """A mesh that holds every region, and what the number of unknowns follows from.
+    """A mesh that was checked to hold every region and its outer boundary.
 
     Attributes
     ----------
+    path : Path
+    regions : Regions
+        Tags and names of the regions.
     points : ndarray, shape (nodes, d), in m
-        In a half-plane x is r and y is z.
-    cells : ndarray, shape (elements, k)
-        Nodes of every element, in the order of the file, all of one type.
+        Coordinates of the nodes; in a half-plane x is r and y is z.
+    cells : ndarray of int, shape (elements, k)
+        Nodes of every element, in the order of the file. All elements are of one type.
     cell_type : str
-        meshio's name of it: ``triangle6``, ``quad`` or ``tetra10``.
+        meshio's name of this type: ``triangle6``, ``quad`` or ``tetra10``.
     in_air, in_iron : ndarray of bool, shape (elements,)
     inner : Entities
-        Off the outer boundary.
+        Numbers of entities off the outer boundary, from which the number of unknowns follows.
     axis : Entities
-        Of these, those on the axis of a half-plane.
+        Of these, the numbers on the axis of a half-plane; 0 for other meshes.
     radius, half_length : float
-        Extent in m.
+        Extent of the mesh in m; the half length of a cross-section is infinite.
     """
 
     path: Path
@@ -98,7 +113,7 @@ class VerifiedMesh:
 
 @dataclass(frozen=True)
 class CountedMesh:
-    """How many parts a mesh will have, before it is made.
+    """Expected numbers of entities of a mesh that has not been built.
 
     Attributes
     ----------
@@ -106,9 +121,9 @@ class CountedMesh:
     inner : Entities
         Off the outer boundary.
     axis : Entities
-        Of these, those on the axis of a half-plane.
+        Of these, the numbers on the axis of a half-plane; 0 for other meshes.
     radius, half_length : float
-        Extent in m.
+        Extent of the mesh in m; the half length of a cross-section is infinite.
     """
 
     elements: int
@@ -119,8 +134,16 @@ class CountedMesh:
 
 
 def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
-    """Mesh a study into ``folder``; the same study always gives the same mesh."""
-    from halbach_fe import geo  # Gmsh loads only when a mesh is built
+    """Mesh the cross-section of a 2D magnet, or a 3D magnet, into ``folder``.
+
+    The same magnet always gives the same mesh.
+
+    Raises
+    ------
+    OutputError
+        If the files cannot be written.
+    """
+    from halbach_fe import geo  # imports Gmsh, which only meshing needs
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -133,13 +156,19 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
 
 
 def meridian_size(magnet: Magnet) -> float:
-    """Element size in m of the half-plane at the magnet."""
+    """Return the element size in m at the magnet in the mesh of the (r, z) half-plane."""
     thickness = magnet.array.outer_radius_m - magnet.array.inner_radius_m
     return magnet.study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
 
 
 def build_meridian(magnet: Magnet, folder: Path) -> MeshFiles:
-    """Mesh the (r, z) half-plane of a rotationally symmetric study into ``folder``."""
+    """Mesh the (r, z) half-plane of a rotationally symmetric magnet into ``folder``.
+
+    Raises
+    ------
+    OutputError
+        If the files cannot be written.
+    """
     from halbach_fe import geo
 
     files = MeshFiles(folder / f"{MERIDIAN}.msh", folder / f"{MERIDIAN}-regions.json")
@@ -152,29 +181,30 @@ def build_meridian(magnet: Magnet, folder: Path) -> MeshFiles:
 
 
 def verify_mesh(files: MeshFiles) -> VerifiedMesh:
-    """Read a mesh and its regions back, and check that they belong together.
+    """Read a mesh and its regions, and check that they match.
 
     Raises
     ------
     MeshError
-        Truncated file, missing or unknown region, missing outer boundary.
+        If the file is truncated or damaged, lacks a region or its outer boundary, holds an unknown
+        region, or has elements of several types.
     """
     regions = Regions.read(files.regions)
     mesh = _read(files.mesh)
     physical = mesh.cell_data.get("gmsh:physical")
     if physical is None:
         raise MeshError(f"Mesh {files.mesh} holds no physical groups; mesh the study again.")
-    found: dict[int, dict[int, int]] = {}
+    counts: dict[int, dict[int, int]] = {}  # number of cells by dimension and region
     for cells, tags in zip(mesh.cells, physical, strict=True):
-        by_tag = found.setdefault(_DIMENSION.get(cells.type, -1), {})
+        by_tag = counts.setdefault(_DIMENSION.get(cells.type, -1), {})
         for tag, count in zip(*np.unique(tags, return_counts=True), strict=True):
             by_tag[int(tag)] = by_tag.get(int(tag), 0) + int(count)
-    volumes = found.get(regions.dimension, {})
+    volumes = counts.get(regions.dimension, {})
     for tag in regions.volume_tags:
         if tag not in volumes:
             raise MeshError(
                 f"Mesh {files.mesh} lacks region {tag} ({regions.names[tag]}); GetDP would leave "
-                "it out without a word. Mesh the study again."
+                "it out without a warning. Mesh the study again."
             )
     unknown = set(volumes) - set(regions.volume_tags)
     if unknown:
@@ -182,7 +212,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
             f"Mesh {files.mesh} holds region {min(unknown)}, which {files.regions.name} does not "
             "name; GetDP would ignore it. Mesh the study again."
         )
-    if regions.outer_boundary not in found.get(regions.dimension - 1, {}):
+    if regions.outer_boundary not in counts.get(regions.dimension - 1, {}):
         raise MeshError(
             f"Mesh {files.mesh} lacks its outer boundary (region {regions.outer_boundary}); GetDP "
             "would solve without a boundary condition. Mesh the study again."
@@ -210,6 +240,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
 
 
 def _read(path: Path) -> meshio.Mesh:
+    """Read a mesh in format MSH 2.2, and check that it is complete."""
     try:
         raw = path.read_bytes()
     except OSError as error:
@@ -225,35 +256,43 @@ def _read(path: Path) -> meshio.Mesh:
     except ValueError as error:
         raise MeshError(f"Mesh {path} is damaged ({error}); mesh the study again.") from None
     if not np.isfinite(mesh.points).all():
-        raise MeshError(f"Mesh {path} has nodes without a place; mesh the study again.")
+        raise MeshError(f"Mesh {path} has nodes without finite coordinates; mesh the study again.")
     return mesh
 
 
 def _on(path: Path, mesh: meshio.Mesh, physical: list[Ints], tag: int) -> tuple[str, Ints]:
-    """Type and elements of a part of the boundary."""
+    """Return the type and the elements of the region ``tag``, a part of the boundary."""
     return _joined(path, [
         (c.type, c.data[tags == tag]) for c, tags in zip(mesh.cells, physical, strict=True)
         if (tags == tag).any()])
 
 
 def _joined(path: Path, parts: list[tuple[str, Ints]]) -> tuple[str, Ints]:
-    """Elements that are of one type, and which."""
+    """Join elements (type, nodes) that must all be of one type; return the type and the nodes."""
     kinds = {kind for kind, _ in parts}
     if len(kinds) != 1 or not kinds <= set(_CORNERS):
         raise MeshError(f"Mesh {path} holds elements of types {', '.join(sorted(kinds)) or 'none'} "
-                        "in place of one; mesh the study again.")
+                        "in place of one type; mesh the study again.")
     return kinds.pop(), np.vstack([data for _, data in parts])
 
 
 def _count(cells: Ints, kind: str) -> Entities:
-    """How many different nodes, corners, edges and faces cells of one type have."""
+    """Count the different nodes, corners, edges and faces of cells of one type."""
     corners = cells[:, :_CORNERS[kind]]
     return Entities(len(np.unique(cells)), len(np.unique(corners)),
                     _different(corners, _EDGES[kind]), _different(corners, _FACES[kind]))
 
 
 def _different(corners: Ints, parts: tuple[tuple[int, ...], ...]) -> int:
-    """How many parts of cells, by their corners in any order, differ."""
+    """Count the different edges or faces of cells.
+
+    Parameters
+    ----------
+    corners : ndarray of int, shape (cells, k)
+    parts : tuple of tuple of int
+        The corners, from 0 to k - 1, of each edge or face of a cell. Edges or faces with the same
+        corners in any order are the same.
+    """
     if not parts or not len(corners):
         return 0
     ordered = np.sort(np.vstack([corners[:, list(part)] for part in parts]), axis=1)
@@ -265,15 +304,21 @@ def _different(corners: Ints, parts: tuple[tuple[int, ...], ...]) -> int:
 
 
 def _less(all_: Entities, some: Entities) -> Entities:
+    """Return the difference of two sets of numbers of entities."""
     return Entities(all_.nodes - some.nodes, all_.corners - some.corners,
                     all_.edges - some.edges, all_.faces - some.faces)
 
 
 def count_mesh(magnet: Magnet, kind: str) -> CountedMesh:
-    """Count the parts of a kind of mesh (a key of `BOUNDARY_RATIO`) without making it."""
+    """Estimate the numbers of entities of a mesh without building it.
+
+    ``kind`` is a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`. The numbers of a half-plane
+    are exact. The other meshes are unstructured: their number of triangles in a plane is estimated,
+    and Euler's formula gives the rest.
+    """
     radius = boundary_radius(magnet, kind)
     half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
-    from halbach_fe import geo  # Gmsh loads only when something is meshed
+    from halbach_fe import geo  # imports Gmsh, which only meshing needs
 
     if kind == "meridian":
         columns, rows = geo.grid_size(magnet, meridian_size(magnet))
@@ -282,18 +327,20 @@ def count_mesh(magnet: Magnet, kind: str) -> CountedMesh:
         return CountedMesh(cells, Entities(nodes, nodes, nodes + cells, cells),
                            Entities(rows - 2, rows - 2, rows - 1, 0), radius, half_length)
     triangles, rim = (round(number) for number in geo.plane_size(magnet, kind))
-    # Euler: a disk of T triangles with R edges on its rim has E edges and V corners
+    # a disk of T triangles with R edges on its rim has E = (3 T + R) / 2 edges, since every inner
+    # edge belongs to two triangles, and by Euler's formula V = 1 + E - T corners
     edges = (3 * triangles + rim) // 2
     corners = 1 + edges - triangles
     none = Entities(0, 0, 0, 0)
     if kind == "cross_section":
         inner = Entities(corners + edges - 2 * rim, corners - rim, edges - rim, triangles)
         return CountedMesh(triangles, inner, none, radius, half_length)
-    # every prism on a triangle is cut into three, every rectangle on an edge into two
+    # the mesh is extruded in layers: every prism on a triangle is cut into three tetrahedra, every
+    # rectangle on an edge into two triangles by a diagonal
     layers = len(geo.layers(magnet)) - 1
     inner_corners = (corners - rim) * (layers - 1)
-    inner_edges = ((corners - rim) * layers + (edges - rim) * (layers - 1)  # upright, level
-                   + (edges - rim) * layers)  # and across the rectangles
+    inner_edges = ((corners - rim) * layers + (edges - rim) * (layers - 1)  # along z, in planes
+                   + (edges - rim) * layers)  # diagonals of the rectangles
     inner_faces = triangles * (layers - 1) + 2 * (edges - rim) * layers + 2 * triangles * layers
     return CountedMesh(3 * triangles * layers, Entities(
         inner_corners + inner_edges, inner_corners, inner_edges, inner_faces), none, radius,

@@ -1,4 +1,8 @@
-"""Runs of GetDP, several at a time, each in its own folder; the first failure ends them all."""
+"""Parallel runs of GetDP, each in its own folder; the first failure ends them all.
+
+A run is described by a `Task`. Results come from the cache if it has them. The folders of finished
+runs are kept, so that a run can be repeated by hand.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,10 @@ from halbach_fe.solver.getdp import Job
 from halbach_fe.solver.session import Progress, RunSize, Session
 
 NEWTON_HISTORY = "newton.csv"
+"""File in the run folder with the relative residual of every Newton step."""
+
 MATRIX_FILE = "matrix.bin"
+"""File in the run folder to which PETSc writes the matrix."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +40,19 @@ class Task:
     Attributes
     ----------
     name : str
-        Of its folder.
+        Name of its folder.
     stage : callable
-        Fills the run folder and returns the job to run there.
+        Takes the run folder, fills it, and returns the job to run there.
     read : callable
-        Reads the verified result, an array of ``shape``, from the run folder.
+        Takes the run folder after the run, verifies the result and returns it.
     shape : tuple of int
+        Shape of the result.
     solves : int
-        Solves that the run reports as progress.
+        Number of solves that the run reports as progress.
     size : RunSize
-        What the run is expected to cost.
+        Size of the run, for estimates of its cost.
     matrix : bool
-        Whether PETSc writes the matrix.
+        Whether PETSc writes the matrix to `MATRIX_FILE`.
     """
 
     name: str
@@ -59,7 +67,12 @@ class Task:
 def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
     """Run GetDP for every task, ``session.jobs`` at a time; the first failure ends them all.
 
-    A session that counts gets zeros.
+    If the session only counts runs, the tasks are recorded and their results are zeros.
+
+    Raises
+    ------
+    GetDPError
+        The error of the first run that failed.
     """
     if session.counter is not None:
         session.counter.batches.append((session.purpose, [task.size for task in tasks]))
@@ -75,21 +88,21 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
                 job = replace(job, matrix=MATRIX_FILE)
             history: list[str] = []
 
-            def see(line: str) -> None:
+            def on_line(line: str) -> None:
                 counter.line(line)
                 if line.startswith("NEWTON"):
                     history.append(line)
 
-            kept = session.cache.entry(session.getdp, job, folder) if session.cache else None
+            entry = session.cache.entry(session.getdp, job, folder) if session.cache else None
             try:
-                if kept is None or not kept.restore(see):
-                    session.run(session.getdp, job, folder, see, cancel)
+                if entry is None or not entry.restore(on_line):
+                    session.run(session.getdp, job, folder, on_line, cancel)
             except GetDPError as error:
                 raise _with_history(error, newton_residuals(history)) from None
             result = task.read(folder)
-            if kept is not None:
-                stored.append(kept.store())  # what was read and found sound
-            for name in job.large:  # and not needed to run the folder by hand
+            if entry is not None:
+                stored.append(entry.store())  # only now: reading has verified the result
+            for name in job.large:  # repeating the run by hand does not need these files
                 (folder / name).unlink()
             return result
 
@@ -102,7 +115,7 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
                     future.result()
             return [future.result() for future in futures]
         finally:
-            cancel.set()  # on failure and on Ctrl-C nobody waits for the others
+            cancel.set()  # on failure and on Ctrl-C, end the runs that still go on
             for future in futures:
                 future.cancel()
             if session.cache is not None and any(stored):
@@ -110,7 +123,10 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
 
 
 def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
-    """The error, with the residuals if Newton's method is what failed."""
+    """Return the error, with the residuals of the last sample if Newton's method failed.
+
+    ``history`` has the relative residuals by sample and step.
+    """
     if "Newton's method did not converge" not in error.sentence or not history:
         return error
     residuals = tuple(history[-1])
@@ -121,13 +137,14 @@ def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
 
 
 class _Counter:
-    """Counts finished solves of several threads."""
+    """Counts the finished solves of several threads, and reports them as progress."""
 
     def __init__(self, total: int, progress: Progress | None) -> None:
         self._lock, self._done, self._total = threading.Lock(), 0, total
         self._progress = progress
 
     def line(self, line: str) -> None:
+        """Count a line of a log if it reports a finished solve."""
         if line.startswith(("SOURCE", "SAMPLE")) and self._progress is not None:
             with self._lock:
                 self._done += 1
@@ -135,31 +152,34 @@ class _Counter:
 
 
 def variant_name(vacuum: bool) -> str:
-    """What a run folder is called by: materials as they are, or all replaced by vacuum."""
+    """Return the name of a variant in run folders: real materials, or vacuum in their place."""
     return "vacuum" if vacuum else "real"
 
 
 def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
-    """Relative residuals of Newton's method in a log of GetDP, by sample and step."""
-    found: list[list[float]] = []
+    """Return the relative residuals of Newton's method in a log of GetDP, by sample and step."""
+    history: list[list[float]] = []
     for line in lines:
         match = re.search(
             r"NEWTON \d+ (\d+) (\d{1,20}(?:\.\d{1,20})?(?:e[-+]?\d+)?|nan|inf)\b", line)
-        if match and (found or match[1] == "0"):
-            if match[1] == "0":
-                found.append([])
-            found[-1].append(float(match[2]))
-    return found
+        if match and (history or match[1] == "0"):
+            if match[1] == "0":  # step 0 starts the next sample
+                history.append([])
+            history[-1].append(float(match[2]))
+    return history
 
 
 def newton_history(folder: Path) -> list[float]:
-    """Relative residuals of Newton's method in the run that a session's folder keeps."""
+    """Return the relative residuals of the last sample's Newton steps.
+
+    ``folder`` is a session's folder, with the finished run for the real materials.
+    """
     log = folder / f"getdp-{variant_name(False)}" / runner.LOG_NAME
     return newton_residuals(log.read_text("utf-8").splitlines())[-1]
 
 
 def write_history(folder: Path) -> int:
-    """Keep the residuals of a run's log as a table; return the number of steps."""
+    """Write the residuals in the log of a run as a table, and return the number of Newton steps."""
     history = newton_residuals((folder / runner.LOG_NAME).read_text("utf-8").splitlines())
     rows = [f"{sample},{step},{residual:.6e}" for sample, residuals in enumerate(history)
             for step, residual in enumerate(residuals)]
@@ -169,8 +189,21 @@ def write_history(folder: Path) -> int:
 
 @contextmanager
 def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Path]:
-    """A private folder, kept as ``name`` after a good run and as ``name-failed`` (with the log)
-    after a bad one; anything else that ends the run leaves nothing.
+    """Make a private folder for a run, and keep it after the run.
+
+    Parameters
+    ----------
+    parent : Path
+    name : str
+        The folder is kept as ``name`` if the run succeeds, and as ``name-failed`` (with the log) if
+        it raises a GetDPError. In all other cases, and if the run was cancelled, it is removed.
+    cancel : threading.Event
+        Set if the run was cancelled.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
     remove_orphans(make_folder(parent))
     folder = Path(tempfile.mkdtemp(prefix=temporary_name(name), dir=parent))
@@ -180,10 +213,10 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
     except GetDPError as error:
         if cancel.is_set():
             raise
-        kept = parent / f"{name}-failed"
-        _replace(folder, kept)
+        failed = parent / f"{name}-failed"
+        _replace(folder, failed)
         if error.log is not None:
-            error.log = kept / error.log.name
+            error.log = failed / error.log.name
         raise
     except OSError as error:
         raise OutputError(f"Cannot write into {parent}: {error.strerror}.") from None
@@ -191,6 +224,7 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _replace(folder: Path, kept: Path) -> None:
-    shutil.rmtree(kept, ignore_errors=True)
-    folder.rename(kept)
+def _replace(folder: Path, target: Path) -> None:
+    """Rename a folder to ``target``, and remove an older folder of that name."""
+    shutil.rmtree(target, ignore_errors=True)
+    folder.rename(target)

@@ -1,4 +1,4 @@
-"""What every solve needs besides the magnet: GetDP, folders, cache, progress."""
+"""The settings of all runs of GetDP: executable, folder, cache, number of processes, progress."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ from halbach_fe.solver.getdp import GetDP, Run, find_getdp
 from halbach_fe.solver.getdp_cache import Cache, default_cache
 
 DEFAULT_JOBS = 2
-"""Runs of GetDP at a time, if the machine has as many cores: most problems are two runs, with the
-materials as they are and with vacuum in their place."""
+"""Number of parallel runs of GetDP, if the machine has as many cores. Most problems consist of two
+runs, with the real materials and with vacuum in their place."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of solves done and the number of all."""
+"""A function that is called with the number of finished solves and the number of all solves."""
 
 
 @dataclass(frozen=True)
 class RunSize:
-    """How large a run of GetDP is.
+    """The size of a run of GetDP, from which its cost is estimated.
 
     Attributes
     ----------
     route : str
-        Formulation that it solves, see `halbach_fe.solver.field.choose_route`.
+        Route of the solve, see `halbach_fe.solver.field.choose_route`.
     elements, unknowns : int
     solves : int
-        Linear solves; those of Newton's steps, which nobody knows before, do not count.
+        Number of linear solves, without those of Newton's steps, whose number is not known in
+        advance.
     matrices : int
-        Different matrices; of Newton's method, again, none of its steps counts.
+        Number of different matrices, also without those of Newton's steps.
     newton : bool
-        Whether the field is solved by Newton's method first.
+        Whether Newton's method solves for the field first.
     """
 
     route: str
@@ -51,7 +52,7 @@ class RunCounter:
     Attributes
     ----------
     batches : list of (str, sequence of RunSize)
-        Runs that may go side by side, with the purpose of the session that starts them.
+        Purpose of the session, and the runs that it would start in parallel.
     """
 
     batches: list[tuple[str, Sequence[RunSize]]] = field(default_factory=list)
@@ -59,31 +60,32 @@ class RunCounter:
 
 @dataclass(frozen=True)
 class Session:
-    """How and where GetDP runs; `Session.open` makes one with the usual settings.
+    """The settings with which GetDP runs; `Session.open` returns the usual ones.
 
     Attributes
     ----------
     getdp : GetDP
-        The executable and what is known of its build.
+        The executable, with its version and build.
     folder : Path
-        Run folders are made here; those of finished runs are kept (``getdp-real``,
-        ``getdp-vacuum``) and can be run by hand.
+        Folder for meshes and runs. The folders of finished runs are kept (``getdp-real``,
+        ``getdp-vacuum``), and GetDP can be started in them by hand.
     jobs : int
-        Runs of GetDP at a time.
+        Largest number of parallel runs of GetDP.
     time_limit_s : float
         Longest time of a single run.
     progress : callable, optional
-        Called with the number of finished solves and the number of all.
+        Called with the number of finished solves and the number of all solves.
     cache : Cache, optional
-        Answers of GetDP that are kept; the same question is not solved again.
+        Results of earlier runs, which are not computed again.
     run : callable
-        Runs a job on this machine, or elsewhere (`halbach_fe.solver.dask_cluster`).
+        Runs a job on this machine (`halbach_fe.solver.getdp.run`), or on another machine
+        (`halbach_fe.solver.dask_cluster`).
     processes : int
         MPI processes that share each run, for a solve that is too large for one process.
     purpose : str
-        What the solves are for, in words.
+        Purpose of the solves, as estimates print it.
     counter : RunCounter, optional
-        With it nothing is meshed or solved: the runs that would be started are counted.
+        If given, the session does not mesh or solve; it only counts the runs that it would start.
 
     Examples
     --------
@@ -113,13 +115,14 @@ class Session:
         Parameters
         ----------
         folder : str or Path
-            Folder for meshes, runs and results; made when needed.
+            Folder for meshes, runs and results; created when it is needed.
         jobs : int, optional
-            Runs of GetDP at a time; two by default, or one on a machine of one core.
+            Largest number of parallel runs of GetDP; two by default, or one on a machine with one
+            core.
         getdp : str, optional
             GetDP executable; by default that of $HALBACH_FE_GETDP, then of PATH.
         progress : callable, optional
-            See `Session`.
+            Called with the number of finished solves and the number of all solves.
 
         Returns
         -------
@@ -128,7 +131,7 @@ class Session:
         Raises
         ------
         GetDPNotFoundError
-            If there is no GetDP.
+            If GetDP is not found, or does not answer like GetDP.
 
         Examples
         --------
@@ -141,9 +144,9 @@ class Session:
 
     @classmethod
     def counting(cls, jobs: int) -> Session:
-        """Return a session that counts runs of GetDP in place of starting them."""
+        """Return a session that counts runs of GetDP instead of starting them."""
         return cls(GetDP(Path(), "", (), ""), Path(), jobs=jobs, counter=RunCounter())
 
     def within(self, name: str) -> Session:
-        """Return the same session in a folder of its own, inside this one's."""
+        """Return the same session with a subfolder of this session's folder."""
         return replace(self, folder=self.folder / name)

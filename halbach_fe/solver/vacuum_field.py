@@ -2,22 +2,25 @@
 
 A block of uniform polarization J = B_r (recoil permeability 1) has the surface charge J . n.
 For a prism along z with outline C between z1 and z2 the field outside is a sum of line integrals
-over C only, with R the distance from source to point, rho its part in the plane, and u = z - z':
+over C only. With R the distance from the source to the point, rho the vector from the source to the
+point in the plane, and u = z - z':
 
 * side faces, charge J_t . n: integrating along z in closed form leaves
   ``B_t = 1/4pi int (J.n) rho/rho^2 [-u/R] dl`` and ``B_z = 1/4pi int (J.n) [1/R] dl``,
   the brackets being differences between z' = z2 and z1;
 * end faces, charge +-J_z: the divergence theorem in the plane of the face gives
   ``B_t = +- J_z/4pi int n/R dl`` (+ at the upper face) and the solid angle
-  ``B_z = +- J_z/4pi int (rho.n/rho^2) (sign u - u/R) dl``, rho counted from the point's
-  projection to the source.
+  ``B_z = +- J_z/4pi int (rho.n/rho^2) (sign u - u/R) dl``, where rho points the other way, from
+  the point's projection to the source.
 
-J. D. Jackson, Classical Electrodynamics, 3rd ed., section 5.9, for the charge model. The brackets
-are evaluated in a form without cancellation, so that points above the prolongation of a vertical
-edge are ordinary points. In two dimensions [-u/R] is 2 and only B_t remains.
+See J. D. Jackson, Classical Electrodynamics, 3rd ed., section 5.9, for the charge model. The
+brackets are evaluated in a form without cancellation, so that points on the prolongation of a
+vertical edge, above or below the block, are not singular. In two dimensions [-u/R] is 2 and only
+B_t remains.
 
-The line integrals are taken by Gauss-Legendre panels no longer than the distance to the nearest
-point, which converges geometrically (to about 1e-12 of the field for the default order).
+The line integrals are evaluated by Gauss-Legendre quadrature on panels that are no longer than the
+distance to the nearest point. It converges geometrically with the order, to an error of about 1e-12
+of the field for the default order.
 """
 
 from __future__ import annotations
@@ -34,31 +37,34 @@ from halbach_fe.geometry.outline import Edge, Outline
 from halbach_fe.geometry.symmetry import Frame, frame_of, rotation_about_z, unique_points
 
 _ORDER = 12
-_STEP = 1e-4
-"""Of the array's radius, for differences: the relative error is the square of the step over the
-distance to a block. Of four Gauss points, measured at 3 % of the radius from the blocks, it is 1e-4
-too."""
+"""Default number of Gauss points per panel."""
 
-_CHUNK = 20_000_000  # numbers in one temporary array: 160 MB
-_AT_ONCE = 4_000_000  # blocks times points whose places are compared at once
+_STEP = 1e-4
+"""Step of finite differences, relative to the largest radius of the blocks. Their relative error is
+the square of the step over the distance to a block. The quadrature with four Gauss points adds an
+error of 1e-4, measured at a distance of 3 % of the radius from the blocks."""
+
+_CHUNK = 20_000_000  # largest number of values in the temporary arrays, 160 MB
+_AT_ONCE = 4_000_000  # largest number of blocks times points that are searched for equal positions
 
 
 def unit_field(
     block: MagnetBlock, points: Floats, order: int = _ORDER, panel: float | None = None
 ) -> Floats:
-    """Field of one block for remanences of 1 T along x, y and z, in vacuum.
+    """Return the field of one block in vacuum for remanences of 1 T along x, y and z.
 
     Parameters
     ----------
     block : MagnetBlock
         Infinite ``z_min``, ``z_max`` give the field of the two-dimensional cross-section.
     points : ndarray, shape (n, 3), in m
-        Points off the block's surface, where the result is not defined; inside it, mu_0 H.
+        Points off the block's surface, where the field is not defined. Inside the block the result
+        is mu_0 H instead of B.
     order : int
         Gauss points per panel of the outline.
     panel : float, optional
-        Longest panel in m (default: the distance to the nearest point); what is nearer to the block
-        is less exact.
+        Longest panel in m (default: the distance to the nearest point). The result is less accurate
+        at points that are nearer to the block than this length.
 
     Returns
     -------
@@ -84,7 +90,8 @@ def unit_fields(
 ) -> Iterator[Floats]:
     """Yield `unit_field` of every block, in order.
 
-    Congruent blocks share the integrals: readings on circles see many blocks from the same place.
+    Congruent blocks share the integrals. Points on circles have the same positions relative to many
+    blocks, and each such position is integrated once.
     """
     at_once = max(1, _AT_ONCE // max(1, len(points)))
     for first in range(0, len(blocks), at_once):
@@ -94,7 +101,12 @@ def unit_fields(
 def _fields_of_some(
     blocks: Sequence[MagnetBlock], points: Floats, order: int, panel: float | None
 ) -> Iterator[Floats]:
-    seen_by = [points if block.in_place else block.to_place(points) for block in blocks]
+    """Yield `unit_field` of blocks that are few enough to be compared at once.
+
+    A displaced block is evaluated in its nominal position, at the points moved the opposite way; a
+    block that consists of several parts is the weighted sum of their fields.
+    """
+    points_by_block = [points if block.in_place else block.to_place(points) for block in blocks]
     pieces = [(number, factor, part) for number, block in enumerate(blocks)
               for factor, part in block.parts]
     frames = [frame_of(part) for _, _, part in pieces]
@@ -104,9 +116,9 @@ def _fields_of_some(
     fields: dict[tuple[object, ...], Floats] = {}
     places: dict[int, Ints] = {}
     for shape, members in groups.items():
-        seen = np.vstack([frames[number].local(seen_by[pieces[number][0]])[0]
+        local_points = np.vstack([frames[number].local(points_by_block[pieces[number][0]])[0]
                           for number in members])
-        union, inverse = unique_points(seen)
+        union, inverse = unique_points(local_points)
         fields[shape] = unit_field(_in_frame(pieces[members[0]][2], frames[members[0]]), union,
                                    order, panel)
         places.update(zip(members, inverse.reshape(len(members), len(points)), strict=True))
@@ -115,7 +127,7 @@ def _fields_of_some(
         total = np.zeros((len(points), 3, 3))
         for piece in islice(remaining, len(block.parts)):
             frame, factor = frames[piece], pieces[piece][1]
-            signs = frame.local(seen_by[number])[1]
+            signs = frame.local(points_by_block[number])[1]
             total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
         if not block.in_place:
             turn = rotation_matrix(block.rotation_rad)
@@ -124,7 +136,7 @@ def _fields_of_some(
 
 
 def _in_frame(block: MagnetBlock, frame: Frame) -> MagnetBlock:
-    """The block moved into its own frame."""
+    """Return the block moved into its frame, which congruent blocks have in common."""
     turn = rotation_about_z(frame.angle)[:2, :2]
 
     def moved(point: tuple[float, float]) -> tuple[float, float]:
@@ -137,7 +149,10 @@ def _in_frame(block: MagnetBlock, frame: Frame) -> MagnetBlock:
 
 
 def field_of(blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER) -> Floats:
-    """Field in vacuum of blocks with their nominal remanence, (n, 3) in T."""
+    """Return B (n, 3) in T of blocks with their nominal remanence in vacuum.
+
+    At points inside a block the result lacks the block's own remanence, see `unit_field`.
+    """
     total = np.zeros((len(points), 3))
     for block, field in zip(blocks, unit_fields(blocks, points, order), strict=True):
         total += field @ (np.array(block.easy_axis) * block.remanence)
@@ -145,10 +160,11 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats, order: int = _ORDER)
 
 
 def gradient_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
-    """Gradient of `field_of` at points (n, 3) in m off the blocks, (n, 3, 3) in T/m.
+    """Return the gradient of `field_of` at points (n, 3) in m off the blocks, (n, 3, 3) in T/m.
 
-    ``[i, c, k]`` is the derivative of component c along k, to 1e-4 at a hundredth of the radius
-    from a block: for the scale of a noise, or the signature of an effect.
+    ``[i, c, k]`` is the derivative of component c along k. Its relative error is 1e-4 at a distance
+    of a hundredth of the radius from a block, which suffices for the size of a noise or the
+    signature of an effect.
     """
     total = np.zeros((len(points), 3, 3))
     for gradient in block_gradients(blocks, points):
@@ -157,10 +173,10 @@ def gradient_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
 
 
 def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
-    """Yield the share of every block in `gradient_of`.
+    """Yield the contribution of every block to `gradient_of`, (n, 3, 3) in T/m.
 
-    By central differences, radially and azimuthally, for which points on circles share integrals;
-    along z by curl B = 0 and div B = 0.
+    The radial and azimuthal derivatives are central differences, for which points on circles share
+    integrals. The derivatives along z follow from curl B = 0 and div B = 0.
     """
     angle = np.arctan2(points[:, 1], points[:, 0])
     zero = np.zeros(len(points))
@@ -180,50 +196,52 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
 
 
 def demagnetizing_tensors(blocks: Sequence[MagnetBlock]) -> list[Floats]:
-    """Magnetometric demagnetizing tensor (3, 3) of every block: H = -N M on average over it, if
-    it is magnetized uniformly.
+    """Return the magnetometric demagnetizing tensor N (3, 3) of every block.
 
-    By Gauss quadrature of the exact field, to 6e-4: the field is logarithmic along the edges.
-    (A cuboid of the block's mean sides, as is usual, would be off by 1e-2 for sectors.) Congruent
-    blocks share it.
+    If a block is magnetized uniformly, its own field averaged over its volume is H = -N M. The
+    average is computed by Gauss quadrature of the exact field, with an error of 6e-4, because the
+    field has logarithmic singularities along the edges. (The usual approximation by a cuboid with
+    the block's mean sides would have an error of 1e-2 for sectors.) Congruent blocks share the
+    computation.
     """
-    found: dict[tuple[object, ...], Floats] = {}
+    by_shape: dict[tuple[object, ...], Floats] = {}
     tensors = []
     for block in blocks:
         frame = frame_of(block)
-        if frame.shape not in found:
+        if frame.shape not in by_shape:
             local = _in_frame(block, frame)
             points, weights = _inside(local)
             average = np.einsum("p,pij->ij", weights, unit_field(local, points)) / local.volume
-            found[frame.shape] = -average
+            by_shape[frame.shape] = -average
         turn = rotation_about_z(frame.angle)
-        tensors.append(turn @ found[frame.shape] @ turn.T)
+        tensors.append(turn @ by_shape[frame.shape] @ turn.T)
     return tensors
 
 
 def _inside(block: MagnetBlock, order: int = 6) -> tuple[Floats, Floats]:
-    """Gauss points (n, 3) in m in a block and their weights (n,) in m^3.
+    """Return Gauss points (n, 3) in m inside a block and their weights (n,) in m^3.
 
-    The outline's second and fourth edge, from inner to outer corners and back in all shapes, are
-    joined by straight lines.
+    The cross-section is parametrized by straight lines between the outline's second and fourth
+    edge, which are opposite to each other in all shapes.
     """
     nodes, weights = np.polynomial.legendre.leggauss(order)
     t, weights = (nodes + 1) / 2, weights / 2
+    # the fourth edge runs the opposite way, so that its normal changes sign too
     (far, far_normal), (near, near_normal) = block.outline[1].at(t), block.outline[3].at(1 - t)
     s = t[:, None, None]
     place = (1 - s) * near + s * far  # (s, t, 2)
     normal = (1 - s) * -near_normal + s * far_normal  # tangent turned by -90 degrees
     area = np.einsum("ti,sti->st", far - near, normal) * weights[:, None] * weights
     height = block.z_max - block.z_min
-    points = np.concatenate([np.dstack([place, np.full_like(area, block.z_min + height * one)])
-                             for one in t])
+    points = np.concatenate([np.dstack([place, np.full_like(area, block.z_min + height * level)])
+                             for level in t])
     return points.reshape(-1, 3), np.outer(height * weights, area).ravel()
 
 
 def panel_quadrature(outline: Outline, distance: float, order: int) -> tuple[Floats, Floats]:
-    """Nodes (q, 2) on an outline and outward normals times weight (q, 2), both in m.
+    """Return quadrature nodes (q, 2) on an outline and outward normals times weights, both in m.
 
-    Panels are at most ``distance`` long.
+    Panels are at most ``distance`` in m long, unless an edge would need more than 200 of them.
     """
     nodes, weights = np.polynomial.legendre.leggauss(order)
     sources, normals = [], []
@@ -238,10 +256,10 @@ def panel_quadrature(outline: Outline, distance: float, order: int) -> tuple[Flo
 
 
 def _nearest(outline: Outline, points: Floats) -> float:
-    """Smallest in-plane distance in m between points and outline, by sampling the outline.
+    """Return the smallest in-plane distance in m between points and a sampled outline.
 
-    Points that pass over or under a block may come arbitrarily near in the plane without being
-    near in space; the panel count is capped where this is used.
+    Points above or below a block may be arbitrarily near to the outline in the plane without being
+    near in space; `panel_quadrature` limits the number of panels for them.
     """
     t = np.linspace(0, 1, 33)
     samples = np.vstack([edge.at(t)[0] for edge in outline])
@@ -254,6 +272,10 @@ def _nearest(outline: Outline, points: Floats) -> float:
 def _prism_field(
     points: Floats, sources: Floats, normals: Floats, z_min: float, z_max: float
 ) -> Floats:
+    """Return the unit field (n, 3, 3) of a prism by the integrals at the top of this module.
+
+    ``sources`` and ``normals`` (q, 2) in m come from `panel_quadrature`.
+    """
     rho = points[:, None, :2] - sources  # from source to point
     rho2 = np.einsum("ijk,ijk->ij", rho, rho)
     result = np.zeros((len(points), 3, 3))
@@ -277,21 +299,23 @@ def _prism_field(
 
 
 def _sign(u: Floats) -> Floats:
+    """Return the sign of u, with 1 for u = 0."""
     return np.where(u < 0, -1.0, 1.0)
 
 
 def _one_minus_over_rho2(u: Floats, r: Floats) -> Floats:
-    """(1 - |u|/R) / rho^2 without cancellation: 1 / (R (R + |u|))."""
+    """Return (1 - |u|/R) / rho^2 without cancellation, as 1 / (R (R + |u|))."""
     return 1 / (r * (r + np.abs(u)))
 
 
 def _difference_over_rho2(
     upper: Floats, r_upper: Floats, lower: Floats, r_lower: Floats, rho2: Floats
 ) -> Floats:
-    """(u_lower/R_lower - u_upper/R_upper) / rho^2, regular at rho = 0 beyond either end.
+    """Return (u_lower/R_lower - u_upper/R_upper) / rho^2, regular at rho = 0 beyond an end.
 
-    With u/R = sign(u) (1 - rho^2/(R (R + |u|))) the ones cancel when both ends are on one side;
-    between the ends they add up to 2/rho^2, which is the field near a charged edge.
+    Insert u/R = sign(u) (1 - rho^2/(R (R + |u|))). If both ends of the block are on the same side
+    of the point, the terms sign(u) cancel. Between the ends they add up to 2/rho^2, which is the
+    field near a charged edge.
     """
     regular = (_sign(upper) / (r_upper * (r_upper + np.abs(upper)))
                - _sign(lower) / (r_lower * (r_lower + np.abs(lower))))

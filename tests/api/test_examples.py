@@ -27,7 +27,7 @@ HEAVY = {"numpy", "scipy", "pydantic", "xarray", "matplotlib", "gmsh", "rich", "
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """A folder with the files that the examples name: a study, a map of it, its blocks."""
+    """A folder with the files that the examples name: study, map, block table, spare blocks."""
     folder = tmp_path_factory.mktemp("examples")
     study = changed(DIPOLE, array__recoil_permeability=1.0,
                     noise={"regions": [{"name": "all", "sigma_T": 1e-5}]})
@@ -72,6 +72,55 @@ def test_a_wrong_example_is_seen(campaign):
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_function_has_an_example(name):
     assert ">>>" in (inspect.getdoc(getattr(hf, name)) or "")
+
+
+def sections(docstring):
+    """The titles of the numpydoc sections of a docstring that are not empty."""
+    lines = inspect.cleandoc(docstring or "").splitlines()
+    return {title for title, rule, *content in (lines[i:i + 3] for i in range(len(lines) - 2))
+            if title and rule == "-" * len(title) and content[0].strip()}
+
+
+def documented_parameters(docstring):
+    """The names in the section Parameters of a docstring."""
+    _, _, text = inspect.cleandoc(docstring or "").partition("Parameters\n----------\n")
+    section = text.partition("\n\n")[0].splitlines()
+    return {name.strip() for line in section if line[:1].strip() and " : " in line
+            for name in line.partition(" : ")[0].split(",")} | {
+        line for line in section if line.isidentifier()}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_function_documents_parameters_and_result(name):
+    function = getattr(hf, name)
+    docstring = inspect.getdoc(function)
+    assert {"Parameters", "Returns", "Examples"} <= sections(docstring)
+    assert set(inspect.signature(function).parameters) == documented_parameters(docstring)
+
+
+@pytest.mark.parametrize("name", sorted(set(hf.__all__) - set(FUNCTIONS) - {
+    "Study",  # its docstring is the description of the JSON schema, which lists the keys itself
+    "HalbachWarning"}))
+def test_every_class_documents_its_attributes(name):
+    assert "Attributes" in sections(vars(getattr(hf, name))["__doc__"])
+
+
+def test_missing_sections_and_parameters_are_seen():
+    lacking = """Solve.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    swaps, turns : int
+        Numbers of moves.
+
+    Returns
+    -------
+    """
+    assert sections(lacking) == {"Parameters"}
+    assert sections("Parameters\n---\nmagnet\n") == set()  # the rule is too short
+    assert documented_parameters(lacking) == {"magnet", "swaps", "turns"}
+    assert documented_parameters("Solve.") == set()
 
 
 def test_the_functions_are_all_there():

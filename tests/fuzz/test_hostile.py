@@ -54,7 +54,7 @@ FOUND = {
     "a mesh that ends the program": ("mesh", b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n"
                                      b"1 0 0 0\n$EndNodes\n$x\n$Elements\n0\n$EndElements", "Mesh"),
     "elements of two types": ("mesh", None, "in place of one"),
-    "nodes without a place": ("mesh", None, "without a place"),
+    "nodes without a place": ("mesh", None, "without finite coordinates"),
     "a block's name that is GetDP's": ("regions", None, "one written beside a mesh"),
     "an unknown of node 1e18": ("GetDP: unknowns", None, "impossibly large"),
     "an unknown that is not there": ("GetDP: unknowns", None, "within 1 to 72"),
