@@ -18,7 +18,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.field import finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.magnetostatics import RunRequest, fill_run_folder

@@ -21,7 +21,7 @@ from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.mesh_convergence import verify
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.azimuthal_modes import solve_modes
-from halbach_fe.solver.field import finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior

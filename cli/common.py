@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from halbach_fe.solver.session import Session
 
 BLAS_BUFFER_BYTES = 128 * 2**20
-"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread and
-library, on two threads."""
+"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
+and library, on two threads."""
 
 MAX_ORDER = 100
 """Highest order of a multipole. Higher orders are negligible in the bore."""

@@ -14,9 +14,9 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import GetDP, blas_of, find_getdp
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 

@@ -12,7 +12,7 @@ from halbach_fe.study.model import Study
 MODULES = (
     "study.reader", "study.model", "study.magnet", "study.measurement", "study.solver",
     "study.inference", "geometry.magnet", "stats.gaussian", "stats.noise", "stats.linear_gaussian",
-    "stats.pcn", "solver.vacuum_field", "solver.closed_form",
+    "stats.pcn", "solver.exact_block_field", "solver.ring_harmonics_2d",
     "measurement.field_map", "measurement.block_table", "measurement.observation",
     "response.matrix", "inference.infer", "inference.result",
     "diagnosis.diagnose", "diagnosis.result", "diagnosis.evidence", "diagnosis.model_selection",

@@ -28,7 +28,7 @@ ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
 # Statistics see arrays only; the closed form is an oracle; and a synthetic campaign tests the model
 # of the field, so it must not come from it.
 MAY_IMPORT = {
-    "stats": ("core",), "solver.closed_form": ("core",),
+    "stats": ("core",), "solver.ring_harmonics_2d": ("core",),
     "synthetic": ("core", "study", "measurement.field_map", "measurement.block_table",
                   "measurement.positions", "measurement.reading_noise")}
 
@@ -159,10 +159,10 @@ def test_imports_point_one_way(me):
 @pytest.mark.parametrize(("me", "name"), [
     ("solver.runs", "subprocess"), ("inference.infer", "gmsh"),
     ("solver.mesh", "halbach_fe.report"), ("study.model", "halbach_fe.geometry.blocks"),
-    ("solver.closed_form", "halbach_fe.study.model"),
+    ("solver.ring_harmonics_2d", "halbach_fe.study.model"),
     ("stats.linear_gaussian", "halbach_fe.solver.getdp"),
     ("inference.infer", "matplotlib.figure"), ("measurement.formats.opera", "halbach_fe.design"),
-    ("synthetic.magpylib_field", "halbach_fe.solver.vacuum_field"),
+    ("synthetic.magpylib_field", "halbach_fe.solver.exact_block_field"),
     ("synthetic.bodies", "halbach_fe.geometry.blocks"), ("synthetic.bodies", "magpylib")])
 def test_the_rules_can_be_broken(me, name):
     assert me in MODULES

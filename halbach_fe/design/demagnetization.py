@@ -22,11 +22,11 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import places_in
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.magnet import BlockException, Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study

@@ -18,7 +18,7 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.field import check_points
+from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.d_optimal import greedy, information
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior

@@ -38,10 +38,10 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP
 from halbach_fe.measurement.instrument import map_time, probe_points
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import unit_fields
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study

@@ -26,7 +26,7 @@ from halbach_fe.diagnosis.smooth_discrepancy import (
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
 

@@ -28,7 +28,7 @@ from halbach_fe.inference.result import (
     TRAINING,
     InferenceResult,
 )
-from halbach_fe.study.edit import edited_text
+from halbach_fe.study.edit_file import edited_text
 from halbach_fe.study.model import Study
 
 STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"

@@ -14,7 +14,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.solver.vacuum_field import gradient_of
+from halbach_fe.solver.exact_block_field import gradient_of
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
 

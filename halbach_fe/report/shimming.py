@@ -24,7 +24,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.response.multipoles import plain, text_table
-from halbach_fe.study.edit import edited_text
+from halbach_fe.study.edit_file import edited_text
 
 
 def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:

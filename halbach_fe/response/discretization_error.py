@@ -13,7 +13,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.solver.field import MESHES, ElementFields, choose_route, finite_element_part
+from halbach_fe.solver.formulation_choice import (
+    MESHES,
+    ElementFields,
+    choose_route,
+    finite_element_part,
+)
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
 
@@ -42,7 +47,7 @@ def refined(magnet: Magnet, factor: float) -> Magnet:
 def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
     """Return the magnet with the boundary farther away by a factor.
 
-    ``mesh`` is the kind of mesh, a value of `halbach_fe.solver.field.MESHES`.
+    ``mesh`` is the kind of mesh, a value of `halbach_fe.solver.formulation_choice.MESHES`.
     """
     end = magnet.half_length
     update = {"radius_m": factor * boundary_radius(magnet, mesh)}

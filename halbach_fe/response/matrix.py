@@ -31,8 +31,9 @@ from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.field import (
+from halbach_fe.solver.formulation_choice import (
     SUPERPOSITION_TOLERANCE,
     ElementFields,
     check_points,
@@ -40,7 +41,6 @@ from halbach_fe.solver.field import (
     vacuum_part,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import unit_fields
 from halbach_fe.stats.linear_gaussian import row_slices
 from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0

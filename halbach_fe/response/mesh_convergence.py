@@ -18,10 +18,10 @@ from halbach_fe.measurement.observation import fourier_analysis
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
-from halbach_fe.solver.field import MESHES, choose_route, solve_nominal
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.formulation_choice import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.measurement import FourierCoefficients
 
 HARMONICS = 8
@@ -64,7 +64,8 @@ class Verification(ShownInNotebook):
     ----------
     magnet : Magnet
     route : str
-        Formulation by which the field is solved, see `halbach_fe.solver.field.choose_route`.
+        Formulation by which the field is solved, see
+        `halbach_fe.solver.formulation_choice.choose_route`.
     differences : tuple of Difference
         Between the coarser and the study's mesh, the study's and the finer mesh, and the nearer and
         the farther boundary; then to the dual formulation if the route has one, and to the exact

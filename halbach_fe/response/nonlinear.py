@@ -21,12 +21,17 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.condensed_newton import Condensed, condense
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.field import check_points, choose_route, finite_element_part, formulation_of
+from halbach_fe.solver.formulation_choice import (
+    check_points,
+    choose_route,
+    finite_element_part,
+    formulation_of,
+)
 from halbach_fe.solver.interpolation import locate, quadrature
 from halbach_fe.solver.magnetostatics import assemble, solve_samples
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import unit_fields
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.study.materials import MU_0
 

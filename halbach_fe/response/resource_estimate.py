@@ -35,7 +35,7 @@ from halbach_fe.response.discretization_error import error_bar_session, reading_
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.response.mesh_convergence import variants_to_compare
 from halbach_fe.solver.azimuthal_modes import mode_decay
-from halbach_fe.solver.field import (
+from halbach_fe.solver.formulation_choice import (
     MESHES,
     check_points,
     choose_route,
@@ -165,7 +165,7 @@ class Problem:
     what : str
         Purpose of the mesh; all runs on the same mesh may go side by side.
     route : str
-        Formulation, see `halbach_fe.solver.field.choose_route`.
+        Formulation, see `halbach_fe.solver.formulation_choice.choose_route`.
     elements, unknowns : int
         Numbers of elements and unknowns of each run.
     processes : int
@@ -407,7 +407,7 @@ def _places(magnet: Magnet, points: Floats) -> float:
     """Return the number of distinct positions of points (n, 3) in m relative to the blocks.
 
     Several blocks see points on circles from the same relative position and share the integrals of
-    their fields (`halbach_fe.solver.vacuum_field.unit_fields`). Positions are counted for the
+    their fields (`halbach_fe.solver.exact_block_field.unit_fields`). Positions are counted for the
     blocks of a single ring and a sample of the points, and scaled up.
     """
     slots = np.arange(1, magnet.array.blocks_per_ring + 1)

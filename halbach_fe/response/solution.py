@@ -18,7 +18,7 @@ from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
-from halbach_fe.solver.field import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 
 

@@ -54,7 +54,7 @@ class Formulation:
     law : str
         Law of the iron's curve that enters the weak form: ``reluctivity`` or ``permeability``.
     route : str
-        Name of the route, see `halbach_fe.solver.field.choose_route`.
+        Name of the route, see `halbach_fe.solver.formulation_choice.choose_route`.
     """
 
     problem: str

@@ -12,7 +12,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.solver.field import choose_route, formulation_of
+from halbach_fe.solver.formulation_choice import choose_route, formulation_of
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0

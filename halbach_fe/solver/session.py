@@ -26,7 +26,7 @@ class RunSize:
     Attributes
     ----------
     route : str
-        Route of the solve, see `halbach_fe.solver.field.choose_route`.
+        Route of the solve, see `halbach_fe.solver.formulation_choice.choose_route`.
     elements, unknowns : int
     solves : int
         Number of linear solves, without those of Newton's steps, whose number is not known in

@@ -16,7 +16,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.demagnetization import demagnetization_summary, write_demagnetization
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.bodies import magnet_of

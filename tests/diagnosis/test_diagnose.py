@@ -14,7 +14,7 @@ from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
 from halbach_fe.diagnosis.search import _possible
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
 

@@ -30,8 +30,8 @@ from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import field_of
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle

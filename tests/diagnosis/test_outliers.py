@@ -17,7 +17,7 @@ from halbach_fe.diagnosis.position_noise import (
     with_position_noise,
 )
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.vacuum_field import gradient_of, unit_fields
+from halbach_fe.solver.exact_block_field import gradient_of, unit_fields
 from halbach_fe.stats.noise import independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle

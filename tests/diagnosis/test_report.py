@@ -23,7 +23,7 @@ from halbach_fe.diagnosis.summary import (
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table, verdict, write_diagnosis_report
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
 from tests.conftest import circle
 
 EFFECTS = {effect.name: effect for effect in catalogue()}

@@ -12,7 +12,7 @@ from halbach_fe.diagnosis.summary import diagnosis_summary, other_findings
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import verdict
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle
 

@@ -15,8 +15,8 @@ from halbach_fe.geometry.symmetry import (
 )
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.field import choose_route, finite_element_part
-from halbach_fe.solver.vacuum_field import unit_field, unit_fields
+from halbach_fe.solver.exact_block_field import unit_field, unit_fields
+from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from tests.conftest import circle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

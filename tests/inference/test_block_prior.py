@@ -23,8 +23,12 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.prior import write_prior
-from halbach_fe.solver.closed_form import SectorMagnetization, ideal_sectors, layered_bore_field
-from halbach_fe.solver.vacuum_field import demagnetizing_tensors
+from halbach_fe.solver.exact_block_field import demagnetizing_tensors
+from halbach_fe.solver.ring_harmonics_2d import (
+    SectorMagnetization,
+    ideal_sectors,
+    layered_bore_field,
+)
 from halbach_fe.stats.small_samples import (
     anderson_darling,
     holm,

@@ -20,8 +20,12 @@ from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.prediction import main_line
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.nonlinear import newton_readings
-from halbach_fe.solver.closed_form import SectorMagnetization, ideal_sectors, layered_bore_field
-from halbach_fe.solver.vacuum_field import gradient_of
+from halbach_fe.solver.exact_block_field import gradient_of
+from halbach_fe.solver.ring_harmonics_2d import (
+    SectorMagnetization,
+    ideal_sectors,
+    layered_bore_field,
+)
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study

@@ -11,7 +11,7 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import concatenate, held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
 from tests.conftest import changed, circle
 
 FOURIER = {"quantity": "fourier_coefficients", "harmonics": 5,

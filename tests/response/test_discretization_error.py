@@ -12,8 +12,8 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
-from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from tests.conftest import circle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

@@ -13,8 +13,8 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.verification import verification_verdict, write_verification
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
-from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from tests.support.pages import page
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

@@ -30,11 +30,11 @@ from halbach_fe.response.nonlinear import (
     nonlinear_model,
 )
 from halbach_fe.solver import condensed_newton as engine
-from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.magnetostatics import nominal_samples, solve_samples, solve_tangent
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import ConstitutiveLaw
 from halbach_fe.study.model import Study

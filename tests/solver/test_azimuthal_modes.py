@@ -12,10 +12,10 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes
-from halbach_fe.solver.closed_form import ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import choose_route, finite_element_part, solve_nominal
+from halbach_fe.solver.exact_block_field import field_of, unit_field
+from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, solve_nominal
 from halbach_fe.solver.mesh import build_meridian, verify_mesh
-from halbach_fe.solver.vacuum_field import field_of, unit_field
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from tests.conftest import circle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

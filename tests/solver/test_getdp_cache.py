@@ -21,7 +21,7 @@ from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.temporary_files import remove_orphans, temporary_name
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp_cache as module
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import run
 from halbach_fe.solver.getdp_cache import (
     FOLDER_VARIABLE,
@@ -269,7 +269,7 @@ from dataclasses import replace
 from pathlib import Path
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.magnetostatics import Session
 from tests.conftest import DIPOLE, changed, circle
 from halbach_fe.study.reader import parse_study

@@ -9,11 +9,11 @@ from halbach_fe.core.errors import GetDPError, MeshError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix, verify_superposition
-from halbach_fe.solver.closed_form import bore_field, ideal_sectors, layered_bore_field
-from halbach_fe.solver.field import solve_nominal
+from halbach_fe.solver.exact_block_field import field_of, unit_field
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.formulations import edge_elements
 from halbach_fe.solver.magnetostatics import solve_sources
-from halbach_fe.solver.vacuum_field import field_of, unit_field
+from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from tests.conftest import circle
 
 SECTORS = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)

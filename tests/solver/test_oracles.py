@@ -8,7 +8,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.solver.field import choose_route, finite_element_part
+from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.oracles import dipole_of

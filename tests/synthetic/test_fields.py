@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import ExtraMissingError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.field import finite_element_part, solve_nominal
-from halbach_fe.solver.vacuum_field import field_of
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.formulation_choice import finite_element_part, solve_nominal
 from halbach_fe.synthetic import magpylib_field, optional_packages
 from halbach_fe.synthetic.bodies import BodyPart, magnet_of, vector
 from halbach_fe.synthetic.magpylib_field import vacuum_field

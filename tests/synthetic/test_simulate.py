@@ -19,7 +19,7 @@ from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.solver.vacuum_field import demagnetizing_tensors, gradient_of
+from halbach_fe.solver.exact_block_field import demagnetizing_tensors, gradient_of
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of

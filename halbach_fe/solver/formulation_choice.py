@@ -24,6 +24,7 @@ from halbach_fe.geometry.domain import (
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, solve_modes
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulations import (
     CROSS_SECTION,
@@ -38,7 +39,6 @@ from halbach_fe.solver.magnetostatics import (
     solve_tangent,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.solver.vacuum_field import field_of
 
 SUPERPOSITION_TOLERANCE = 1e-8
 """Relative tolerance of the check that single blocks add up to the nominal array, if a direct

@@ -8,8 +8,8 @@ import pytest
 
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.closed_form import bore_field, ideal_sectors, layered_bore_field
-from halbach_fe.solver.vacuum_field import field_of, gradient_of, unit_field
+from halbach_fe.solver.exact_block_field import field_of, gradient_of, unit_field
+from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from tests.conftest import circle
 
 MAGPYLIB_ERROR = 1e-6
