@@ -8,11 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from halbach_fe.core.errors import (
-    MeasurementError,
-    OutputError,
-    must_be,
-)
+from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.temporary_files import remove_orphans, temporary_name
 
 

@@ -28,11 +28,7 @@ from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.model_selection import (
-    Candidate,
-    SelectedEffect,
-    probabilities,
-)
+from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     estimate_position_noise,

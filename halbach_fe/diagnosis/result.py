@@ -11,14 +11,9 @@ from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
-from halbach_fe.diagnosis.model_selection import (
-    Candidate,
-    SelectedEffect,
-)
+from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
-from halbach_fe.diagnosis.position_noise import (
-    PositionNoise,
-)
+from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study

@@ -19,10 +19,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
-from halbach_fe.diagnosis.smooth_discrepancy import (
-    fields_of_rms,
-    harmonic_fields,
-)
+from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.instrument import probe_points

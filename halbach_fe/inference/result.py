@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.observation import (
-    Observation,
-)
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import row_slices, whitened

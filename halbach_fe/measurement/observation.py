@@ -19,11 +19,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import sensor_model
-from halbach_fe.study.measurement import (
-    CirclePositions,
-    FluxDensity,
-    FourierCoefficients,
-)
+from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCoefficients
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 

@@ -17,10 +17,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.domain import (
-    boundary_half_length,
-    boundary_radius,
-)
+from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, solve_modes

@@ -23,11 +23,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.solver.dofs import Unknowns
-from halbach_fe.solver.interpolation import (
-    Located,
-    curl_operators,
-    nodal_operators,
-)
+from halbach_fe.solver.interpolation import Located, curl_operators, nodal_operators
 from halbach_fe.solver.mesh import Entities, VerifiedMesh
 
 

@@ -13,10 +13,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    Field,
-    model_validator,
-)
+from pydantic import Field, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials

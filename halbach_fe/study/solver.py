@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import (
-    Field,
-)
+from pydantic import Field
 
 from halbach_fe.study.types import MAX_LENGTH_M, MIN_LENGTH_M, Length, StudyModel
 
