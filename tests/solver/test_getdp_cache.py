@@ -265,18 +265,18 @@ def test_a_cache_that_cannot_be_written_costs_nothing_but_a_warning(coarse, shar
 
 SHARED = """
 import sys
-from dataclasses import replace
 from pathlib import Path
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.formulation_choice import solve_nominal
-from halbach_fe.solver.magnetostatics import Session
+from halbach_fe.solver.session import Session
 from tests.conftest import DIPOLE, changed, circle
 from halbach_fe.study.reader import parse_study
 folder, cache = map(Path, sys.argv[1:])
 for remanence in (1.0, 1.1, 1.2):
     study = parse_study(changed(DIPOLE, array__remanence_T=remanence, mesh__block_size_m=0.04))
-    field = solve_nominal(study, circle(0.07, 5), Session(
+    field = solve_nominal(build_magnet(study), circle(0.07, 5), Session(
         find_getdp(), folder, jobs=2, cache=Cache(cache, 150_000)))
     print(field.tobytes().hex())
 """
