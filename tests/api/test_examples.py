@@ -21,7 +21,6 @@ MODULES = sorted(
     if not module.name.endswith("__main__"))
 FUNCTIONS = [name for name in hf.__all__ if inspect.isfunction(inspect.unwrap(getattr(hf, name)))
              or inspect.isfunction(getattr(getattr(hf, name), "dispatch", None))]
-LIMIT_S = 0.7
 HEAVY = {"numpy", "scipy", "pydantic", "xarray", "matplotlib", "gmsh", "rich", "arviz", "plotly"}
 
 

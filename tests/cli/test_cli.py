@@ -19,6 +19,7 @@ import pytest
 from halbach_fe.cli import main, parser
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import EXIT_CODES
+from halbach_fe.design.demagnetization import ACROSS
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.solver.getdp import blas_of
@@ -494,6 +495,13 @@ def test_every_exit_code_is_documented():
     for code, meaning in EXIT_CODES.items():
         assert f"{code:3d}  {meaning}" in text
         assert f"| {code} | {meaning} |" in page
+
+
+def test_the_help_states_the_default_that_it_does_not_import():
+    """The help must come without the solver, so it repeats the number."""
+    verb = next(action for action in parser(["demagnetization"])._actions if action.dest == "verb")
+    shown = " ".join(verb.choices["demagnetization"].format_help().split())
+    assert f"(default: {ACROSS})" in shown
 
 
 def test_a_bug_is_called_a_bug(study, tmp_path, monkeypatch, capsys):
