@@ -246,7 +246,7 @@ def _cut_block(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, F
     def lattice(depth: Floats, width: Floats, height: Floats) -> Floats:
         flat = places_in(block.outline, depth, width).reshape(-1, 2)
         places = np.column_stack([np.tile(flat, (len(height), 1)), np.repeat(height, len(flat))])
-        return places if block.in_place else block.from_place(places)
+        return places if block.in_magnet_frame else block.from_frame(places)
 
     vertices = lattice(np.linspace(0, 1, across + 1), np.linspace(0, 1, wide + 1), z)
     middles = lattice((np.arange(across) + 0.5) / across, (np.arange(wide) + 0.5) / wide,

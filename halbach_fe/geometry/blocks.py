@@ -1,8 +1,9 @@
-"""The blocks of an array: their place, shape and nominal magnetization.
+"""The blocks of a magnet: their place, shape and nominal magnetization.
 
-Every block is a prism along z between two values of z. Its outline in the (x, y) plane consists of
-straight edges and of arcs about the z axis. The mesh, the exact field and the checks of a user's
-points are all derived from these blocks.
+Every block is a prism along the z axis of its frame, between two values of z. Its outline in the
+frame's (x, y) plane consists of straight edges and of arcs about the frame's z axis. Blocks of
+rings are described in the magnet's own frame, and free blocks each in a frame of their own. The
+mesh, the exact field and the checks of a user's points are all derived from these blocks.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ class MagnetBlock:
     ring, slot : int
         Counted from 1.
     outline : Outline
-        Outline of its nominal place in the (x, y) plane, in m.
+        Outline of its nominal place in the (x, y) plane of its frame, in m.
     z_min, z_max : float, in m
-        Limits of its nominal place; infinite in 2D.
+        Limits of its nominal place along the z axis of its frame; infinite in 2D.
     easy_axis : tuple of 3 floats
-        Unit vector, rotated with the block.
+        Unit vector along x, y and z of the magnet, rotated with the block.
     remanence : float, in T
         Negative for a block that is mounted upside down.
     recoil_permeability, recoil_permeability_across : float
@@ -49,6 +50,13 @@ class MagnetBlock:
         ``inner_corner_loss`` of `halbach_fe.study.magnet.BlockException`.
     mounted_from : tuple of 2 ints, optional
         Ring and slot that the block was made for, if that is another place.
+    origin_m : tuple of 3 floats
+        Origin of the block's frame in the magnet; zero for blocks of rings.
+    orientation_rad : tuple of 3 floats
+        Rotation vector that turns the magnet's axes into those of the frame; zero for blocks of
+        rings.
+    label : str, optional
+        The name of a free block.
     """
 
     ring: int
@@ -65,6 +73,9 @@ class MagnetBlock:
     gradient: float = 0.0
     corner_loss: float = 0.0
     mounted_from: tuple[int, int] | None = None
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    orientation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    label: str | None = None
 
     @property
     def in_place(self) -> bool:
@@ -72,27 +83,37 @@ class MagnetBlock:
         return not (any(self.displacement_m) or any(self.rotation_rad))
 
     @property
+    def in_magnet_frame(self) -> bool:
+        """Whether outline and limits describe the block in the magnet's own frame, as it lies."""
+        return self.in_place and not (any(self.origin_m) or any(self.orientation_rad))
+
+    @cached_property
     def middle(self) -> Floats:
         """Mean of the corners of the nominal place, (3,) in m; z is 0 for an infinite block."""
         x, y = np.mean([edge.start for edge in self.outline], axis=0)
         z = 0.0 if np.isinf(self.z_max) else (self.z_min + self.z_max) / 2
-        return np.array([x, y, z])
+        turn = rotation_matrix(self.orientation_rad)
+        return np.asarray(turn @ [x, y, z] + np.array(self.origin_m))
 
-    def to_place(self, points: Floats) -> Floats:
-        """Return points (n, 3) in m moved by the motion that takes the block to its nominal place.
+    @cached_property
+    def axes(self) -> Floats:
+        """Axes of the block's frame as columns (3, 3), turned with a rotated block."""
+        nominal = rotation_matrix(self.orientation_rad)
+        return np.asarray(rotation_matrix(self.rotation_rad) @ nominal)
 
-        The moved points lie, relative to the nominal place, as the given points lie relative to the
-        displaced block.
-        """
-        back = (points - self.middle - self.displacement_m) @ rotation_matrix(self.rotation_rad)
-        return np.asarray(back + self.middle)
-
-    def from_place(self, points: Floats) -> Floats:
-        """Return points (n, 3) in m moved with the block from its nominal place: the inverse of
-        `to_place`.
-        """
-        turned = (points - self.middle) @ rotation_matrix(self.rotation_rad).T
+    @cached_property
+    def position(self) -> Floats:
+        """Origin of the block's frame, (3,) in m, moved with a displaced or rotated block."""
+        turned = rotation_matrix(self.rotation_rad) @ (np.array(self.origin_m) - self.middle)
         return np.asarray(turned + self.middle + self.displacement_m)
+
+    def to_frame(self, points: Floats) -> Floats:
+        """Return points (n, 3) of the magnet in the block's frame, in m."""
+        return np.asarray((points - self.position) @ self.axes)
+
+    def from_frame(self, points: Floats) -> Floats:
+        """Return points (n, 3) of the block's frame in the magnet, in m: inverts `to_frame`."""
+        return np.asarray(points @ self.axes.T + self.position)
 
     @cached_property
     def parts(self) -> tuple[tuple[float, MagnetBlock], ...]:
@@ -130,8 +151,8 @@ class MagnetBlock:
 
     @property
     def name(self) -> str:
-        """Label of the block in regions, parameters and reports: ``r01s05`` is ring 1, slot 5."""
-        return f"r{self.ring:02d}s{self.slot:02d}"
+        """Name of the block in regions, parameters and reports: ``r01s05`` is ring 1, slot 5."""
+        return self.label or f"r{self.ring:02d}s{self.slot:02d}"
 
     @cached_property
     def area(self) -> float:
@@ -159,8 +180,8 @@ class MagnetBlock:
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m lie inside the block or on its end faces."""
-        if not self.in_place:
-            points = self.to_place(points)
+        if not self.in_magnet_frame:
+            points = self.to_frame(points)
         inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)
         inside[inside] = outline_contains(self.outline, points[inside, :2])
         return inside

@@ -32,7 +32,7 @@ from itertools import islice
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import Edge, Outline
 from halbach_fe.geometry.symmetry import Frame, frame_of, rotation_about_z, unique_points
 
@@ -103,10 +103,11 @@ def _fields_of_some(
 ) -> Iterator[Floats]:
     """Yield `unit_field` of blocks that are few enough to be compared at once.
 
-    A displaced block is evaluated in its nominal position, at the points moved the opposite way; a
-    block that consists of several parts is the weighted sum of their fields.
+    Every block is evaluated in its own frame, into which the points are moved; a block that
+    consists of several parts is the weighted sum of their fields.
     """
-    points_by_block = [points if block.in_place else block.to_place(points) for block in blocks]
+    points_by_block = [points if block.in_magnet_frame else block.to_frame(points)
+                       for block in blocks]
     pieces = [(number, factor, part) for number, block in enumerate(blocks)
               for factor, part in block.parts]
     frames = [frame_of(part) for _, _, part in pieces]
@@ -129,9 +130,8 @@ def _fields_of_some(
             frame, factor = frames[piece], pieces[piece][1]
             signs = frame.local(points_by_block[number])[1]
             total += factor * frame.unfold(fields[frame.shape][places[piece]], signs)
-        if not block.in_place:
-            turn = rotation_matrix(block.rotation_rad)
-            total = turn @ total @ turn.T
+        if not block.in_magnet_frame:
+            total = block.axes @ total @ block.axes.T
         yield total
 
 
@@ -213,7 +213,7 @@ def demagnetizing_tensors(blocks: Sequence[MagnetBlock]) -> list[Floats]:
             points, weights = _inside(local)
             average = np.einsum("p,pij->ij", weights, unit_field(local, points)) / local.volume
             by_shape[frame.shape] = -average
-        turn = rotation_about_z(frame.angle)
+        turn = block.axes @ rotation_about_z(frame.angle)
         tensors.append(turn @ by_shape[frame.shape] @ turn.T)
     return tensors
 
