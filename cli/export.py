@@ -1,8 +1,11 @@
-"""Write a map in the file format of another program.
+"""Write a map, or the blocks of a magnet, in the file format of another program.
 
 The formats openpmd (openPMD-beamphysics field mesh, HDF5), bdsim (BDSIM's three-dimensional text
 format) and geant4 (table of Geant4's PurgMagTabulatedField3D) need points on a regular grid; csv
 and vtu accept any points.
+
+With the format blocks, the input is a study, and the file a table of free blocks (CSV or HDF5): all
+blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
 """
 
 from __future__ import annotations
@@ -11,22 +14,35 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.geometry.block_export import blocks_table
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.measurement.formats import WRITERS, export_map
+from halbach_fe.study.free_blocks_file import write_free_blocks
+from halbach_fe.study.reader import read_study
+
+BLOCKS = "blocks"
+"""Name of the format of tables of free blocks."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("map", type=Path, metavar="MAP", help="map in m and T (CSV, HDF5 or VTU)")
-    parser.add_argument("--format", choices=WRITERS, required=True,
+    parser.add_argument("input", type=Path, metavar="MAP",
+                        help="map in m and T (CSV, HDF5 or VTU); for the format blocks, a study")
+    parser.add_argument("--format", choices=(*WRITERS, BLOCKS), required=True,
                         help="format of FILE")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE",
                         help="file to write")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read the map, write it in the other format, and report its size."""
-    data = read_map(arguments.map)
+    """Read the map or study, write it in the other format, and report its size."""
+    if arguments.format == BLOCKS:
+        columns = blocks_table(build_magnet(read_study(arguments.input)))
+        write_free_blocks(columns, arguments.output)
+        common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
+        return 0
+    data = read_map(arguments.input)
     export_map(data, arguments.format, arguments.output)
     common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")
     return 0

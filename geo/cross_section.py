@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import gmsh
 import numpy as np
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.element_size import set_element_sizes
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_radius
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.geometry.regions import BlockRegion, Regions
@@ -61,7 +64,7 @@ def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
 def draw(
     magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float
 ) -> dict[int, list[int]]:
-    """Draw the cross-section of the first ring in a disk, and set the element sizes.
+    """Draw the cross-section in a disk, of the first ring in 3D, and set the element sizes.
 
     Parameters
     ----------
@@ -75,19 +78,17 @@ def draw(
     """
     occ = gmsh.model.occ
     disk = [(2, occ.addDisk(0, 0, 0, radius, radius))]
-    drawn = [(tags.FIRST_BLOCK_TAG + i, (2, _surface(block.outline)))
-             for i, block in enumerate(blocks) if block.ring == 1]
-    if magnet.iron_ring is not None:
-        loops = [occ.addCurveLoop([occ.addCircle(0, 0, 0, radius)])
-                 for radius in (magnet.iron_ring.outer_radius_m, magnet.iron_ring.inner_radius_m)]
-        drawn.append((tags.IRON_TAG, (2, occ.addPlaneSurface(loops))))
+    drawn = [(tags.FIRST_BLOCK_TAG + i, (2, _block_surface(block)))
+             for i, block in enumerate(blocks) if magnet.dimension == 2 or block.ring == 1]
+    drawn += [(tags.IRON_TAG, (2, _iron_surface(body))) for body in magnet.iron]
     _, children = occ.fragment(disk, [entity for _, entity in drawn])
     occ.synchronize()
     gmsh.model.removeEntities(
         [point for point in gmsh.model.getEntities(0)
          if not len(gmsh.model.getAdjacencies(*point)[0])])
-    surfaces = {tag: [entity for _, entity in pieces]
-                for (tag, _), pieces in zip(drawn, children[1:], strict=True)}
+    surfaces: dict[int, list[int]] = {}
+    for (tag, _), pieces in zip(drawn, children[1:], strict=True):
+        surfaces.setdefault(tag, []).extend(entity for _, entity in pieces)
     _check_shared(surfaces)
     solid = {entity for pieces in surfaces.values() for entity in pieces}
     surfaces[tags.AIR_TAG] = [entity for _, entity in children[0] if entity not in solid]
@@ -113,7 +114,7 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     are built and counted. The size of a fine mesh is extrapolated from one with larger elements,
     that of a large ring from one or two meshes with a part of its blocks. No file is written.
     """
-    blocks = magnet.blocks[:magnet.array.blocks_per_ring]
+    blocks = magnet.blocks if magnet.dimension == 2 else magnet.blocks[:magnet.blocks_by_ring[0]]
     radius = boundary_radius(magnet, kind)
     wanted = _equilateral(magnet, radius)
     coarser = max(1.0, (wanted / COUNTED) ** 0.5)
@@ -145,7 +146,7 @@ def _equilateral(magnet: Magnet, radius: float) -> float:
 
     The size depends on the radius as `set_element_sizes` has it.
     """
-    mesh, bore = magnet.study.mesh, magnet.array.inner_radius_m
+    mesh, bore = magnet.study.mesh, magnet.bore_radius
     r = np.concatenate([[0.0], np.geomspace(bore, radius, 2000)])
     middle = (r[1:] + r[:-1]) / 2
     size = mesh.block_size_m + (mesh.growth - 1) * np.maximum(middle - magnet.radius, 0)
@@ -168,7 +169,7 @@ def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
     """Return the content of the region file; block tags count up from FIRST_BLOCK_TAG."""
     return Regions(
         study=magnet.name, dimension=magnet.dimension, air=tags.AIR_TAG,
-        iron=None if magnet.iron_ring is None else tags.IRON_TAG,
+        iron=tags.IRON_TAG if magnet.iron else None,
         outer_boundary=tags.OUTER_BOUNDARY_TAG,
         blocks=tuple(
             BlockRegion(name=block.name, ring=block.ring, slot=block.slot,
@@ -177,15 +178,41 @@ def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
     )
 
 
-def _surface(outline: Outline) -> int:
-    """Add the surface inside an outline to the Gmsh model; return its tag."""
+def _block_surface(block: MagnetBlock) -> int:
+    """Add the cross-section of a block to the Gmsh model; return its tag.
+
+    In 2D it lies where the block is mounted, in 3D in its nominal place.
+    """
+    if np.isinf(block.z_max) and not block.in_magnet_frame:
+        return _surface(block.outline, block.from_frame)
+    return _surface(block.outline)
+
+
+def _iron_surface(body: IronSolid) -> int:
+    """Add the cross-section of a body of iron to the Gmsh model; return its tag."""
+    if body.outline is not None:
+        return _surface(body.outline)
     occ = gmsh.model.occ
-    points = [occ.addPoint(*edge.start, 0) for edge in outline]
+    loops = [occ.addCurveLoop([occ.addCircle(0, 0, 0, radius)])
+             for radius in (body.outer_radius, body.inner_radius) if radius]
+    return int(occ.addPlaneSurface(loops))
+
+
+def _surface(outline: Outline, place: Callable[[Floats], Floats] | None = None) -> int:
+    """Add the surface inside an outline to the Gmsh model; return its tag.
+
+    ``place`` takes points (n, 3) of the outline's frame to their place in the model.
+    """
+    occ = gmsh.model.occ
+    corners = np.array([[*edge.start, 0.0] for edge in outline] + [[0.0, 0.0, 0.0]])
+    if place is not None:
+        corners = place(corners)
+    points = [occ.addPoint(*corner) for corner in corners[:-1].tolist()]
     curves = []
     for i, edge in enumerate(outline):
         ends = points[i], points[(i + 1) % len(points)]
         if edge.arc:
-            centre = occ.addPoint(0, 0, 0)
+            centre = occ.addPoint(*corners[-1].tolist())
             curves.append(occ.addCircleArc(ends[0], centre, ends[1]))
             occ.remove([(0, centre)])
         else:

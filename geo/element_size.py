@@ -28,7 +28,7 @@ def set_element_sizes(magnet: Magnet) -> None:
     outside = field.add("Max")
     field.setNumbers(outside, "FieldsList", [constant, growing])
     finer = bore_size < block_size
-    for name, value in (("Radius", magnet.array.inner_radius_m * (1 - 1e-9)), ("ZAxis", 1.0),
+    for name, value in (("Radius", magnet.bore_radius * (1 - 1e-9)), ("ZAxis", 1.0),
                         ("VIn", bore_size), ("VOut", 1e22 if finer else 0.0)):
         field.setNumber(bore, name, value)
     size = field.add("Min" if finer else "Max")

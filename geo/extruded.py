@@ -74,6 +74,7 @@ def layers(magnet: Magnet) -> Floats:
     iron_end = magnet.iron_half_length
     thickness = magnet.array.ring_length_m / magnet.study.mesh.layers_per_ring
     limits = {limit for ring in magnet.ring_limits for limit in ring} | {-iron_end, iron_end}
+    limits |= {end for body in magnet.iron for end in (body.z_min, body.z_max)}
     # Limits that differ only by rounding would make a sliver: keep one of them.
     stops = sorted(limits)
     stops = [stops[0]] + [b for a, b in pairwise(stops) if b - a > 1e-9]
@@ -91,7 +92,7 @@ def _outside_layers(start: float, thickness: float, magnet: Magnet) -> list[floa
     z, size = [], thickness
     position = start
     while position < boundary:
-        if position - start > magnet.array.inner_radius_m:
+        if position - start > magnet.bore_radius:
             size *= magnet.study.mesh.growth
         position = boundary if boundary - position < 1.5 * size else position + size
         z.append(position)
@@ -216,8 +217,9 @@ def _layer_tags(magnet: Magnet, region: Ints, z: float) -> Ints:
         if low < z < high:
             block = region >= tags.FIRST_BLOCK_TAG
             result[block] = region[block] + ring * magnet.array.blocks_per_ring
-    if abs(z) < magnet.iron_half_length:
-        result[region == tags.IRON_TAG] = tags.IRON_TAG
+    for body in magnet.iron:
+        if body.z_min < z < body.z_max:
+            result[region == tags.IRON_TAG] = tags.IRON_TAG
     return result
 
 

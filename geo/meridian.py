@@ -6,6 +6,8 @@ region, because their permeability does not depend on the azimuth.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -43,11 +45,11 @@ def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
         write_mesh(mesh_path)
     return Regions(
         study=magnet.name, dimension=2, air=tags.AIR_TAG,
-        iron=None if magnet.iron_ring is None else tags.IRON_TAG,
+        iron=tags.IRON_TAG if magnet.iron else None,
         outer_boundary=tags.OUTER_BOUNDARY_TAG, axis=tags.AXIS_TAG,
         blocks=tuple(BlockRegion(name=f"r{ring:02d}", ring=ring, slot=0,
                                  tag=tags.FIRST_BLOCK_TAG + ring - 1)
-                     for ring in range(1, magnet.array.rings + 1)))
+                     for ring in range(1, len(magnet.blocks_by_ring) + 1)))
 
 
 def grid_size(magnet: Magnet, size: float) -> tuple[int, int]:
@@ -57,10 +59,8 @@ def grid_size(magnet: Magnet, size: float) -> tuple[int, int]:
 
 def _radii(magnet: Magnet, size: float) -> Floats:
     """Return the radii of the grid lines in m, ascending from 0."""
-    array, iron = magnet.array, magnet.iron_ring
-    stops = [0.0, array.inner_radius_m, array.outer_radius_m]
-    if iron is not None:
-        stops += [iron.inner_radius_m, iron.outer_radius_m]
+    stops = sorted({0.0} | {
+        radius for low, high, _, _, _ in _rectangles(magnet) for radius in (low, high)})
     r = [*_uniform(stops, size), *_growing(stops[-1], size, boundary_radius(magnet, "meridian"))]
     return _graded(r, stops[1:])
 
@@ -68,17 +68,39 @@ def _radii(magnet: Magnet, size: float) -> Floats:
 def _heights(magnet: Magnet, size: float) -> Floats:
     """Return the z of the grid lines in m, ascending."""
     end = magnet.half_length
-    stops = {limit for ring in magnet.ring_limits for limit in ring} | {-end, end}
-    stops |= {-magnet.iron_half_length, magnet.iron_half_length} if magnet.iron_ring else set()
+    rectangles = _rectangles(magnet)
+    stops = {limit for rectangle in rectangles for limit in rectangle[2:4]} | {-end, end}
     # uniform elements up to two bore radii beyond the ends: the fringe field matters as much
     boundary = boundary_half_length(magnet, "meridian")
-    uniform = min(end + 2 * magnet.array.inner_radius_m, 0.5 * (end + boundary))
+    uniform = min(end + 2 * magnet.bore_radius, 0.5 * (end + boundary))
     outside = _growing(uniform, size, boundary)
     inside = _uniform(sorted(stops | {-uniform, uniform}), size)
     z = [*(-value for value in reversed(outside)), *inside, *outside]
-    iron_end = magnet.iron_half_length if magnet.iron_ring else end
-    ends = {magnet.array_half_length, iron_end}
-    return _graded(z, [side * value for value in ends for side in (-1, 1)])
+    return _graded(z, _free_ends(rectangles))
+
+
+def _free_ends(rectangles: Sequence[Rectangle]) -> list[float]:
+    """Return the z in m at which rectangles end without a neighbour of the same radii."""
+    faces: Counter[tuple[float, float, float]] = Counter(
+        (low, high, round(z, 9)) for low, high, bottom, top, _ in rectangles
+        for z in (bottom, top))
+    return sorted({z for (_, _, z), count in faces.items() if count == 1})
+
+
+Rectangle = tuple[float, float, float, float, int]
+"""Radii and heights in m of a body of the half-plane, and its physical tag."""
+
+
+def _rectangles(magnet: Magnet) -> list[Rectangle]:
+    """Return the rings and the bodies of iron as rectangles of the half-plane."""
+    found = []
+    for ring, (low, high) in enumerate(magnet.ring_limits):
+        array = magnet.array.of_ring(ring + 1)
+        found.append((array.inner_radius_m, array.outer_radius_m, low, high,
+                      tags.FIRST_BLOCK_TAG + ring))
+    found += [(body.inner_radius, body.outer_radius, body.z_min, body.z_max, tags.IRON_TAG)
+              for body in magnet.iron]
+    return found
 
 
 def _graded(positions: list[float], corners: list[float]) -> Floats:
@@ -152,11 +174,6 @@ def _build(magnet: Magnet, r: Floats, z: Floats) -> None:
 def _materials(magnet: Magnet, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return the physical tags (n,) of the materials at points r, z (n,) in m."""
     result = np.full(len(r), tags.AIR_TAG)
-    array, iron = magnet.array, magnet.iron_ring
-    inside = (r > array.inner_radius_m) & (r < array.outer_radius_m)
-    for ring, (low, high) in enumerate(magnet.ring_limits):
-        result[inside & (z > low) & (z < high)] = tags.FIRST_BLOCK_TAG + ring
-    if iron is not None:
-        result[(r > iron.inner_radius_m) & (r < iron.outer_radius_m)
-               & (np.abs(z) < magnet.iron_half_length)] = tags.IRON_TAG
+    for inner, outer, low, high, tag in _rectangles(magnet):
+        result[(r > inner) & (r < outer) & (z > low) & (z < high)] = tag
     return result

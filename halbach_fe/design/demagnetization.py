@@ -27,7 +27,8 @@ from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
 from halbach_fe.solver.session import Session
-from halbach_fe.study.magnet import BlockException, Demagnetization
+from halbach_fe.study.array import BlockException
+from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.array_layout import facing_angle_deg, position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 
 LARGEST_ANGLE = np.radians(2.0)
 """Largest angle in rad between the nominal magnetization of a block that fits a slot and the
@@ -102,7 +101,7 @@ class Mounts:
 def mounts_of(magnet: Magnet) -> Mounts:
     """Return the slots of a magnet with its present blocks."""
     meant, built = as_meant(magnet).blocks, magnet.blocks
-    frames = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
+    frames = np.array([rotation_about_z(np.radians(block.facing_deg))
                        for block in meant])
     kinds = _kinds(meant)
     sources = np.array([source for source, _ in mountings(magnet)])
@@ -186,7 +185,7 @@ def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magne
     for to, source, matrix in moved:
         meant, earlier = before[source]
         total = matrix @ earlier
-        here, there = (rotation_about_z(np.radians(position_angle_deg(array, old[i].slot)))
+        here, there = (rotation_about_z(np.radians(old[i].angle_deg))
                        for i in (to, meant))
         exceptions.append(BlockException(
             ring=old[to].ring, slot=old[to].slot,

@@ -20,7 +20,6 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.geometry.array_layout import facing_angle_deg
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import as_mounted, loose_blocks, types_of
@@ -166,7 +165,7 @@ def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) ->
     """Compute the contribution of every block to the multipoles in every slot."""
     size, blocks = magnet.dimension, magnet.blocks
     vectors, roots = loose_blocks(magnet, table)
-    turns = np.array([rotation_about_z(np.radians(facing_angle_deg(magnet.array, block.slot)))
+    turns = np.array([rotation_about_z(np.radians(block.facing_deg))
                       for block in blocks])[:, :size, :size]
     columns = model.matrix.reshape(len(model.matrix), len(blocks), size)
     carried = np.einsum("ksi,sij->ksj", columns, turns)
@@ -194,7 +193,8 @@ def _magnitudes(vectors: Floats, dimension: int) -> Floats:
 def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
     """Raise a MeasurementError if the table has too few blocks of a type."""
     for label, slots in types_of(magnet).items():
-        needed, measured = len(slots) * magnet.array.rings, table.type.count(label)
+        needed = sum(block.slot in slots for block in magnet.blocks)
+        measured = table.type.count(label)
         if measured < needed:
             raise MeasurementError(must_be(
                 f"blocks of type {label}", table.source, f"enough for the {needed} slots of that "

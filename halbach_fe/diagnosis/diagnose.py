@@ -106,7 +106,7 @@ def diagnose(
     gross_errors, corrected, start = _correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:
         say(f"gross error: {error.convention.text}")
-    if blocks is not None and corrected.array.rings != study.array.rings:
+    if blocks is not None and corrected.array.blocks_by_ring != study.array.blocks_by_ring:
         unplaced = np.zeros_like(blocks.ring)  # the table's rings are not those of this magnet
         blocks = replace(blocks, ring=unplaced, slot=unplaced)
     signatures: Signatures = {}

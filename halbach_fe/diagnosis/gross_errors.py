@@ -299,7 +299,7 @@ class _Search:
         """
         radii = np.hypot(self.points[:, 0], self.points[:, 1])
         circles, smallest = radii.any(), radii[radii > 0].min(initial=np.inf)
-        size = self.study.array.inner_radius_m
+        size = build_magnet(self.study).bore_radius
         for unit in self.lengths if level > 1 else (1.0,):
             source = MapConvention(length_unit=unit)
             families = [[replace(source, offset_m=size * offset) for offset in RADIUS_OFFSETS
@@ -321,7 +321,7 @@ class _Search:
                 return replace(best, offset_m=float(value))
             return replace(best, radius=float(value))
 
-        step = (RADIUS_OFFSETS[1] - RADIUS_OFFSETS[0]) * self.study.array.inner_radius_m
+        step = (RADIUS_OFFSETS[1] - RADIUS_OFFSETS[0]) * build_magnet(self.study).bore_radius
         ratio = RADIUS_FACTORS[1] / RADIUS_FACTORS[0]
         found = minimize_scalar(
             lambda value: min(self.misfit(at(value)).standard, 1e9), method="bounded",
@@ -331,7 +331,7 @@ class _Search:
 
     def shifted(self) -> Iterator[MapConvention]:
         """Yield the best convention with all points displaced by the same vector."""
-        size = self.study.array.inner_radius_m
+        size = build_magnet(self.study).bore_radius
         starts = [np.zeros(3)] + [
             size * part * np.array([np.cos(angle), np.sin(angle), 0.0])
             for part in (0.2, 0.5) for angle in np.pi / 4 * np.arange(8)]
@@ -420,7 +420,7 @@ class _Search:
         blocks = build_magnet(study).blocks
         mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
         points = _probe_points(study.instrument, self.points)
-        panel = PANEL_SIZE * study.array.inner_radius_m
+        panel = PANEL_SIZE * build_magnet(study).bore_radius
         total = external_field(build_magnet(study), points)
         for block, magnetization, unit in zip(blocks, mean, unit_fields(blocks, points, 4, panel),
                                     strict=True):
@@ -475,7 +475,7 @@ class _Nominal:
             return None
         field, across, variance = (np.zeros_like(points) for _ in range(3))
         for block, unit in zip(blocks, unit_fields(
-                blocks, points, 4, PANEL_SIZE * study.array.inner_radius_m), strict=True):
+                blocks, points, 4, PANEL_SIZE * build_magnet(study).bore_radius), strict=True):
             x, y, _ = block.easy_axis
             field += unit @ (np.array(block.easy_axis) * block.remanence)
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)

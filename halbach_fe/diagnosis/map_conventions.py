@@ -12,6 +12,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.instrument import to_magnet_axes
+from halbach_fe.study.halbach_order import check_order
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 
@@ -143,8 +144,10 @@ class MapConvention:
 def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
     """Return magnets that may have been measured by mistake in place of the study's."""
     array = study.array
+    if not array.is_uniform:
+        return ()
     pitch = 360.0 / array.blocks_per_ring
-    found = []
+    found: list[ArrayVariant] = []
     for blocks in range(1 - array.blocks_per_ring // 2, array.blocks_per_ring // 2 + 1):
         if blocks:
             angle = blocks * pitch
@@ -169,11 +172,20 @@ def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
                     "wrong_ring_count", f"a magnet of {_count(rings, 'ring')}",
                     partial(_with_array, rings=rings)))
     for order in range(1, 5):
-        if order != array.multipole_order:
+        if order != array.multipole_order and _is_possible(order, array.blocks_per_ring):
             found.append(ArrayVariant(
                 "wrong_multipole_order", f"a magnet of multipole order {order}",
                 partial(_with_array, multipole_order=order)))
     return tuple(found)
+
+
+def _is_possible(order: int, blocks: int) -> bool:
+    """Tell whether a ring of so many blocks can make a multipole of this order."""
+    try:
+        check_order(order, blocks)
+    except ValueError:
+        return False
+    return True
 
 
 def _rotated_magnet(study: Study, angle_deg: float) -> Study:

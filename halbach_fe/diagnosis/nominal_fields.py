@@ -19,7 +19,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.exact_block_field import block_gradients, unit_fields
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 

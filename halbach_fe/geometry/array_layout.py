@@ -2,86 +2,122 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix, vector
-from halbach_fe.geometry.outline import Outline, check_overlaps, closed_outline, plane_rotation
-from halbach_fe.study.magnet import Array, BlockException
+from halbach_fe.geometry.free_blocks import nominal_free_blocks
+from halbach_fe.geometry.outline import Outline, closed_outline, plane_rotation
+from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.model import Study
 
 
-def blocks_of_array(study: Study) -> tuple[MagnetBlock, ...]:
-    """Build all blocks of a study, ring by ring (lowest z first), slot by slot.
+def blocks_of_array(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
+    """Build all blocks of an array, ring by ring, slot by slot; free blocks follow the rings.
 
-    The single ring of a 2D study extends from z = -inf to +inf.
+    The rings of a cross-section (``dimension`` 2) extend from z = -inf to +inf.
 
     Raises
     ------
     StudyError
-        If neighbouring blocks overlap.
+        If a block cannot be built as described.
     """
-    array = study.array
-    outlines = [outline_of_slot(array, slot) for slot in range(1, array.blocks_per_ring + 1)]
-    check_overlaps(tuple(outlines))
-    return tuple(
-        _block(array, ring, slot, outline, limits)
-        for ring, limits in enumerate(ring_limits(study), start=1)
-        for slot, outline in enumerate(outlines, start=1))
+    nominal = nominal_blocks(array, dimension)
+    if not array.exceptions:
+        return nominal
+    places = {(block.ring, block.slot): block for block in nominal}
+    return tuple(_with_exceptions(block, exceptions_of(array, block.ring, block.slot), places)
+                 for block in nominal)
 
 
-def _block(
+def nominal_blocks(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
+    """Build the blocks of an array without the deviations that its exceptions describe."""
+    blocks: list[MagnetBlock] = []
+    outlines: dict[Array, tuple[Outline, ...]] = {}
+    for ring, limits in enumerate(ring_limits(array, dimension), start=1):
+        own = array.of_ring(ring) if array.ring else array
+        if own not in outlines:
+            outlines[own] = tuple(outline_of_slot(own, slot)
+                                  for slot in range(1, own.blocks_per_ring + 1))
+        blocks += [_nominal_block(own, ring, slot, outline, limits)
+                   for slot, outline in enumerate(outlines[own], start=1)]
+    if array.free_blocks is not None:
+        blocks += nominal_free_blocks(array, dimension)
+    return tuple(blocks)
+
+
+def _nominal_block(
     array: Array, ring: int, slot: int, outline: Outline, limits: tuple[float, float]
 ) -> MagnetBlock:
-    """Return one block, with the array's values and those of its exceptions.
+    """Return one block of a ring with the values of its array.
 
     ``outline`` and ``limits`` (of z, in m) are its nominal place.
     """
-    exceptions = exceptions_of(array, ring, slot)
-    angle, remanence = magnetization_angle_deg(array, slot), array.remanence_T
+    direction = np.radians(magnetization_angle_deg(array, slot))
     permeability = array.recoil_permeability
-    across = array.recoil_permeability_across or permeability
-    meant: tuple[int, int] | None = None
-    gradient = corner_loss = 0.0
+    block = MagnetBlock(
+        ring=ring, slot=slot, outline=outline, z_min=limits[0], z_max=limits[1],
+        easy_axis=(float(np.cos(direction)), float(np.sin(direction)), 0.0),
+        remanence=array.remanence_T or np.nan, recoil_permeability=permeability,
+        recoil_permeability_across=array.recoil_permeability_across or permeability,
+        angle_deg=position_angle_deg(array, slot), facing_deg=facing_angle_deg(array, slot))
+    if array.remanence_T is None:
+        block = replace(block, remanence=_remanence_of_moment(array, block))
+    return block
+
+
+def _with_exceptions(
+    block: MagnetBlock, exceptions: Sequence[BlockException],
+    places: dict[tuple[int, int], MagnetBlock],
+) -> MagnetBlock:
+    """Return a nominal block with the deviations of its exceptions.
+
+    ``places`` are all nominal blocks, by ring and slot.
+    """
+    if not exceptions:
+        return block
+    changed: dict[str, Any] = {}
+    permeability, across = block.recoil_permeability, block.recoil_permeability_across
+    remanence, easy_axis = block.remanence, np.array(block.easy_axis)
     for exception in exceptions:
         if exception.mounted_from is not None:
-            meant = exception.mounted_from
-            angle = (magnetization_angle_deg(array, meant[1]) + position_angle_deg(array, slot)
-                     - position_angle_deg(array, meant[1]))
+            changed["mounted_from"] = exception.mounted_from
+            meant = places[exception.mounted_from]
+            turn = (0.0, 0.0, np.radians(block.angle_deg - meant.angle_deg))
+            easy_axis = rotation_matrix(turn) @ meant.easy_axis
         if exception.magnetization_angle_deg is not None:
-            angle = exception.magnetization_angle_deg
+            direction = np.radians(exception.magnetization_angle_deg)
+            easy_axis = np.array([np.cos(direction), np.sin(direction), 0.0])
         if exception.recoil_permeability is not None:
             permeability = across = exception.recoil_permeability
         across = exception.recoil_permeability_across or across
         remanence = exception.remanence_T or remanence
         if exception.magnetization_gradient is not None:
-            gradient = exception.magnetization_gradient
+            changed["gradient"] = exception.magnetization_gradient
         if exception.inner_corner_loss is not None:
-            corner_loss = exception.inner_corner_loss
-    direction = np.radians(angle)
-    easy_axis = np.array([np.cos(direction), np.sin(direction), 0.0])
-    block = MagnetBlock(
-        ring=ring, slot=slot, outline=outline, z_min=limits[0], z_max=limits[1],
-        easy_axis=vector(easy_axis), remanence=np.nan if remanence is None else remanence,
-        recoil_permeability=permeability, recoil_permeability_across=across, gradient=gradient,
-        corner_loss=corner_loss, mounted_from=meant)
-    if remanence is None:
-        block = replace(block, remanence=_remanence_of_moment(array, block))
+            changed["corner_loss"] = exception.inner_corner_loss
     factor = magnetization_factor(exceptions)
-    if factor != 1.0:
-        block = replace(block, remanence=block.remanence * factor)
-    return _displaced(block, array, exceptions)
+    if factor == 0.0:  # there is no block, so there is no permeability either
+        permeability = across = 1.0
+    block = replace(
+        block, easy_axis=vector(easy_axis), remanence=remanence * factor,
+        recoil_permeability=permeability, recoil_permeability_across=across, **changed)
+    if (block.gradient or block.corner_loss) and len(block.outline) != 4:
+        raise StudyError(
+            f"Input `array.exceptions` of study must give magnetization_gradient and "
+            f"inner_corner_loss for blocks with four edges only; instead block {block.name} has "
+            f"{len(block.outline)}. Leave the keys out there.")
+    return _displaced(block, exceptions)
 
 
-def _displaced(
-    block: MagnetBlock, array: Array, exceptions: Sequence[BlockException]
-) -> MagnetBlock:
+def _displaced(block: MagnetBlock, exceptions: Sequence[BlockException]) -> MagnetBlock:
     """Return the block displaced and rotated by its exceptions; its easy axis rotates with it."""
-    axes = rotation_matrix((0.0, 0.0, np.radians(position_angle_deg(array, block.slot))))
+    axes = rotation_matrix((0.0, 0.0, np.radians(block.angle_deg)))
     displacement, rotation = np.zeros(3), np.zeros(3)
     for exception in exceptions:
         twist = np.array([0.0, 0.0, np.radians(exception.twist_deg)])
@@ -106,7 +142,7 @@ def magnetization_factor(exceptions: Sequence[BlockException]) -> float:
 
 
 def position_angle_deg(array: Array, slot: int) -> float:
-    """Return the angle about the z axis of the middle of slot ``slot`` (from 1)."""
+    """Return the angle about the z axis of the middle of slot ``slot`` (from 1) of equal rings."""
     return array.first_block_angle_deg + (slot - 1) * 360.0 / array.blocks_per_ring
 
 
@@ -123,16 +159,38 @@ def facing_angle_deg(array: Array, slot: int) -> float:
     return position_angle_deg(array, slot)
 
 
-def ring_limits(study: Study) -> list[tuple[float, float]]:
-    """Return the z limits in m of every ring; the array is centred at z = 0, infinite in 2D."""
-    array = study.array
-    if study.dimension == 2:
-        return [(-np.inf, np.inf)]
-    assert array.ring_length_m is not None  # the study model guarantees it
-    pitch = array.ring_length_m + array.ring_gap_m
-    length = array.rings * pitch - array.ring_gap_m
-    starts = -length / 2 + pitch * np.arange(array.rings)
-    return [(float(z), float(z + array.ring_length_m)) for z in starts]
+def ring_limits(array: Array, dimension: int) -> list[tuple[float, float]]:
+    """Return the z limits in m of every ring, without free blocks; they are infinite in 2D.
+
+    Rings are stacked layer by layer, and each stack is centred at z = 0, see
+    `halbach_fe.study.array.Ring`.
+    """
+    if dimension == 2:
+        return [(-np.inf, np.inf)] * array.rings
+    if not array.ring:
+        if not array.rings:
+            return []
+        assert array.ring_length_m is not None  # the study model guarantees it
+        pitch = array.ring_length_m + array.ring_gap_m
+        length = array.rings * pitch - array.ring_gap_m
+        starts = -length / 2 + pitch * np.arange(array.rings)
+        return [(float(z), float(z + array.ring_length_m)) for z in starts]
+    limits: list[tuple[float, float]] = [(0.0, 0.0)] * array.rings
+    stacks: defaultdict[int, list[tuple[int, float, float]]] = defaultdict(list)
+    for number, ring in enumerate(array.ring):
+        length = ring.ring_length_m or array.ring_length_m or np.nan  # one of them is given
+        if ring.z_m is not None:
+            limits[number] = (ring.z_m - length / 2, ring.z_m + length / 2)
+            continue
+        gap = array.ring_gap_m if ring.ring_gap_m is None else ring.ring_gap_m
+        stacks[ring.layer].append((number, length, gap))
+    for stack in stacks.values():
+        total = sum(length + gap for _, length, gap in stack) - stack[-1][2]
+        z = -total / 2
+        for number, length, gap in stack:
+            limits[number] = (z, z + length)
+            z += length + gap
+    return limits
 
 
 def _remanence_of_moment(array: Array, block: MagnetBlock) -> float:

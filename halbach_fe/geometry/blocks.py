@@ -8,6 +8,7 @@ mesh, the exact field and the checks of a user's points are all derived from the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -47,7 +48,7 @@ class MagnetBlock:
         Rotation vector, about the block's middle.
     gradient, corner_loss : float
         Non-uniformity of the magnetization, see ``magnetization_gradient`` and
-        ``inner_corner_loss`` of `halbach_fe.study.magnet.BlockException`.
+        ``inner_corner_loss`` of `halbach_fe.study.array.BlockException`.
     mounted_from : tuple of 2 ints, optional
         Ring and slot that the block was made for, if that is another place.
     origin_m : tuple of 3 floats
@@ -57,6 +58,9 @@ class MagnetBlock:
         rings.
     label : str, optional
         The name of a free block.
+    angle_deg, facing_deg : float
+        Nominal angles to the x axis of the block's position about the z axis, and of its
+        thickness.
     """
 
     ring: int
@@ -76,6 +80,8 @@ class MagnetBlock:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orientation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     label: str | None = None
+    angle_deg: float = 0.0
+    facing_deg: float = 0.0
 
     @property
     def in_place(self) -> bool:
@@ -196,3 +202,21 @@ def vector(values: Floats) -> tuple[float, float, float]:
     """Return an array (3,) as a tuple of Python floats."""
     x, y, z = values.tolist()
     return x, y, z
+
+
+def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
+    """Return the radius in m of the largest cylinder about the z axis that nominal blocks leave
+    free, by points on their outlines; 1e-4 m if a block covers the axis.
+    """
+    t = np.linspace(0.0, 1.0, 17)
+    smallest = np.inf
+    for block in blocks:
+        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
+        if any(block.orientation_rad) or any(block.origin_m):
+            heights = [0.0] if np.isinf(block.z_max) else np.linspace(block.z_min, block.z_max, 9)
+            nominal = rotation_matrix(block.orientation_rad)
+            outline = np.vstack([
+                (np.column_stack([outline, np.full(len(outline), z)]) @ nominal.T
+                 + block.origin_m)[:, :2] for z in heights])
+        smallest = min(smallest, float(np.hypot(*outline.T).min()))
+    return max(smallest, 1e-4)

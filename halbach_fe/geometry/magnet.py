@@ -1,12 +1,12 @@
-"""The magnet that a study describes: its blocks, its iron ring, and its outer dimensions.
+"""The magnet that a study describes: its blocks, its iron, and its outer dimensions.
 
 `build_magnet` builds it once; all functions that compute a field take it as an argument.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,15 +15,27 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.geometry.array_layout import blocks_of_array, ring_limits
-from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.study.magnet import Array, External, IronRing
+from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
+from halbach_fe.geometry.blocks import MagnetBlock, bore_radius
+from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
+from halbach_fe.geometry.overlaps import block_in_iron, overlapping_blocks
+from halbach_fe.study.array import Array
+from halbach_fe.study.iron import Iron, IronRing
+from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import Curve
-from halbach_fe.study.model import Study, curve_of, is_nonlinear
+from halbach_fe.study.model import Study, curve_of, iron_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
-SHAPE_KEYS = ("dimension", "array")
-"""Keys of a study that the blocks depend on."""
+SHAPE_KEYS = ("dimension", "array", "iron_ring", "iron")
+"""Keys of a study that the shapes of blocks and iron depend on."""
+
+CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
+"""Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
+blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
+
+SQUEEZED = 0.1
+"""The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
+makes neighbours overlap a little; a larger overlap cannot be a tolerance of the assembly."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +54,8 @@ class Magnet(ShownInNotebook):
     nominal_magnetization : ndarray, shape (parameters,), in A/m
         Nominal values of these components.
     radius, half_length : float
-        Outer radius and half the length of the magnet in m, including the iron ring; the length of
-        a 2D magnet is infinite.
+        Outer radius and half the length of the magnet in m, including its iron; the length of a 2D
+        magnet is infinite.
 
     Examples
     --------
@@ -76,10 +88,22 @@ class Magnet(ShownInNotebook):
         """The array of blocks as the study gives it."""
         return self.study.array
 
+    @cached_property
+    def iron(self) -> tuple[IronSolid, ...]:
+        """The bodies of iron; none if the magnet has no iron."""
+        study = self.study
+        return iron_solids(self.dimension, study.iron_ring, study.iron, self.array_half_length)
+
     @property
-    def iron_ring(self) -> IronRing | None:
-        """The iron tube around the blocks, or None."""
-        return self.study.iron_ring
+    def iron_permeability(self) -> float:
+        """Constant relative permeability of the iron; 1 without iron or with a curve."""
+        iron = iron_of(self.study)
+        return 1.0 if iron is None else iron.relative_permeability or 1.0
+
+    @property
+    def iron_is_axisymmetric(self) -> bool:
+        """Whether all bodies of iron are coaxial tubes or discs."""
+        return all(body.outline is None for body in self.iron)
 
     @property
     def external(self) -> External:
@@ -88,7 +112,7 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def curve(self) -> Curve | None:
-        """Magnetization curve of the iron ring, or None if there is none."""
+        """Magnetization curve of the iron, or None if there is none."""
         return curve_of(self.study)
 
     @property
@@ -99,7 +123,7 @@ class Magnet(ShownInNotebook):
     @cached_property
     def is_vacuum(self) -> bool:
         """Whether all permeabilities are 1, so that the closed-form field needs no correction."""
-        return self.iron_ring is None and all(
+        return not self.iron and all(
             block.isotropic and block.recoil_permeability == 1.0 for block in self.blocks)
 
     @cached_property
@@ -115,50 +139,100 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def ring_limits(self) -> tuple[tuple[float, float], ...]:
-        """Limits of z in m of every ring; the array is centred at z = 0, infinite in 2D."""
-        return tuple(ring_limits(self.study))
+        """Limits of z in m of every ring without its free blocks; infinite in 2D."""
+        return tuple(ring_limits(self.array, self.dimension))
 
-    @property
+    @cached_property
+    def blocks_by_ring(self) -> tuple[int, ...]:
+        """Number of slots of every ring; free blocks form rings after the others."""
+        return self.array.blocks_by_ring
+
+    @cached_property
+    def _numbers(self) -> dict[tuple[int, int], int]:
+        return {(block.ring, block.slot): number for number, block in enumerate(self.blocks)}
+
+    def number_of(self, ring: int, slot: int) -> int:
+        """Return the number of a block, from 0 in the order of `blocks`.
+
+        Raises
+        ------
+        KeyError
+            If there is no such block.
+        """
+        return self._numbers[ring, slot]
+
+    def by_ring(self, values: Floats) -> Floats:
+        """Return values of blocks (blocks,) as a table (rings, slots), NaN where no block is."""
+        table = np.full((len(self.blocks_by_ring), max(self.blocks_by_ring)), np.nan)
+        for value, block in zip(values, self.blocks, strict=True):
+            table[block.ring - 1, block.slot - 1] = value
+        return table
+
+    @cached_property
+    def _corners(self) -> tuple[Floats, ...]:
+        """Points (n, 3) in m on the edges of every block's nominal place.
+
+        z is 0 for infinite blocks.
+        """
+        t = np.linspace(0.0, 1.0, 9)[:-1]
+        found = []
+        for block in self.blocks:
+            outline = np.vstack([edge.at(t if edge.arc else t[:1])[0] for edge in block.outline])
+            ends = [0.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
+            points = np.vstack([np.column_stack([outline, np.full(len(outline), z)])
+                                for z in ends])
+            found.append(replace(block, displacement_m=(0.0, 0.0, 0.0),
+                                 rotation_rad=(0.0, 0.0, 0.0)).from_frame(points))
+        return tuple(found)
+
+    @cached_property
+    def ring_sections(self) -> tuple[tuple[tuple[float, float], tuple[float, float]], ...]:
+        """Limits of z and of the distance from the z axis, in m, of every ring in 3D.
+
+        Free blocks of the same height count as a ring.
+        """
+        found: dict[int, list[Floats]] = {}
+        for block, points in zip(self.blocks, self._corners, strict=True):
+            found.setdefault(block.ring, []).append(points)
+        sections = []
+        for points in map(np.vstack, found.values()):
+            radius = np.hypot(points[:, 0], points[:, 1])
+            sections.append(((float(points[:, 2].min()), float(points[:, 2].max())),
+                             (float(radius.min()), float(radius.max()))))
+        return tuple(sections)
+
+    @cached_property
     def array_half_length(self) -> float:
-        """Half the length of the array in m; infinite in 2D."""
-        return self.ring_limits[-1][1]
+        """Largest |z| in m of the nominal blocks; infinite in 2D."""
+        if self.dimension == 2:
+            return np.inf
+        return max(float(np.abs(points[:, 2]).max()) for points in self._corners)
 
     @cached_property
     def array_outer_radius(self) -> float:
         """Radius in m of the smallest cylinder about the z axis around all nominal blocks."""
-        slots = self.array.blocks_per_ring
-        return max(edge.radius for block in self.blocks[:slots] for edge in block.outline)
+        return max(float(np.hypot(*points[:, :2].T).max()) for points in self._corners)
+
+    @cached_property
+    def bore_radius(self) -> float:
+        """Radius in m of the largest cylinder about the z axis that the blocks leave free."""
+        return bore_radius(self.blocks)
 
     @property
     def iron_half_length(self) -> float:
-        """Half the length of the iron ring in m (default: that of the array); infinite in 2D."""
-        iron = self.iron_ring
-        if self.dimension == 3 and iron is not None and iron.length_m:
-            return iron.length_m / 2
-        return self.array_half_length
+        """Largest |z| in m of the iron, or of the array without iron; infinite in 2D."""
+        if self.dimension == 2 or not self.iron:
+            return self.array_half_length
+        return max(max(-body.z_min, body.z_max) for body in self.iron)
 
     @cached_property
     def radius(self) -> float:
-        """Outer radius in m of the magnet, including the iron ring.
-
-        Raises
-        ------
-        StudyError
-            If the iron ring overlaps the blocks.
-        """
-        radius = self.array_outer_radius
-        if self.iron_ring is None:
-            return radius
-        if self.iron_ring.inner_radius_m < radius * (1 - 1e-9):
-            raise StudyError(
-                f"Input `iron_ring.inner_radius_m` of study must be at least {radius:.6g}, where "
-                f"the blocks end; instead received {self.iron_ring.inner_radius_m:g}. Enlarge the "
-                "ring.")
-        return self.iron_ring.outer_radius_m
+        """Outer radius in m of the magnet, including its iron."""
+        return max([self.array_outer_radius, *(body.radius for body in self.iron)])
 
     @property
     def half_length(self) -> float:
-        """Half the length of the magnet in m, including the iron ring."""
+        """Half the length of the magnet in m, including its iron."""
         return max(self.array_half_length, self.iron_half_length)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
@@ -166,11 +240,8 @@ class Magnet(ShownInNotebook):
         inside = np.zeros(len(points), bool)
         for block in self.blocks:
             inside |= block.contains(points)
-        ring = self.iron_ring
-        if ring is not None:
-            radius = np.hypot(points[:, 0], points[:, 1])
-            inside |= ((radius >= ring.inner_radius_m) & (radius <= ring.outer_radius_m)
-                       & (np.abs(points[:, 2]) <= self.iron_half_length))
+        for body in self.iron:
+            inside |= body.contains(points)
         return inside
 
     def with_(self, **changes: Any) -> Magnet:
@@ -206,4 +277,44 @@ def build_magnet(study: Study) -> Magnet:
     >>> hf.build_magnet(hf.read_study("dipole.toml")).blocks[0].name
     'r01s01'
     """
-    return Magnet(study, blocks_of_array(study))
+    magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
+    check_iron_ring(study, magnet.array_outer_radius)
+    _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
+    return magnet
+
+
+@lru_cache(maxsize=128)  # a diagnosis builds the same magnets hundreds of times
+def _check_overlaps(
+    dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None
+) -> None:
+    """Refuse blocks that overlap one another or iron, in their nominal or in their real places.
+
+    Raises
+    ------
+    StudyError
+    """
+    contact = CONTACT_IN_TABLES if array.free_blocks else CONTACT
+    cases = [(nominal_blocks(array, dimension), contact, "")]
+    blocks = blocks_of_array(array, dimension)
+    if dimension == 2:  # where a small tilt turns magnetizations, and moves nothing in the plane
+        blocks = tuple(replace(block, rotation_rad=(0.0, 0.0, block.rotation_rad[2]))
+                       for block in blocks)
+    if not all(block.in_place for block in blocks):
+        cases.append((blocks, SQUEEZED, ", where they are mounted"))
+    for placed, tolerance, where in cases:
+        blocks = tuple(block for block in placed if block.remanence)  # the others are missing
+        pair = overlapping_blocks(blocks, tolerance)
+        if pair is not None:
+            first, second = (blocks[number].name for number in pair[:2])
+            raise StudyError(
+                f"Input `array` of study must leave blocks apart; instead blocks {first} and "
+                f"{second} overlap by at least {1e3 * pair[2]:.3g} mm{where}. Make the blocks "
+                "smaller, or move them apart.")
+        reach = max(abs(end) for block in placed for end in (block.z_min, block.z_max))
+        solids = iron_solids(dimension, iron_ring, iron, reach)
+        found = block_in_iron(blocks, solids, tolerance) if solids else None
+        if found is not None:
+            raise StudyError(
+                f"Input `iron` of study must leave the blocks room; instead block "
+                f"{blocks[found[0]].name} and body {found[1] + 1} of iron overlap by at least "
+                f"{1e3 * found[2]:.3g} mm{where}. Move the iron away.")

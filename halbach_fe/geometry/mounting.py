@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, position_angle_deg
+from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 
@@ -23,10 +23,11 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
     array, found = magnet.array, []
     for block in magnet.blocks:
         ring, slot = block.mounted_from or (block.ring, block.slot)
-        moved = position_angle_deg(array, block.slot) - position_angle_deg(array, slot)
+        number = magnet.number_of(ring, slot)
+        moved = block.angle_deg - magnet.blocks[number].angle_deg
         turn = rotation_matrix(block.rotation_rad) @ rotation_matrix((0.0, 0.0, np.radians(moved)))
         factor = magnetization_factor(exceptions_of(array, block.ring, block.slot))
-        found.append(((ring - 1) * array.blocks_per_ring + slot - 1, factor * turn))
+        found.append((number, factor * turn))
     return found
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError
 
 
 @dataclass(frozen=True)
@@ -141,64 +139,3 @@ def closed_outline(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
     points = [(float(x), float(y)) for x, y in corners]
     return tuple(Edge(points[i], points[(i + 1) % len(points)], arc=i in arcs)
                  for i in range(len(points)))
-
-
-@lru_cache(maxsize=32)  # a diagnosis builds the same blocks hundreds of times
-def check_overlaps(outlines: tuple[Outline, ...]) -> None:
-    """Raise StudyError if outlines overlap: if a point of one is inside another, or edges cross.
-
-    Shared faces are allowed: the outlines are shrunk by 1e-6 so that rounding does not matter.
-    """
-    t = np.linspace(0.0, 1.0, 9)
-    shrunk, centres, reaches, widths = [], [], [], []
-    for outline in outlines:
-        boundary = np.vstack([edge.at(t)[0][:-1] for edge in outline])
-        centre = np.mean([edge.start for edge in outline], axis=0)
-        shrunk.append(centre + (1 - 1e-6) * (boundary - centre))
-        centres.append(centre)
-        reaches.append(1.1 * np.hypot(*(boundary - centre).T).max())  # arcs bulge between samples
-        widths.append([np.abs(_angles(polygon, centre)).max()
-                       for polygon in (shrunk[-1], boundary)])
-    places, sizes = np.array(centres), np.array(reaches)
-    # an outline that contains the axis subtends all angles
-    inside, whole = np.where(np.array(widths) < np.pi / 2, widths, np.pi).T
-    for i, polygon in enumerate(shrunk):
-        samples = np.vstack([polygon, polygon.mean(axis=0)])
-        # only outlines with overlapping ranges of angle about the axis, and near enough, are
-        # compared; those that share a face are told apart by the shrinking
-        near = (np.hypot(*(places - places[i]).T) <= sizes + sizes[i]) & (
-            np.abs(_angles(places, places[i])) <= inside[i] + whole)
-        for j in np.flatnonzero(near).tolist():
-            if i != j and (outline_contains(outlines[j], samples).any()
-                           or _cross(polygon, shrunk[j])):
-                raise StudyError(
-                    f"Input `array.block` of study must leave neighbours apart; instead blocks "
-                    f"{i + 1} and {j + 1} of a ring overlap. Reduce the block's width, or place "
-                    "the blocks on a larger radius."
-                )
-
-
-def _angles(points: Floats, from_: Floats) -> Floats:
-    """Return the angles (n,) in rad about the axis of points (n, 2), from that of a point (2,)."""
-    turned = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(from_[1], from_[0])
-    return np.asarray((turned + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _cross(first: Floats, second: Floats) -> bool:
-    """Tell whether any side of a closed polygon (n, 2) crosses any side of another (m, 2)."""
-    a, b = first[:, None], np.roll(first, -1, axis=0)[:, None]
-    c, d = second[None], np.roll(second, -1, axis=0)[None]
-
-    def side(p: Floats, q: Floats, x: Floats) -> Floats:
-        return ((q[..., 0] - p[..., 0]) * (x[..., 1] - p[..., 1])
-                - (q[..., 1] - p[..., 1]) * (x[..., 0] - p[..., 0]))
-
-    def apart(x: Floats, y: Floats) -> NDArray[np.bool_]:
-        """Tell whether x and y have opposite signs beyond rounding.
-
-        Sides of aligned blocks are collinear up to rounding, and do not cross.
-        """
-        return (np.minimum(x, y) < -tiny) & (np.maximum(x, y) > tiny)
-
-    tiny = 1e-9 * float(np.ptp(first)) ** 2
-    return bool((apart(side(a, b, c), side(a, b, d)) & apart(side(c, d, a), side(c, d, b))).any())

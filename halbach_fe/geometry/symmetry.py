@@ -128,9 +128,11 @@ def symmetry_of(magnet: Magnet) -> Symmetry:
     """Return the symmetry under rotations about z by whole blocks and reflection in z = 0.
 
     The shapes and permeabilities of the blocks decide; their magnetizations may differ, because
-    fields are computed per unit of magnetization. The iron ring and the outer boundary always have
-    this symmetry.
+    fields are computed per unit of magnetization. Rings that differ, free blocks and poles of iron
+    have no symmetry here.
     """
+    if not magnet.array.is_uniform or not magnet.iron_is_axisymmetric:
+        return no_symmetry(magnet)
     blocks = magnet.blocks
     slots, rings = magnet.array.blocks_per_ring, magnet.array.rings
     tensors = np.array([b.recoil_tensor for b in blocks]).reshape(rings, slots, 3, 3)

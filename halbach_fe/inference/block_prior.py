@@ -19,12 +19,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.geometry.array_layout import facing_angle_deg, position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
@@ -38,7 +38,6 @@ from halbach_fe.stats.small_samples import (
     measured_prior,
     predictive_covariance,
 )
-from halbach_fe.study.magnet import Array
 
 DIRECTIONS = ("along", "across", "z")
 """Axes of deviations: along the nominal magnetization, across it in the ring's plane, and z."""
@@ -169,7 +168,7 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(magnet, slots, position_angle_deg,
+        _check_alike(magnet, slots, attrgetter("angle_deg"),
                      "Give ring and slot of every measured block.")
         slot_of = np.array([block.slot for block in blocks])
         for label, samples in members.items():
@@ -217,13 +216,13 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     magnet = as_meant(magnet)
     blocks, slots, size = magnet.blocks, types_of(magnet), magnet.dimension
     _check_types(magnet, table, slots)
-    _check_alike(magnet, slots, facing_angle_deg, "Make them types of their own.")
+    _check_alike(magnet, slots, attrgetter("facing_deg"), "Make them types of their own.")
     index = _block_of_rows(magnet, table, slots)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])[index]
     _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([rotation_about_z(-np.radians(facing_angle_deg(magnet.array, blocks[i].slot)))
+    own = np.array([rotation_about_z(-np.radians(blocks[i].facing_deg))
                     for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
@@ -245,11 +244,11 @@ def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
     -------
     ndarray, shape (rows, 3), in A m^2
     """
-    array, index = magnet.array, _block_of_rows(magnet, table, types_of(magnet))
+    index = _block_of_rows(magnet, table, types_of(magnet))
 
     def aside(place: int) -> float:
-        slot = place % array.blocks_per_ring + 1
-        return facing_angle_deg(array, slot) - position_angle_deg(array, slot)
+        block = magnet.blocks[place]
+        return block.facing_deg - block.angle_deg
 
     turns = np.array([rotation_about_z(np.radians(aside(new) - aside(old)))
                       for new, old in zip(places.tolist(), index.tolist(), strict=True)])
@@ -269,14 +268,16 @@ def _tested(
 def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
     """Return the slots of every type of block, by the label of the type."""
     return magnet.study.prior.types or {
-        str(slot): (slot,) for slot in range(1, magnet.array.blocks_per_ring + 1)}
+        str(slot): (slot,) for slot in range(1, max(magnet.blocks_by_ring) + 1)}
 
 
 def _frame(block: MagnetBlock) -> Floats:
     """Return `DIRECTIONS` as columns (3, 3) of the length of the nominal magnetization in A/m."""
     x, y, _ = block.easy_axis
-    axes = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
-    return axes * float(np.linalg.norm(block.magnetization))
+    level = np.hypot(x, y)
+    across = np.array([-y, x, 0.0]) / level if level > 1e-9 else np.array([0.0, 1.0, 0.0])
+    axes = np.column_stack([block.easy_axis, across, np.cross(block.easy_axis, across)])
+    return np.asarray(axes * float(np.linalg.norm(block.magnetization)))
 
 
 def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
@@ -315,7 +316,7 @@ def _conversions(
     volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
     tensors = demagnetizing_tensors(real)
     return np.array([
-        _of_block(block, tensor, position_angle_deg(magnet.array, block.slot)) / volume
+        _of_block(block, tensor, block.angle_deg) / volume
         for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
 
 
@@ -339,17 +340,18 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
 
 def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
     """Raise a MeasurementError if a type or place is not in the study."""
-    array = magnet.array
+    places = {(block.ring, block.slot) for block in magnet.blocks}
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
         if label not in slots:
             raise MeasurementError(must_be(
                 f"type of block {serial}", table.source,
                 f"one of the study's: {', '.join(slots)}", f"'{label}'",
                 "Name the slots of each type in the study's prior.types."))
-        if ring > array.rings or slot > array.blocks_per_ring:
+        if ring and (ring, slot) not in places:
             raise MeasurementError(must_be(
                 f"place of block {serial}", table.source,
-                f"within {array.rings} rings of {array.blocks_per_ring} blocks",
+                f"one of the magnet's {len(magnet.blocks_by_ring)} rings of "
+                f"{', '.join(map(str, sorted(set(magnet.blocks_by_ring))))} blocks",
                 f"ring {ring}, slot {slot}"))
         if slot and slot not in slots[label]:
             raise MeasurementError(must_be(
@@ -359,9 +361,7 @@ def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, 
 
 def _check_complete(magnet: Magnet, table: BlockTable) -> None:
     """Raise a MeasurementError if some blocks have a place but not every place has a block."""
-    array = magnet.array
-    places = {(ring, slot) for ring in range(1, array.rings + 1)
-              for slot in range(1, array.blocks_per_ring + 1)}
+    places = {(block.ring, block.slot) for block in magnet.blocks}
     missing = sorted(places - set(table.places))
     if table.ring.any() and missing:
         raise MeasurementError(must_be(
@@ -371,8 +371,10 @@ def _check_complete(magnet: Magnet, table: BlockTable) -> None:
 
 def _block_of_rows(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
     """Return the block number (rows,) of each row; without a place, the first of its type."""
+    first_of_slot = {block.slot: number
+                     for number, block in reversed(list(enumerate(magnet.blocks)))}
     return np.array([
-        max(ring - 1, 0) * magnet.array.blocks_per_ring + (slot or slots[label][0]) - 1
+        magnet.number_of(ring, slot) if ring else first_of_slot[slots[label][0]]
         for label, (ring, slot) in zip(table.type, table.places, strict=True)])
 
 
@@ -411,7 +413,7 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[Array, int], float],
+    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[MagnetBlock], float],
     hint: str
 ) -> None:
     """Raise a StudyError if the study's blocks of a type differ, seen from their own axes.
@@ -424,7 +426,7 @@ def _check_alike(
               for block in blocks]
     tensors = demagnetizing_tensors(finite)
     seen = np.array([
-        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(magnet.array, block.slot)))
+        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(block)))
         / block.volume for block, tensor in zip(finite, tensors, strict=True)])
     for label, own in slots.items():
         first, *others = [number for number, block in enumerate(blocks) if block.slot in own]

@@ -318,8 +318,7 @@ def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
 
 def _deviations(update: InferenceResult) -> dict[str, Floats]:
     """Return posterior less prior mean of each component, (rings, slots)."""
-    array = update.study.array
-    return {name: values.reshape(array.rings, array.blocks_per_ring) for name, values in
+    return {name: update.magnet.by_ring(values) for name, values in
             _parts(update, update.posterior.mean - update.prior.mean).items()}
 
 
@@ -327,17 +326,17 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
     """Draw posterior less prior mean of every block's magnetization by ring and slot."""
     shown = states(diagnosis)
     found = [_deviations(state.update) for state in shown]
-    array = diagnosis.before.study.array
-    figure = Figure(figsize=(9, 1.0 + len(found[0]) * (1.0 + 0.14 * array.rings)),
+    rings, slots = next(iter(found[0].values())).shape
+    figure = Figure(figsize=(9, 1.0 + len(found[0]) * (1.0 + 0.14 * min(rings, 40))),
                     layout="constrained")
     axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(axes, found[0], strict=True):
-        limit = max(float(np.abs(deviations[name]).max()) for deviations in found) or 1.0
+        limit = max(float(np.nanmax(np.abs(deviations[name]))) for deviations in found) or 1.0
         for axis, deviations in zip(row, found, strict=True):
             axis.imshow(deviations[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
                         origin="lower",
-                        extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
-            axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 6)))
+                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5))
+            axis.set_yticks(range(1, rings + 1, max(1, rings // 6)))
         figure.colorbar(_colours(limit), ax=list(row), label=name.replace(" in", "\nin"))
         row[0].set_ylabel("ring")
     for axis, state in zip(axes[0], shown, strict=True):
@@ -353,7 +352,7 @@ def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
     prior = _parts(diagnosis.before, np.asarray(diagnosis.before.prior.root))
     return [{"rms change of the magnetizations": name,
              "prior sd": f"{np.sqrt(np.mean(np.sum(values**2, axis=1))):.3g}"} | {
-        when: f"{np.sqrt(np.mean(one[name]**2)):.3g}" for when, one in found}
+        when: f"{np.sqrt(np.nanmean(one[name]**2)):.3g}" for when, one in found}
         for name, values in prior.items()]
 
 

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, save, write_page
@@ -99,12 +100,11 @@ def write_inference_report(
         for model in circle_models(result.magnet, result.observation, result.response)]
     if multipoles:
         write_multipole_csv(result.study, multipoles, folder / "multipoles.csv")
-    array = result.study.array
     write_page(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
-        rows=score_table(result, published), assumptions=assumptions, array=array,
-        remanence=result.magnet.blocks[0].remanence, conflict=_conflict_sentence(result),
+        rows=score_table(result, published), assumptions=assumptions,
+        magnet_rows=magnet_rows(result.magnet), conflict=_conflict_sentence(result),
         view=view_of_inference(result))
 
 
@@ -135,50 +135,52 @@ def _figure_height(rings: int) -> float:
 
 def _magnetization_change_figure(result: InferenceResult) -> Figure:
     """Draw the change of each magnetization along the easy axis, from nominal to posterior."""
-    array = result.study.array
     dimension = result.study.dimension
     nominal = result.response.nominal.reshape(-1, dimension)
     shift = (result.posterior.mean - result.response.nominal).reshape(-1, dimension)
     length = np.linalg.norm(nominal, axis=1)
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
-    picture = 100 * along.reshape(array.rings, array.blocks_per_ring)
-    figure = Figure(figsize=(8, _figure_height(array.rings)), layout="constrained")
+    picture = 100 * result.magnet.by_ring(along)
+    rings, slots = picture.shape
+    figure = Figure(figsize=(8, _figure_height(rings)), layout="constrained")
     axis = figure.subplots()
-    limit = float(np.abs(picture).max()) or 1.0
+    limit = float(np.nanmax(np.abs(picture))) or 1.0
     image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
                         origin="lower",
-                        extent=(0.5, array.blocks_per_ring + 0.5, 0.5, array.rings + 0.5))
-    axis.add_patch(Rectangle((0.5, 0.5), array.blocks_per_ring, array.rings, fill=False))
+                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5))
+    axis.add_patch(Rectangle((0.5, 0.5), slots, rings, fill=False))
     axis.set_xlabel("slot")
     axis.set_ylabel("ring")
-    axis.set_xticks(range(1, array.blocks_per_ring + 1, max(1, array.blocks_per_ring // 24)))
-    axis.set_yticks(range(1, array.rings + 1, max(1, array.rings // 12)))
+    axis.set_xticks(range(1, slots + 1, max(1, slots // 24)))
+    axis.set_yticks(range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="posterior change along\nthe easy axis in %")
     return figure
 
 
 def _contraction_figure(result: InferenceResult) -> Figure:
     """Draw the contraction of each block: as bars for a single ring, else by ring and slot."""
-    array = result.study.array
-    percent = 100 * contraction(result.prior, result.posterior, result.study.dimension).reshape(
-        array.rings, array.blocks_per_ring)
-    slots = np.arange(1, array.blocks_per_ring + 1)
-    figure = Figure(figsize=(8, 3 if array.rings == 1 else _figure_height(array.rings)),
+    percent = 100 * result.magnet.by_ring(
+        contraction(result.prior, result.posterior, result.study.dimension))
+    rings = len(percent)
+    slots = np.arange(1, percent.shape[1] + 1)
+    figure = Figure(figsize=(8, 3 if rings == 1 else _figure_height(rings)),
                     layout="constrained")
     axis = figure.subplots()
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
-    if array.rings == 1:
+    if rings == 1:
         bars = axis.bar(slots, percent[0], color=POSTERIOR)
         if len(slots) <= NUMBERED_SLOTS:
             axis.bar_label(bars, fmt="%.0f", fontsize=7)
         axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))
         return figure
     image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
-                        extent=(0.5, len(slots) + 0.5, 0.5, array.rings + 0.5))
-    if len(slots) <= NUMBERED_SLOTS and array.rings <= NUMBERED_RINGS:
+                        extent=(0.5, len(slots) + 0.5, 0.5, rings + 0.5))
+    if len(slots) <= NUMBERED_SLOTS and rings <= NUMBERED_RINGS:
         for (ring, slot), value in np.ndenumerate(percent):
+            if np.isnan(value):
+                continue
             axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
                       color="white" if value < 50 else "black")
-    axis.set(ylabel="ring", yticks=range(1, array.rings + 1, max(1, array.rings // 12)))
+    axis.set(ylabel="ring", yticks=range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="contraction in %")
     return figure

@@ -14,7 +14,8 @@ from markupsafe import Markup
 from scipy.spatial import Delaunay
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import outline_contains
 from halbach_fe.inference.result import InferenceResult
@@ -184,8 +185,7 @@ def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None =
     blocks, values = _merge_rings(magnet, values)
     figure = go.Figure([_blocks_trace(magnet, blocks, values),
                         *_arrow_traces(magnet, blocks, values)])
-    if magnet.iron_ring is not None:
-        figure.add_trace(_iron_trace(magnet))
+    figure.add_traces([_iron_trace(body, _prism_height(magnet)) for body in magnet.iron])
     if points is not None:
         figure.add_trace(_points_trace(points))
     figure.update_layout(
@@ -201,7 +201,7 @@ def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None =
 
 def _rings_per_prism(magnet: Magnet) -> int:
     """Return the number of neighbouring rings that are merged for drawing."""
-    return math.ceil(magnet.array.rings * magnet.array.blocks_per_ring / MOST_BLOCKS)
+    return math.ceil(len(magnet.blocks) / MOST_BLOCKS) if magnet.array.is_uniform else 1
 
 
 def _merge_rings(
@@ -302,14 +302,12 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
                        np.column_stack([ring, ahead + count, ring + count])])
     corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
-    corners = ((corners - block.middle) @ rotation_matrix(block.rotation_rad).T
-               + block.middle + block.displacement_m)
-    return corners, np.vstack([face, face + count, sides])
+    return block.from_frame(corners), np.vstack([face, face + count, sides])
 
 
 def _prism_height(magnet: Magnet) -> float:
     """Return the drawn height in m of blocks of infinite length."""
-    return FLAT * magnet.array.outer_radius_m
+    return FLAT * magnet.array_outer_radius
 
 
 def _arrow_traces(
@@ -320,8 +318,8 @@ def _arrow_traces(
                          prism(block, _prism_height(magnet))[0][:, 2].max()] for block in blocks])
     vectors = np.zeros((len(blocks), 3))
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
-    vectors *= (ARROW * (magnet.array.outer_radius_m - magnet.array.inner_radius_m)
-                / np.linalg.norm(vectors, axis=1).max())
+    size = np.median([np.ptp(prism(block, 0.0)[0], axis=0).max() for block in blocks[:100]])
+    vectors *= ARROW * size / (np.linalg.norm(vectors, axis=1).max() or 1.0)
     gap = np.full_like(middles, np.nan)  # NaN separates the lines of consecutive arrows
     x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
     shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
@@ -333,21 +331,24 @@ def _arrow_traces(
     return [shafts, heads]
 
 
-def _iron_trace(magnet: Magnet) -> go.Surface:
-    """Return the surface of the iron ring."""
-    ring = magnet.iron_ring
-    assert ring is not None
-    blocks = magnet.blocks
-    length = ring.length_m or (blocks[-1].z_max - blocks[0].z_min)
-    half = (length if np.isfinite(length) else _prism_height(magnet)) / 2
-    angle = np.linspace(0, 2 * np.pi, 97)
-    radius = np.array([ring.inner_radius_m, ring.outer_radius_m, ring.outer_radius_m,
-                       ring.inner_radius_m, ring.inner_radius_m])[:, None]
-    z = np.array([-half, -half, half, half, -half])[:, None]
+def _iron_trace(body: IronSolid, height: float) -> go.Surface:
+    """Return the surface of a body of iron; ``height`` in m is drawn if it is infinitely long."""
+    low, high = (body.z_min, body.z_max) if np.isfinite(body.z_max) else (-height / 2, height / 2)
+    if body.outline is None:
+        angle = np.linspace(0, 2 * np.pi, 97)
+        radius = np.array([body.inner_radius, body.outer_radius, body.outer_radius,
+                           body.inner_radius, body.inner_radius])[:, None]
+        z = np.array([low, low, high, high, low])[:, None] + 0 * angle
+        x, y = radius * np.cos(angle), radius * np.sin(angle)
+    else:
+        corners = np.array([edge.start for edge in (*body.outline, body.outline[0])])
+        middle = corners.mean(axis=0)
+        x, y = (np.array([middle[i] + 0 * corners[:, i], corners[:, i], corners[:, i],
+                          middle[i] + 0 * corners[:, i]]) for i in range(2))
+        z = np.array([low, low, high, high])[:, None] + 0 * corners[:, 0]
     return go.Surface(
-        x=radius * np.cos(angle), y=radius * np.sin(angle), z=z + 0 * angle, opacity=0.25,
-        showscale=False, colorscale=[[0, IRON], [1, IRON]], name="iron", showlegend=True,
-        hoverinfo="name")
+        x=x, y=y, z=z, opacity=0.25, showscale=False, colorscale=[[0, IRON], [1, IRON]],
+        name="iron", showlegend=True, hoverinfo="name")
 
 
 def _points_trace(points: ViewPoints) -> go.Scatter3d:

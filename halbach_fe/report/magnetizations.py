@@ -59,9 +59,9 @@ def _magnetizations_figure(
 ) -> Figure:
     """Draw deviations of a ring's magnetizations from nominal, a panel for each component."""
     size = magnet.dimension
-    slots = magnet.array.blocks_per_ring
-    part = slice((ring - 1) * slots * size, ring * slots * size)
-    blocks = magnet.blocks[(ring - 1) * slots:ring * slots]
+    first, slots = sum(magnet.blocks_by_ring[:ring - 1]), magnet.blocks_by_ring[ring - 1]
+    part = slice(first * size, (first + slots) * size)
+    blocks = magnet.blocks[first:first + slots]
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     figure = Figure(figsize=(8, 1 + 2.4 * size), layout="constrained")
     axes = figure.subplots(size, 1, sharex=True)

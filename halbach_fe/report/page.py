@@ -14,12 +14,12 @@ import numpy as np
 import tomlkit
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Polygon, Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.study.model import Study
+from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
@@ -79,6 +79,7 @@ def write_page(
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.globals["is_nonlinear"] = is_nonlinear
     write_text(path, environment.get_template(template).render(
         pictures=pictures, study=study, study_text=text, provenance={**(provenance or {}),
             "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
@@ -109,18 +110,24 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
 
 
 def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
-    """Draw the first ring's blocks with arrows of their easy axes, and the iron ring, in mm."""
+    """Draw the first ring's blocks with arrows of their easy axes, and the iron, in mm."""
     t = np.linspace(0, 1, 9)
-    for block in magnet.blocks[:magnet.array.blocks_per_ring]:
-        outline = 1e3 * np.vstack([edge.at(t)[0] for edge in block.outline])
+    flat = magnet.dimension == 2
+    for block in magnet.blocks if flat else magnet.blocks[:magnet.blocks_by_ring[0]]:
+        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
+        outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
         axis.plot(*outline.T, color="#777777", lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
-        length = 150 * (magnet.array.outer_radius_m - magnet.array.inner_radius_m)
+        length = 0.15 * float(np.ptp(outline, axis=0).max())
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})
-    if magnet.iron_ring is not None:
-        for radius in (magnet.iron_ring.inner_radius_m, magnet.iron_ring.outer_radius_m):
+    for body in magnet.iron:
+        if body.outline is not None:
+            axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])
+                                    for edge in body.outline], fill=False, color=IRON, lw=0.8))
+            continue
+        for radius in (body.inner_radius, body.outer_radius):
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
 
 
@@ -144,10 +151,10 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
         axis.grid(alpha=0.3)
-        low, high = 1e3 * magnet.array.inner_radius_m, 1e3 * magnet.array.outer_radius_m
-        for block in magnet.blocks[::magnet.array.blocks_per_ring]:
-            axis.add_patch(Rectangle((1e3 * block.z_min, low), 1e3 * (block.z_max - block.z_min),
-                                     high - low, fill=False, color="#777777", lw=0.6))
+        for z_limits, radii in magnet.ring_sections:
+            axis.add_patch(Rectangle(
+                (1e3 * z_limits[0], 1e3 * radii[0]), 1e3 * (z_limits[1] - z_limits[0]),
+                1e3 * (radii[1] - radii[0]), fill=False, color="#777777", lw=0.6))
     for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                             (others, "x", PRIOR, "held out")):
         if positions is None:

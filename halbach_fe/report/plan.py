@@ -119,7 +119,7 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     slots = np.array([block.slot for block in magnet.blocks])
-    places = np.arange(1, magnet.array.blocks_per_ring + 1)
+    places = np.arange(1, max(magnet.blocks_by_ring) + 1)
 
     def by_slot(sd: Floats) -> Floats:
         variance = (sd**2).reshape(len(slots), -1).sum(axis=1)

@@ -130,7 +130,7 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
 
 def _moves_figure(shim: Shim) -> Figure:
     """Draw the moves in the cross-section, or for several rings in a grid of rings and slots."""
-    flat = shim.study.array.rings == 1
+    flat = len(shim.magnet.blocks_by_ring) == 1
     figure = Figure(figsize=(6, 6) if flat else (9, 4.6), layout="constrained")
     axis = figure.subplots()
     if flat:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import (
@@ -51,7 +52,7 @@ def write_solution_report(
     write_page(
         folder / "report.html", "solution.html.j2", save(figures, folder),
         study=solution.magnet.study,
-        array=solution.magnet.study.array, remanence=solution.magnet.blocks[0].remanence,
+        magnet_rows=magnet_rows(solution.magnet),
         multipoles=middle_table(multipoles), provenance=provenance,
         strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
         error=float(solution.errors.max()),

@@ -13,6 +13,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
     MEASURED,
@@ -111,7 +112,7 @@ def write_verification(
     change = found.changes[1]
     write_page(
         folder / "verification.html", "verification.html.j2", save(figures, folder),
-        study=magnet.study,
+        study=magnet.study, magnet_rows=magnet_rows(magnet),
         provenance=provenance, found=found, rows=difference_table(found), basis=error_basis(found),
         verdict=verification_verdict(magnet, found), refinement=REFINEMENT, flattest=FLATTEST,
         view=view_of_nominal_magnet(magnet, ViewPoints(

@@ -25,6 +25,9 @@ from halbach_fe.solver.session import Session
 REFINEMENT = 1.5
 """Factor between the element sizes, and between the distances of the boundary, of two solves."""
 
+CELLS_PER_SIDE = 2
+"""Default of `halbach_fe.study.solver.MeshSettings.cells_per_side`."""
+
 DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
 """The dual formulation of each formulation that has one."""
 
@@ -40,8 +43,15 @@ def refined(magnet: Magnet, factor: float) -> Magnet:
     return magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m / factor, "bore_size_m": bore / factor,
         "meridian_size_m": meridian_size(magnet) / factor,
+        "cells_per_side": _cells(mesh.cells_per_side or CELLS_PER_SIDE, factor),
         "layers_per_ring": max(1, round(mesh.layers_per_ring * factor)),
         "growth": 1 + (mesh.growth - 1) / factor})}))
+
+
+def _cells(cells: int, factor: float) -> int:
+    """Return a number of cells that is larger by about a factor, but by one at least."""
+    finer = max(cells + 1, round(cells * factor))
+    return finer if factor > 1 else max(1, min(cells - 1, round(cells * factor)))
 
 
 def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
@@ -92,9 +102,14 @@ def reading_errors(
     -------
     ndarray, shape (readings,), in T
     """
-    nominal = parts.nominal
-    if parts.error is not None:
-        return observation.magnitude(parts.error)
+    nominal, known = parts.nominal, parts.error
+    if known is not None:
+        unknown = np.isnan(known).any(axis=1)
+        if unknown.any():  # these points were solved for by another route, see `ElementFields`
+            known = known.copy()
+            known[unknown] = _change_of_modes(
+                magnet, observation.points[unknown], nominal[unknown], session)
+        return observation.magnitude(known)
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return np.zeros(len(observation))  # the field is exact: finite elements add nothing
     route = choose_route(magnet, observation.points)
@@ -109,3 +124,16 @@ def reading_errors(
         return change(dual(magnet, route), "dual route")
     return change(refined(magnet, 1 / REFINEMENT), "coarser mesh") + change(
         farther(magnet, MESHES[route], REFINEMENT), "farther boundary")
+
+
+def _change_of_modes(
+    magnet: Magnet, points: Floats, nominal: Floats, session: Session
+) -> Floats:
+    """Return the change (n, 3) in T by another mesh and boundary of the route azimuthal_modes."""
+    magnet, total = magnet.with_(solver__route="azimuthal_modes"), np.zeros_like(nominal)
+    for variant, purpose in ((refined(magnet, 1 / REFINEMENT), "coarser mesh"),
+                             (farther(magnet, "meridian", REFINEMENT), "farther boundary")):
+        other = finite_element_part(variant, points, replace(
+            session, purpose=f"error bars, {purpose}"), columns=False).nominal
+        total += np.abs(other - nominal)
+    return total

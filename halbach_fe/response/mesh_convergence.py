@@ -17,7 +17,14 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import fourier_analysis
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
-from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
+from halbach_fe.response.discretization_error import (
+    CELLS_PER_SIDE,
+    DUAL,
+    REFINEMENT,
+    dual,
+    farther,
+    refined,
+)
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
@@ -28,6 +35,8 @@ HARMONICS = 8
 """Number of harmonics that are compared if the study does not state a number."""
 
 EXACT = "exact field"
+OWN, COARSER, FINER, FARTHER = (
+    "the study's mesh", "a coarser mesh", "a finer mesh", "a farther boundary")
 
 FLATTEST, STEEPEST = 0.5, 4.0
 """Limits of the observed order of convergence, see `observed_order`."""
@@ -159,12 +168,14 @@ def verify(
     for purpose, variant in variants_to_compare(magnet, points).items():
         say(purpose)
         fields[purpose] = solve_nominal(variant, points, session)
-    base, coarse, fine, far, *others = fields.values()
+    base, coarse, fine = (fields[purpose] for purpose in (OWN, COARSER, FINER))
     compare = _Comparison(magnet, points, base)
     pairs = {"coarser mesh to the study's": (coarse, base),
-             "the study's mesh to a finer": (base, fine), "boundary farther away": (base, far)}
-    if others:
-        pairs[f"dual route, {DUAL[route]}"] = base, others[0]
+             "the study's mesh to a finer": (base, fine)}
+    pairs |= {description: (base, fields[purpose]) for purpose, description in (
+        (FARTHER, "boundary farther away"), (f"the dual route, {DUAL.get(route)}",
+                                             f"dual route, {DUAL.get(route)}"))
+        if purpose in fields}
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)
     steps = [compare(description, *pair) for description, pair in pairs.items()]
@@ -173,14 +184,14 @@ def verify(
         error, fourier = steps[-1].pointwise, steps[-1].fourier
     else:
         series = 1 / (1 - REFINEMENT**-order)
-        error = series * steps[1].pointwise + steps[2].pointwise
-        fourier = (None if steps[1].fourier is None or steps[2].fourier is None
-                   else series * steps[1].fourier + steps[2].fourier)
+        boundary = steps[2:3] if FARTHER in fields else []
+        error = series * steps[1].pointwise + sum(step.pointwise for step in boundary)
+        fourier = None if steps[1].fourier is None else series * steps[1].fourier + sum(
+            step.fourier or 0.0 for step in boundary)
     return Verification(
         magnet=magnet, route=route, differences=tuple(steps), order=order, error_pointwise=error,
         error_fourier=fourier, main_field_T=compare.scale,
-        element_size_m=(meridian_size(magnet) if route == "azimuthal_modes"
-                        else magnet.study.mesh.block_size_m),
+        element_size_m=_element_size(magnet, route),
         points=points, field=base, changes=np.array(
             [np.linalg.norm(first - second, axis=1) for first, second in pairs.values()]))
 
@@ -189,16 +200,26 @@ def variants_to_compare(magnet: Magnet, points: Floats) -> dict[str, Magnet]:
     """Return the magnets that `verify` solves at the points (n, 3) in m, by a description.
 
     They are the magnet with the study's mesh, with a coarser and a finer one, with a farther
-    boundary, and with the dual formulation if the route has one.
+    boundary if there is one, and with the dual formulation if the route has one.
     """
     route = choose_route(magnet, points)
-    variants = {
-        "the study's mesh": magnet, "a coarser mesh": refined(magnet, 1 / REFINEMENT),
-        "a finer mesh": refined(magnet, REFINEMENT),
-        "a farther boundary": farther(magnet, MESHES[route], REFINEMENT)}
+    variants = {OWN: magnet, COARSER: refined(magnet, 1 / REFINEMENT),
+                FINER: refined(magnet, REFINEMENT)}
+    if route != "moments":
+        variants[FARTHER] = farther(magnet, MESHES[route], REFINEMENT)
     if route in DUAL:
         variants[f"the dual route, {DUAL[route]}"] = dual(magnet, route)
     return variants
+
+
+def _element_size(magnet: Magnet, route: str) -> float:
+    """Return the size in m of the elements, or for the method of moments of the cells of blocks."""
+    if route == "azimuthal_modes":
+        return meridian_size(magnet)
+    if route == "moments":
+        smallest = min(block.volume for block in magnet.blocks) ** (1 / 3)
+        return float(smallest / (magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
+    return magnet.study.mesh.block_size_m
 
 
 def observed_order(first: float, second: float) -> float:

@@ -471,7 +471,7 @@ def _reach(magnet: Magnet) -> float:
 def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
     """Return the reference radius in m, by default as `MultipoleReference` describes."""
     positions = magnet.study.observation.positions
-    bore = magnet.array.inner_radius_m
+    bore = magnet.bore_radius
     radius = reference.radius_m
     if radius is None:
         own = positions.radius_m if isinstance(positions, CirclePositions) else ()
@@ -488,7 +488,7 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
 
     They are those of the circle at z, or in 3D with z None those of the field integrated along z.
     """
-    bore = magnet.array.inner_radius_m
+    bore = magnet.bore_radius
     angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
     if magnet.dimension == 3 and z is None:

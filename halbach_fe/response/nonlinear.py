@@ -34,6 +34,7 @@ from halbach_fe.solver.magnetostatics import assemble, solve_samples
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import iron_of
 
 AGREEMENT_T = 1e-8
 """Largest accepted difference in T between readings of the model and of GetDP's Newton method.
@@ -115,10 +116,11 @@ def nonlinear_model(
         If the model does not agree with GetDP.
     """
     if magnet.curve is None:
-        raise StudyError(f"Input `iron_ring.curve` of study {magnet.name} must be given for a "
+        raise StudyError(f"Input `curve` of the iron of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
     check_points(magnet, observation.points)
-    base = _with_vacuum_for_iron(magnet, choose_route(magnet, observation.points))
+    route = _mesh_route(magnet, observation.points)
+    base = _with_vacuum_for_iron(magnet, route)
     linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))
     condensed = condense_to_iron(magnet, observation, session, linear)
     error = _error(magnet, observation, session)
@@ -141,7 +143,7 @@ def condense_to_iron(
     """
     curve = magnet.curve
     assert curve is not None  # the caller has checked it
-    route = choose_route(magnet, observation.points)
+    route = _mesh_route(magnet, observation.points)
     formulation = formulation_of(magnet, route)
     assembly = assemble(_with_vacuum_for_iron(magnet, route), session, formulation)
     mesh, unknowns, size = assembly.mesh, assembly.unknowns, magnet.dimension
@@ -187,7 +189,7 @@ def newton_readings(
     size = magnet.dimension
     samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
     samples[..., :size] = magnetizations.reshape(len(magnetizations), -1, size)
-    route = choose_route(magnet, observation.points)
+    route = _mesh_route(magnet, observation.points)
     fields = solve_samples(magnet, observation.points, samples, session,
                            formulation_of(magnet, route), cold=cold)
     if magnet.study.solver.method == "reaction":
@@ -221,19 +223,30 @@ def compare_with_newton(
     return difference
 
 
+def _mesh_route(magnet: Magnet, points: Floats) -> str:
+    """Return the route of the mesh that holds the iron; ``moments`` has none."""
+    route = choose_route(magnet, points)
+    return "scalar_potential" if route == "moments" else route
+
+
 def _with_vacuum_for_iron(magnet: Magnet, route: str) -> Magnet:
     """Return the magnet with vacuum in place of the iron, on the same mesh.
 
     Symmetry is switched off, so that every block is solved by itself.
     """
-    assert magnet.iron_ring is not None  # only iron has a curve
-    ring = magnet.iron_ring.with_(curve=None, relative_permeability=1.0)
+    study = magnet.study
+    key = "iron_ring" if study.iron_ring is not None else "iron"
+    iron = iron_of(study)
+    assert iron is not None  # only iron has a curve
+    vacuum = iron.with_(curve=None, relative_permeability=1.0)
     solver = {"symmetry": False} | ({} if magnet.dimension == 2 else {"route": route})
-    return magnet.with_(iron_ring=ring, solver=magnet.study.solver.with_(**solver))
+    return magnet.with_(**{key: vacuum}, solver=study.solver.with_(**solver))
 
 
 def _error(magnet: Magnet, observation: Observation, session: Session) -> Floats:
     """Return the error bar of the finite elements, (readings,) in T, for the nominal magnet."""
+    if magnet.dimension == 3:  # by the mesh of the model, whose error it is
+        magnet = magnet.with_(solver__route=_mesh_route(magnet, observation.points))
     parts = finite_element_part(magnet, observation.points, replace(
         session, folder=session.folder / "nominal"), columns=False)
     return reading_errors(magnet, observation, parts, error_bar_session(session))

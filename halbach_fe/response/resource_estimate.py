@@ -25,7 +25,6 @@ from scipy.sparse.linalg import splu
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
-from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -309,7 +308,10 @@ def check_domain(magnet: Magnet, points: Floats) -> None:
     """Refuse points (n, 3) outside the mesh that the solver will make, as it does itself."""
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return
-    kind = MESHES[choose_route(magnet, points)]
+    route = choose_route(magnet, points)
+    if route == "moments":  # the blocks need no boundary
+        return
+    kind = MESHES[route]
     half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
     check_inside(magnet.name, boundary_radius(magnet, kind), half_length, points)
 
@@ -344,7 +346,7 @@ def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Pro
         magnet.study.solver.edge_order]}.get(size.route, FACTORIZED)
     if size.route == "scalar_potential" and size.unknowns > formulation.factorized:
         law = ITERATED
-        if magnet.iron_ring is not None:
+        if magnet.iron:
             law = replace(law, solve_s=IRON_ITERATIONS * law.solve_s)
     matrices, solves = size.matrices, size.solves
     if size.newton:
@@ -410,16 +412,16 @@ def _places(magnet: Magnet, points: Floats) -> float:
     their fields (`halbach_fe.solver.exact_block_field.unit_fields`). Positions are counted for the
     blocks of a single ring and a sample of the points, and scaled up.
     """
-    slots = np.arange(1, magnet.array.blocks_per_ring + 1)
-    sample = points[:COUNTED_PLACES // len(slots) + 1]
-    middles = np.radians([position_angle_deg(magnet.array, slot) for slot in slots.tolist()])
+    ring = magnet.blocks[:magnet.blocks_by_ring[0]]
+    sample = points[:COUNTED_PLACES // len(ring) + 1]
+    middles = np.radians([block.angle_deg for block in ring])
     turn = np.arctan2(sample[:, 1], sample[:, 0])[:, None] - middles
     turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
     r = np.hypot(sample[:, 0], sample[:, 1])[:, None]
     z = np.broadcast_to(sample[:, 2:], turn.shape)
     different, _ = unique_points(np.column_stack(
         [x.ravel() for x in (r * np.cos(turn), r * np.sin(turn), z)]).round(9))
-    return magnet.array.rings * len(different) * len(points) / len(sample)
+    return len(magnet.blocks) / len(ring) * len(different) * len(points) / len(sample)
 
 
 def machine_speed() -> float:

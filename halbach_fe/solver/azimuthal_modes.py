@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import make_folder
-from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -83,20 +82,30 @@ NO_REMANENCE = 1e-12
 remanence is smaller, which are rounding errors and are not solved for."""
 
 
-def is_axisymmetric(magnet: Magnet, points: Floats) -> bool:
-    """Tell whether the materials are rotationally symmetric and few modes suffice at the points.
+def is_axisymmetric(magnet: Magnet) -> bool:
+    """Tell whether the materials are rotationally symmetric.
 
     The magnet must be 3D, of sectors without angular gaps and of one isotropic permeability in each
-    ring, with linear iron or none. At the points (n, 3) in m at most `MAX_MODES` modes may matter.
+    ring, with linear iron or none.
     """
-    block = magnet.array.block
-    if magnet.dimension != 3 or block.shape != "sector" or block.angular_gap_deg:
+    if magnet.dimension != 3 or magnet.is_nonlinear or magnet.array.free_blocks is not None:
         return False
-    if magnet.is_nonlinear or not all(block.isotropic for block in magnet.blocks):
+    if not magnet.iron_is_axisymmetric or not all(block.isotropic for block in magnet.blocks):
         return False
-    permeability = np.array([b.recoil_permeability for b in magnet.blocks])
-    by_ring = permeability.reshape(magnet.array.rings, -1)
-    return bool((by_ring == by_ring[:, :1]).all()) and modes_needed(magnet, points) <= MAX_MODES
+    shapes = [ring.block or magnet.array.block for ring in magnet.array.ring] or [
+        magnet.array.block]
+    if any(shape.shape != "sector" or shape.angular_gap_deg for shape in shapes):
+        return False
+    permeability = magnet.by_ring(np.array([b.recoil_permeability for b in magnet.blocks]))
+    alike = np.nanmax(permeability, axis=1) == np.nanmin(permeability, axis=1)
+    return bool(alike.all())
+
+
+def few_modes_suffice(magnet: Magnet, points: Floats) -> NDArray[np.bool_]:
+    """Tell at which points (n, 3) in m at most `MAX_MODES` modes matter, if the route applies."""
+    if not is_axisymmetric(magnet):
+        return np.zeros(len(points), bool)
+    return np.asarray(mode_decay(magnet, points) <= MODE_TOLERANCE ** (1 / MAX_MODES))
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
@@ -106,16 +115,21 @@ def modes_needed(magnet: Magnet, points: Floats) -> int:
 
 
 def mode_decay(magnet: Magnet, points: Floats) -> Floats:
-    """Return the factor (n,) by which the field at each point falls from one mode to the next."""
-    array = magnet.array
-    r, z = np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])
-    beyond = np.maximum(z - magnet.array_half_length, 0)
-    # with inner radius ri and outer radius ro: r/ri in the bore, ro/r outside the array, and in
-    # between an exponential of the distance beyond the ends
-    decay = np.where(r < array.inner_radius_m, r / array.inner_radius_m,
-                     np.where(r > array.outer_radius_m, array.outer_radius_m / np.maximum(r, 1e-9),
-                              np.exp(-beyond / array.outer_radius_m)))
-    return np.asarray(decay)
+    """Return the factor (n,) by which the field at each point falls from one mode to the next.
+
+    The potential of mode m of a charged circle of radius s, at a distance dz along the axis, is
+    proportional to the Legendre function Q_(m-1/2)(x) with x = (r^2 + s^2 + dz^2) / (2 r s)
+    (H. S. Cohl and J. E. Tohline, Astrophys. J. 527 (1999) 86). It falls by exp(-arcosh x) from one
+    mode to the next: by r/s inside the circle in its plane. The nearest circle of each ring counts.
+    """
+    r = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
+    decay = np.zeros(len(points))
+    for (low, high), (inner, outer) in magnet.ring_sections:
+        distance = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0)
+        source = np.clip(np.hypot(r, distance), inner, outer)
+        x = (r**2 + source**2 + distance**2) / (2 * r * source)
+        decay = np.maximum(decay, x - np.sqrt(np.maximum(x**2 - 1, 0)))
+    return decay
 
 
 @dataclass(frozen=True)
@@ -125,6 +139,8 @@ class _Ring:
     Attributes
     ----------
     recoil_permeability : float
+    half_angle : float, in rad
+        Half the angle of a block.
     rank : int
         Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings.
     along, across, axial : list of float, in T
@@ -133,6 +149,7 @@ class _Ring:
     """
 
     recoil_permeability: float
+    half_angle: float
     rank: int
     along: list[float]
     across: list[float]
@@ -209,9 +226,8 @@ def solve_modes(
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
         The nominal array, then block by block, axis by axis.
     """
-    array = magnet.array
     r = np.hypot(points[:, 0], points[:, 1])
-    r[r < AXIS_RADIUS * array.inner_radius_m] = 0.0
+    r[r < AXIS_RADIUS * magnet.bore_radius] = 0.0
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
     highest = modes_needed(magnet, points)
     mesh: VerifiedMesh | CountedMesh
@@ -220,7 +236,7 @@ def solve_modes(
     else:
         mesh = count_mesh(magnet, "meridian")
     check_inside(magnet.name, mesh.radius, mesh.half_length, points)
-    solved = tuple(sorted({number // array.blocks_per_ring for number in blocks}))
+    solved = tuple(sorted({magnet.blocks[number].ring - 1 for number in blocks}))
     weights = nominal_waves(magnet, highest)
     case = _Case(magnet, mesh, weights, solved, meridian)
     spans = spans_of(weights, bool(blocks),
@@ -286,7 +302,7 @@ def nominal_waves(magnet: Magnet, highest: int) -> Floats:
         component 0 is along the blocks' middles, 1 across them, 2 along z.
     """
     m = np.arange(highest + 1)
-    waves = np.zeros((highest + 1, 2, magnet.array.rings, 3))
+    waves = np.zeros((highest + 1, 2, len(magnet.blocks_by_ring), 3))
     for block in magnet.blocks:
         middle = _middle(magnet, block)
         x, y, axial = block.remanence * np.array(block.easy_axis)
@@ -306,13 +322,15 @@ def nominal_waves(magnet: Magnet, highest: int) -> Floats:
 
 def _middle(magnet: Magnet, block: MagnetBlock) -> float:
     """Return the angle in rad of a block's middle."""
-    return float(np.radians(position_angle_deg(magnet.array, block.slot)))
+    return float(np.radians(block.angle_deg))
 
 
 def _rings(case: _Case) -> list[_Ring]:
     """Return the data of all rings for the template of the problem."""
-    blocks = case.magnet.blocks[::case.magnet.array.blocks_per_ring]
-    return [_Ring(block.recoil_permeability,
+    magnet = case.magnet
+    blocks = [magnet.blocks[magnet.number_of(ring, 1)]
+              for ring in range(1, len(magnet.blocks_by_ring) + 1)]
+    return [_Ring(block.recoil_permeability, np.pi / magnet.blocks_by_ring[ring],
                   case.solved.index(ring) + 1 if ring in case.solved else 0,
                   *(case.weights[:, :, ring, component].ravel().tolist()
                     for component in range(3)))
@@ -417,7 +435,7 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     def gradients(located: Located, chosen: NDArray[np.floating]) -> Floats:
         value, (along_r, along_z) = nodal_operators(case.real_mesh, located, unknowns)
         r = coordinates(case.real_mesh, located)[:, 0]
-        r[r < AXIS_RADIUS * case.magnet.array.inner_radius_m] = np.inf  # see _limit_on_axis
+        r[r < AXIS_RADIUS * case.magnet.bore_radius] = np.inf  # see _limit_on_axis
         return np.stack([apply_operator(along_r, chosen), apply_operator(value, chosen) / r,
                          apply_operator(along_z, chosen)], axis=2)
 

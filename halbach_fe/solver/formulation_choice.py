@@ -3,14 +3,15 @@
 The problem is magnetostatics without currents: curl H = 0 and div B = 0, with B = mu_0 mu_r H + B_r
 in the blocks and a linear or non-linear law in the iron. Four routes solve it by finite elements:
 ``cross_section`` (2D, vector potential), ``azimuthal_modes`` (rotationally symmetric materials,
-scalar potential), ``scalar_potential`` and ``edge_elements`` (3D, vector potential).
+scalar potential), ``scalar_potential`` and ``edge_elements`` (3D, vector potential). The route
+``moments`` divides only the blocks into cells, and solves the iron by azimuthal modes.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
-from halbach_fe.solver.azimuthal_modes import is_axisymmetric, solve_modes
+from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulations import (
@@ -35,6 +36,7 @@ from halbach_fe.solver.magnetostatics import (
     solve_sources,
     solve_tangent,
 )
+from halbach_fe.solver.separate_blocks import applies, separate_columns, solve_separate
 from halbach_fe.solver.session import Session
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -60,6 +62,10 @@ PLACED_TOLERANCE_LOWEST_ORDER = 0.5
 """The same as `PLACED_TOLERANCE` for edge elements of order 1, whose error was measured to be 5 %
 (20 mm) to 35 % (50 mm). Only blocks of the wrong sign or rotated the wrong way, which make a
 difference of 100 % and more, are detected with certainty."""
+
+MOMENTS_TOLERANCE = 0.1
+"""The same tolerance for the route ``moments``. The columns have a single cell per block, and leave
+out what blocks and iron answer to each other; the difference goes into the error bar."""
 
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
@@ -88,14 +94,14 @@ class ElementFields:
         The value to which the blocks must add up: ``nominal``, or with non-linear iron the
         derivative of the field along the nominal magnetization.
     sources : tuple of MagnetBlock
-        The blocks of the array for which single blocks were solved. It may be a stand-in for the
-        magnet, see `axisymmetric_stand_in`.
+        The blocks of the array for which single blocks were solved.
     block : callable
         Takes the number of a block, from 0, and indices (k,) of points or a slice. Returns the
         finite-element part (k, 3, D) of the block's B there in T per T of remanence along each of
         the D axes. By symmetry several blocks share one solve.
     error : ndarray, shape (n, 3), in T, or None
-        Discretization error of ``nominal`` if the solve already yields it, else None.
+        Discretization error of ``nominal`` where the solve already yields it, NaN elsewhere; None
+        if it is known nowhere.
     """
 
     superposition_tolerance: float
@@ -130,12 +136,6 @@ def vacuum_part(magnet: Magnet, points: Floats) -> Floats:
     return external + field_of(magnet.blocks, points)
 
 
-def is_vacuum(magnet: Magnet) -> bool:
-    """Tell whether all materials have the permeability of vacuum, so that the exact field is B."""
-    return magnet.iron_ring is None and all(
-        block.isotropic and block.recoil_permeability == 1.0 for block in magnet.blocks)
-
-
 def finite_element_part(
     magnet: Magnet, points: Floats, session: Session, columns: bool = True
 ) -> ElementFields:
@@ -156,12 +156,11 @@ def finite_element_part(
         return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, magnet.blocks,
                              lambda number, some: np.zeros((len(points[some]), 3, size)))
     route = choose_route(magnet, points)
+    if route == "moments":
+        return _by_moments(magnet, points, session, columns)
     if not columns:
         nominal = _solve_nominal(magnet, points, session, route)
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved)
-    near = axisymmetric_stand_in(magnet, route, points)
-    if near is not None:
-        return _with_axisymmetric_columns(near, magnet, points, session)
     placed = uses_symmetry(magnet)
     symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
     places, index = symmetry.source_points(points)
@@ -186,6 +185,62 @@ def finite_element_part(
                          magnet.blocks, block)
 
 
+def _by_moments(
+    magnet: Magnet, points: Floats, session: Session, columns: bool
+) -> ElementFields:
+    """Return the reaction of separate blocks and rotationally symmetric iron.
+
+    Where the materials are rotationally symmetric, azimuthal modes serve all points but those
+    that would need too many modes, because they are so near to the blocks.
+    """
+    few = few_modes_suffice(magnet, points)
+    if magnet.study.solver.route == "auto" and few.any():
+        parts = [(np.flatnonzero(chosen), finite_element_part(
+            magnet.with_(solver__route=route), points[chosen], session.within(route), columns))
+            for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
+        return _joined(magnet, points, parts)
+    if session.counter is not None:
+        zero = np.zeros((len(points), 3))
+        return ElementFields(np.nan, zero, zero, magnet.blocks, _not_solved, zero)
+    solved = solve_separate(magnet, session)
+    nominal, error = solved.field_with_errors(points)
+    if not columns:
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
+    block = separate_columns(magnet, points, solved.iron)
+    along = nominal
+    if magnet.is_nonlinear:  # the columns are derivatives at the nominal magnet
+        along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
+                     for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
+    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error)
+
+
+def _joined(
+    magnet: Magnet, points: Floats, parts: Sequence[tuple[Ints, ElementFields]]
+) -> ElementFields:
+    """Return the fields at all points (n, 3) from those that several routes have at some.
+
+    ``parts`` has the numbers of the points and the fields of each route.
+    """
+    nominal, along, error = (np.zeros((len(points), 3)) for _ in range(3))
+    for numbers, fields in parts:
+        nominal[numbers], along[numbers] = fields.nominal, fields.along_nominal
+        error[numbers] = np.nan if fields.error is None else fields.error
+    rank = np.empty(len(points), int)
+    owner = np.empty(len(points), int)
+    for number, (numbers, _) in enumerate(parts):
+        rank[numbers], owner[numbers] = np.arange(len(numbers)), number
+
+    def block(number: int, some: Ints | slice) -> Floats:
+        found = np.zeros((len(points[some]), 3, 3))
+        for part, (_, fields) in enumerate(parts):
+            here = owner[some] == part
+            found[here] = fields.block(number, rank[some][here])
+        return found
+
+    return ElementFields(max(fields.superposition_tolerance for _, fields in parts), nominal, along,
+                         magnet.blocks, block, error)
+
+
 def uses_symmetry(magnet: Magnet) -> bool:
     """Tell whether only some blocks are solved for, and the others obtained by symmetry.
 
@@ -193,50 +248,6 @@ def uses_symmetry(magnet: Magnet) -> bool:
     geometry, since its tangent depends on the field.
     """
     return magnet.study.solver.symmetry and magnet.dimension == 3 and not magnet.is_nonlinear
-
-
-def axisymmetric_stand_in(magnet: Magnet, route: str, points: Floats) -> Magnet | None:
-    """Return the magnet `without_gaps` if its single blocks can approximate those of the magnet.
-
-    It must be axisymmetric although the magnet itself is not, and the route must have been chosen
-    automatically. Otherwise return None. `_with_axisymmetric_columns` describes the approximation.
-    """
-    near = without_gaps(magnet)
-    chosen = magnet.study.solver.route == "auto" and route == "scalar_potential"
-    return near if chosen and is_axisymmetric(near, points) else None
-
-
-def without_gaps(magnet: Magnet) -> Magnet:
-    """Return the magnet with one isotropic permeability, and without gaps between sectors."""
-    array = magnet.array
-    exceptions = tuple(
-        exception.with_(recoil_permeability=None, recoil_permeability_across=None)
-        for exception in array.exceptions)
-    block = array.block
-    if block.shape == "sector":
-        block = block.with_(angular_gap_deg=0.0)
-    return magnet.with_(
-        array=array.with_(block=block, exceptions=exceptions, recoil_permeability_across=None))
-
-
-def _with_axisymmetric_columns(
-    near: Magnet, magnet: Magnet, points: Floats, session: Session
-) -> ElementFields:
-    """Solve for the nominal array on a 3D mesh, and for single blocks in an axisymmetric stand-in.
-
-    Azimuthal modes solve for the single blocks of ``near``. Single blocks only describe the
-    deviations from the nominal magnetization, of the order of a per cent, and the reaction to a
-    block is some per cent of its field, so that the difference between the two arrays matters
-    little. The discretization error of the nominal array is taken from the stand-in, for which both
-    the 3D mesh and the much more accurate azimuthal modes give a result.
-    """
-    base = finite_element_part(near, points, session)
-    nominal, same_mesh = (
-        _solve_nominal(array, points, replace(session.within(name), purpose=purpose),
-                       "scalar_potential")
-        for array, name, purpose in ((magnet, "as-it-is", "the magnet on a 3D mesh"),
-                                   (near, "simpler", "its axisymmetric stand-in on a 3D mesh")))
-    return replace(base, nominal=nominal, error=same_mesh - base.nominal)
 
 
 def _superposition_tolerance(magnet: Magnet, route: str, placed: bool) -> float:
@@ -286,17 +297,31 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
     """
     if magnet.dimension == 2:
         return "cross_section"
-    asked, symmetric = magnet.study.solver.route, is_axisymmetric(magnet, points)
+    asked = magnet.study.solver.route
+    symmetric = is_axisymmetric(magnet) and bool(few_modes_suffice(magnet, points).all())
     if asked == "azimuthal_modes" and not symmetric:
         raise StudyError(
             f"Input `solver.route` of study {magnet.name} must be another route; instead received "
             "azimuthal_modes, which needs sectors without angular gaps, of one isotropic "
             "permeability in each ring, linear iron, and points that are not too near to the "
             "blocks. Leave the key out.")
+    if asked == "moments" and not applies(magnet):
+        raise StudyError(
+            f"Input `solver.route` of study {magnet.name} must be another route; instead received "
+            "moments, which needs the method reaction and iron of coaxial tubes or discs. Leave "
+            "the key out.")
     if asked == "auto":
         if magnet.study.solver.method == "direct":
-            return "edge_elements"
-        return "azimuthal_modes" if symmetric else "scalar_potential"
+            asked = "edge_elements"
+        elif symmetric:
+            asked = "azimuthal_modes"
+        else:
+            asked = "moments" if applies(magnet) else "scalar_potential"
+    if asked in ("edge_elements", "scalar_potential") and not magnet.array.is_uniform:
+        raise StudyError(
+            f"Input `array` of study {magnet.name} must consist of equal rings for the route "
+            f"{asked.replace('_', ' ')}; instead it has rings of their own or free blocks. Use the "
+            "method reaction, and iron of coaxial tubes or discs.")
     return asked
 
 
@@ -334,7 +359,10 @@ def check_points(
             f"Input `{key}` of study {magnet.name} must lie in air; instead "
             f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
             f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
-    mesh = MESHES[choose_route(magnet, points)]
+    route = choose_route(magnet, points)
+    if route == "moments":  # the blocks need no boundary
+        return
+    mesh = MESHES[route]
     directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
              boundary_radius(magnet, mesh))]
     if magnet.dimension == 3:

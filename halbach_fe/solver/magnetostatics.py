@@ -323,7 +323,7 @@ def render(template: str, *, magnet: Magnet, **data: object) -> str:
         autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
     return environment.from_string(source).render(
         study=magnet.study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=magnet.blocks,
-        iron_permeability=magnet.iron_ring.relative_permeability if magnet.iron_ring else 1.0,
+        iron_permeability=magnet.iron_permeability,
         **data)
 
 

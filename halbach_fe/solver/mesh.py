@@ -157,7 +157,7 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
 
 def meridian_size(magnet: Magnet) -> float:
     """Return the element size in m at the magnet in the mesh of the (r, z) half-plane."""
-    thickness = magnet.array.outer_radius_m - magnet.array.inner_radius_m
+    thickness = min(radii[1] - radii[0] for _, radii in magnet.ring_sections)
     return magnet.study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
 
 

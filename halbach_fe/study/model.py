@@ -10,21 +10,25 @@ neither ``B_r / mu_0`` nor the magnetization at the working point.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
+from halbach_fe.study.array import Array
 from halbach_fe.study.inference import Inference, Plan, Prior
-from halbach_fe.study.magnet import Array, Demagnetization, External, IronRing
+from halbach_fe.study.iron import Iron, IronMaterial, IronRing
+from halbach_fe.study.magnet import Demagnetization, External
+from halbach_fe.study.material_keys import STRENGTHS, grade_of
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 
-FIELD_KEYS = {"dimension", "array", "iron_ring", "external", "mesh", "open_boundary", "solver"}
+FIELD_KEYS = {"dimension", "array", "iron_ring", "iron", "external", "mesh", "open_boundary",
+              "solver"}
 """Keys of a study that its computed field depends on."""
 
 
@@ -36,6 +40,7 @@ class Study(StudyModel):
     dimension: Literal[2, 3] = 3
     array: Array
     iron_ring: IronRing | None = None
+    iron: Iron | None = None
     external: External = External()
     instrument: Instrument = Instrument()
     mesh: MeshSettings
@@ -48,12 +53,34 @@ class Study(StudyModel):
     plan: Plan = Plan()
     demagnetization: Demagnetization | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _with_grade(cls, given: Any) -> Any:
+        """Fill in what the grade of the array's material says about prior and demagnetization."""
+        if not isinstance(given, dict) or not isinstance(array := given.get("array"), dict):
+            return given  # a validated array has been through here
+        found = grade_of(array)
+        if found is None:
+            return given
+        values = dict(given)
+        prior = values.get("prior", {})
+        if isinstance(prior, dict) and all(array.get(key) is None for key in STRENGTHS):
+            values["prior"] = {"common_mode_sd": found.remanence_sd} | prior
+        demagnetization = values.get("demagnetization")
+        if isinstance(demagnetization, dict):
+            values["demagnetization"] = found.demagnetization_defaults | demagnetization
+        return values
+
     @model_validator(mode="after")
     def _consistent(self) -> Study:
-        if self.dimension == 3 and self.array.ring_length_m is None:
+        if self.dimension == 3 and self.array.rings and self.array.ring_length_m is None and not (
+                self.array.ring and all(ring.ring_length_m for ring in self.array.ring)):
             raise ValueError("a 3D study needs array.ring_length_m")
-        if self.dimension == 2 and self.array.rings != 1:
+        if self.dimension == 2 and self.array.rings > 1 and not self.array.ring:
             raise ValueError("a 2D study is a cross-section: array.rings must be 1")
+        if self.iron_ring is not None and self.iron is not None:
+            raise ValueError("give either iron_ring or iron, of which a ring can be one of the "
+                             "bodies")
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
             "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),
@@ -63,9 +90,10 @@ class Study(StudyModel):
                 raise ValueError(f"{key} may name components of flux_density only; Fourier "
                                  "coefficients have none")
         slots = sorted(slot for members in self.prior.types.values() for slot in members)
-        if self.prior.types and slots != list(range(1, self.array.blocks_per_ring + 1)):
-            raise ValueError(f"prior.types must name every slot from 1 to "
-                             f"{self.array.blocks_per_ring} once, but names {slots}")
+        most = max(self.array.blocks_by_ring)
+        if self.prior.types and slots != list(range(1, most + 1)):
+            raise ValueError(f"prior.types must name every slot from 1 to {most} once, but names "
+                             f"{slots}")
         for name, size in self.mesh:
             if name.endswith("size_m") and size is not None and size > self.array.outer_radius_m:
                 raise ValueError(f"mesh.{name} ({size}) must not be larger than the array "
@@ -75,18 +103,25 @@ class Study(StudyModel):
 
 def is_nonlinear(study: Study) -> bool:
     """Tell whether the field is a non-linear function of the magnetizations (iron with a curve)."""
-    return study.iron_ring is not None and study.iron_ring.curve is not None
+    iron = iron_of(study)
+    return iron is not None and iron.curve is not None
+
+
+def iron_of(study: Study) -> IronMaterial | None:
+    """Return the material of the study's iron, or None if it has no iron."""
+    return study.iron_ring or study.iron
 
 
 def curve_of(study: Study) -> Curve | None:
-    """Return the magnetization curve of the iron ring, or None if it has none.
+    """Return the magnetization curve of the iron, or None if it has none.
 
     Raises
     ------
     StudyError
         If the curve is in a file that has not been read (`read_study` reads it).
     """
-    curve = study.iron_ring and study.iron_ring.curve
+    iron = iron_of(study)
+    curve = iron and iron.curve
     if not curve:
         return None
     if curve.kind == "brauer":
@@ -99,7 +134,7 @@ def curve_of(study: Study) -> Curve | None:
     elif curve.file is None:
         table = curve.H_A_per_m, curve.B_T
     else:  # the folder that the path is relative to is not known here
-        raise StudyError(must_be("`iron_ring.curve.file`", f"study {study.name}",
+        raise StudyError(must_be("`curve.file` of the iron", f"study {study.name}",
                                  "read together with the study's own file", f"'{curve.file}'",
                                  "Use read_study, or give H_A_per_m and B_T."))
     return materials.table_curve(np.array(table[0]), np.array(table[1]))

@@ -15,8 +15,10 @@ from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.magnet import TableCurve
-from halbach_fe.study.model import Study
+from halbach_fe.study.free_blocks import MAX_PATH
+from halbach_fe.study.free_blocks_file import free_blocks_of_file
+from halbach_fe.study.iron import TableCurve
+from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import MIN_LENGTH_M
 
 MAX_WRONG_UNIT = 1e9
@@ -29,8 +31,8 @@ def read_study(path: str | Path) -> Study:
     Parameters
     ----------
     path : str or Path
-        A TOML file. If it names a file with the H(B) curve of the iron, that file is read too; its
-        path is relative to the folder of the study file.
+        A TOML file. If it names a file with the H(B) curve of the iron, or a table of free blocks,
+        that file is read too; its path is relative to the folder of the study file.
 
     Returns
     -------
@@ -78,6 +80,7 @@ def read_study(path: str | Path) -> Study:
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
         ) from None
+    document = _with_free_blocks(document, path.parent, where)
     return _with_table(parse_study(document, where), path.parent, where)
 
 
@@ -89,27 +92,41 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
         raise StudyError(_sentence(error, where)) from None
 
 
+def _with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
+    """Return the document with the table of free blocks in place of its file's name."""
+    array = document.get("array")
+    free = array.get("free_blocks") if isinstance(array, dict) else None
+    file = free.get("file") if isinstance(free, dict) else None
+    if not (isinstance(file, str) and file.isprintable() and 0 < len(file) <= MAX_PATH):
+        return document  # the validation says what is wrong
+    if len(free) > 1:
+        raise StudyError(must_be("`array.free_blocks`", where, "either a file or columns", "both"))
+    table = free_blocks_of_file(folder / file, f" of {where}")
+    return document | {"array": array | {"free_blocks": table}}
+
+
 def _with_table(study: Study, folder: Path, where: str) -> Study:
     """Return the study with the numbers of its H(B) file in place of the file's name."""
-    ring = study.iron_ring
-    if ring is None or ring.curve is None or ring.curve.kind != "table" or not ring.curve.file:
+    key = "iron_ring" if study.iron_ring is not None else "iron"
+    iron = iron_of(study)
+    if iron is None or iron.curve is None or iron.curve.kind != "table" or not iron.curve.file:
         return study
-    path = folder / ring.curve.file
+    path = folder / iron.curve.file
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise ValueError("it must be a file")  # reading a device might never end
         field, flux_density = materials.read_table(path)
         table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:
-        raise StudyError(must_be("`iron_ring.curve.file`", where, "a readable file",
+        raise StudyError(must_be(f"`{key}.curve.file`", where, "a readable file",
                                  f"{str(path)!r} ({error.strerror})",
                                  "Give its path from the study's folder.")) from None
     except ValueError as error:
         reason = (error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
                   if isinstance(error, ValidationError) else error)
-        raise StudyError(must_be("`iron_ring.curve.file`", where, "a table of H(B)",
+        raise StudyError(must_be(f"`{key}.curve.file`", where, "a table of H(B)",
                                  f"{str(path)!r}, which cannot be used: {reason}")) from None
-    return study.with_(iron_ring=ring.with_(curve=table))
+    return study.with_(**{key: iron.with_(curve=table)})
 
 
 def _sentence(error: ValidationError, where: str) -> str:

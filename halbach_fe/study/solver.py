@@ -17,6 +17,9 @@ class MeshSettings(StudyModel):
     unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the cross-section
     is extruded along z, in ``layers_per_ring`` layers per ring.
 
+    ``cells_per_side`` divides separate blocks for the method of moments: the number of cells along
+    the sides of a cube (default: 2).
+
     ``meridian_size_m`` is the size in the mesh of the (r, z) half-plane, which is used for
     rotationally symmetric materials (default: a twelfth of the blocks' radial thickness).
     """
@@ -24,6 +27,7 @@ class MeshSettings(StudyModel):
     block_size_m: Length
     bore_size_m: Length | None = None
     layers_per_ring: Annotated[int, Field(ge=1, le=100)] = 2
+    cells_per_side: Annotated[int, Field(ge=1, le=16)] | None = None
     meridian_size_m: Length | None = None
     growth: Annotated[float, Field(gt=1.0, le=4.0)] = 1.4
 
@@ -49,14 +53,19 @@ class SolverSettings(StudyModel):
     of the azimuth, and needs rotationally symmetric materials (sector blocks without gaps).
     ``edge_elements`` solves the curl-curl equation of the vector potential, for any geometry;
     ``edge_order`` is the order of its elements. ``scalar_potential`` solves the dual problem with
-    nodal elements of second order, for any geometry too. ``auto`` takes azimuthal modes where
-    possible and the scalar potential elsewhere, and edge elements for ``method = "direct"``.
+    nodal elements of second order, for any geometry too. These two take the rings to be equal.
+    ``moments`` divides the blocks into cells instead of meshing space (method of moments), and
+    solves rotationally symmetric iron by azimuthal modes; it is the most accurate for separate
+    blocks, and takes each where it is mounted. ``auto`` takes azimuthal modes where possible and
+    moments elsewhere, reading by reading, the scalar potential if the iron is not rotationally
+    symmetric, and edge elements for ``method = "direct"``.
 
     With ``symmetry`` the field of only one block is computed of all those that a rotation or
     reflection of the magnet maps onto one another.
     """
 
     method: Literal["reaction", "direct"] = "reaction"
-    route: Literal["auto", "azimuthal_modes", "edge_elements", "scalar_potential"] = "auto"
+    route: Literal["auto", "azimuthal_modes", "moments", "edge_elements",
+                   "scalar_potential"] = "auto"
     edge_order: Literal[1, 2] = 1
     symmetry: bool = True

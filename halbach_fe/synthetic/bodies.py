@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.magnet import Array, IronRing
+from halbach_fe.study.array import Array
+from halbach_fe.study.iron import IronRing
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 

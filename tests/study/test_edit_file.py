@@ -14,7 +14,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.study import edit_file
 from halbach_fe.study.edit_file import REWRITTEN_NOTE, edited_text
-from halbach_fe.study.magnet import IronRing, SteelCurve
+from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import ROOT
 

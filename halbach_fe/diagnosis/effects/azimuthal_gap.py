@@ -30,6 +30,10 @@ class AzimuthalGapEffect(Effect):
     kind = "field"
     parameters = (Parameter("gap", "m", 2e-4),)
 
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return [Place()] if study.array.is_uniform else []
+
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         step = 1e-4  # small enough for the field to be linear in the gap

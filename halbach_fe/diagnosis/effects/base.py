@@ -17,7 +17,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -202,14 +202,14 @@ def blocks_at(nominal: NominalFields, place: Place) -> list[int]:
 
 def each_block(study: Study) -> list[Place]:
     """Return a place for every block."""
-    array = study.array
-    return [Place(ring, slot) for ring in range(1, array.rings + 1)
-            for slot in range(1, array.blocks_per_ring + 1)]
+    return [Place(ring, slot) for ring, count in enumerate(study.array.blocks_by_ring, start=1)
+            for slot in range(1, count + 1)]
 
 
 def each_ring(study: Study) -> list[Place]:
     """Return a place for every ring; none in two dimensions."""
-    return [] if study.dimension == 2 else [Place(ring) for ring in range(1, study.array.rings + 1)]
+    count = len(study.array.blocks_by_ring)
+    return [] if study.dimension == 2 else [Place(ring) for ring in range(1, count + 1)]
 
 
 def with_remanence(study: Study) -> Study:

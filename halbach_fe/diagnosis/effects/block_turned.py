@@ -16,9 +16,8 @@ from halbach_fe.diagnosis.effects.base import (
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 
@@ -39,8 +38,7 @@ class BlockTurnedEffect(Effect):
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         (block,) = blocks_at(nominal, place)
-        axes = rotation_matrix(
-            (0.0, 0.0, np.radians(position_angle_deg(nominal.study.array, place.slot))))
+        axes = rotation_matrix((0.0, 0.0, np.radians(nominal.blocks[block].angle_deg)))
         middle = nominal.blocks[block].middle
         return np.array([nominal.block_rotation_derivative(block, axis, middle) for axis in axes.T])
 

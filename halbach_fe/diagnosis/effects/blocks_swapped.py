@@ -9,10 +9,9 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 SHORTLIST = 40
@@ -37,10 +36,9 @@ class BlocksSwappedEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         """Return pairs of neighbours, as examples; the search uses `shortlist`."""
-        array = study.array
-        return [Place(ring, slot, other=(ring, slot % array.blocks_per_ring + 1))
-                for ring in range(1, array.rings + 1)
-                for slot in range(1, array.blocks_per_ring + 1)]
+        return [Place(ring, slot, other=(ring, slot % count + 1))
+                for ring, count in enumerate(study.array.blocks_by_ring, start=1)
+                for slot in range(1, count + 1)]
 
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
@@ -52,7 +50,7 @@ class BlocksSwappedEffect(Effect):
         at once from the entries of the two blocks.
         """
         blocks, size = build_magnet(study).blocks, study.dimension
-        angles = np.radians([position_angle_deg(study.array, block.slot) for block in blocks])
+        angles = np.radians([block.angle_deg for block in blocks])
         vectors = mean.reshape(len(blocks), size)
         own = np.array([rotation_about_z(-angle)[:size, :size] @ vector
                         for angle, vector in zip(angles, vectors, strict=True)])
@@ -73,11 +71,11 @@ class BlocksSwappedEffect(Effect):
         """See `Effect.signature`."""
         where = [(block.ring, block.slot) for block in nominal.blocks]
         here, there = where.index((place.ring, place.slot)), where.index(place.other)
-        size, array = nominal.study.dimension, nominal.study.array
+        size = nominal.study.dimension
         total = np.zeros_like(nominal.points)
         for to, source in ((here, there), (there, here)):
-            turn = rotation_about_z(np.radians(position_angle_deg(array, where[to][1])
-                                          - position_angle_deg(array, where[source][1])))
+            turn = rotation_about_z(np.radians(
+                nominal.blocks[to].angle_deg - nominal.blocks[source].angle_deg))
             total += nominal.field_with(to, turn[:size, :size] @ nominal.magnetizations[source]
                                       - nominal.magnetizations[to])
         return total[None]

@@ -31,11 +31,12 @@ class FerromagneticObjectEffect(Effect):
         """See `Effect.places`."""
         if study.dimension == 2:
             return []
-        array, half = study.array, build_magnet(study).array_half_length
-        radii = [array.inner_radius_m, array.outer_radius_m, 1.4 * array.outer_radius_m]
+        magnet = build_magnet(study)
+        half, outer = magnet.array_half_length, magnet.array_outer_radius
+        radii = [magnet.bore_radius, outer, 1.4 * outer]
         heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
         ends = [(r, z) for r in radii for z in heights]
-        outside = [(1.2 * array.outer_radius_m, z) for z in np.linspace(-half, half, 7)]
+        outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
         axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
         return axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))

@@ -25,6 +25,10 @@ class InnerRadiusEffect(Effect):
     kind = "field"
     parameters = (Parameter("difference", "m", 3e-4),)
 
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return [Place()] if study.array.is_uniform else []
+
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         step = 1e-4

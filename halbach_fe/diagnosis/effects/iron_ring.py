@@ -10,8 +10,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.magnet import IronRing
-from halbach_fe.study.model import Study
+from halbach_fe.study.iron import IronRing
+from halbach_fe.study.model import Study, iron_of
 
 PERMEABILITY = 1000.0
 """Relative permeability that every candidate ring is given.
@@ -48,7 +48,7 @@ class IronRingEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
-        if study.iron_ring is not None:
+        if iron_of(study) is not None:
             return []
         blocks = build_magnet(study).array_outer_radius
         return [Place(at_m=(blocks + gap, blocks + gap + thickness))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.study.magnet import IronRing, SteelCurve
+from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.model import Study
 
 STEEL = "aisi_1010"

@@ -27,7 +27,7 @@ class LengthEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
-        return [Place()] if study.dimension == 3 else []
+        return [Place()] if study.dimension == 3 and study.array.is_uniform else []
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""

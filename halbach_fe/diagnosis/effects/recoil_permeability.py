@@ -5,8 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_array, with_remanence
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    with_array,
+    with_exceptions,
+    with_remanence,
+)
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 
@@ -30,10 +39,15 @@ class RecoilPermeabilityEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        value = study.array.recoil_permeability + float(values[0])
-        across = study.array.recoil_permeability_across
-        return with_array(with_remanence(study), recoil_permeability=value,
-                          recoil_permeability_across=across)
+        array, change = study.array, float(values[0])
+        if not array.is_uniform:
+            return with_exceptions(study, [BlockException(
+                ring=block.ring, slot=block.slot,
+                recoil_permeability=max(1.0, block.recoil_permeability + change))
+                for block in build_magnet(study).blocks])
+        return with_array(with_remanence(study),
+                          recoil_permeability=array.recoil_permeability + change,
+                          recoil_permeability_across=array.recoil_permeability_across)
 
 
 EFFECTS = (RecoilPermeabilityEffect(),)

@@ -9,7 +9,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 
@@ -36,7 +36,7 @@ class RingGapEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
-        rings = study.array.rings if study.dimension == 3 else 1
+        rings = study.array.rings if study.dimension == 3 and study.array.is_uniform else 1
         return [Place(ring) for ring in range(1, rings)]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

@@ -16,7 +16,7 @@ from halbach_fe.diagnosis.effects.base import (
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 

@@ -11,7 +11,7 @@ from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exc
 from halbach_fe.diagnosis.effects.temperature import coefficient
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.magnet import BlockException
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
 
@@ -34,11 +34,13 @@ class TemperatureGradientEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        exceptions = []
-        for slot in range(1, study.array.blocks_per_ring + 1):
-            middle = build_magnet(study).blocks[slot - 1].middle[:2] / study.array.outer_radius_m
-            exceptions.append(BlockException(slot=slot, magnetization_factor=float(
-                1.0 + coefficient(study) * (middle @ np.asarray(values)))))
+        blocks, exceptions = build_magnet(study).blocks, []
+        uniform = study.array.is_uniform  # then one exception serves a slot of all rings
+        for block in blocks[:study.array.blocks_per_ring] if uniform else blocks:
+            middle = block.middle[:2] / study.array.outer_radius_m
+            exceptions.append(BlockException(
+                ring=None if uniform else block.ring, slot=block.slot, magnetization_factor=float(
+                    1.0 + coefficient(study) * (middle @ np.asarray(values)))))
         return with_exceptions(study, exceptions)
 
 

@@ -1,0 +1,69 @@
+"""The rows of a page's table that describe the magnet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.study.model import iron_of
+
+
+def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
+    """Return name and value of the properties of a magnet that its pages list."""
+    array, blocks = magnet.array, magnet.blocks
+    rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
+            ("radius of the bore, outer radius",
+             f"{magnet.bore_radius:.6g} m, {magnet.array_outer_radius:.6g} m"),
+            ("remanence", f"{_range((abs(block.remanence) for block in blocks), 4)} T"),
+            ("recoil permeability along, across the easy axis",
+             f"{_range((block.recoil_permeability for block in blocks), 3)}, "
+             f"{_range((block.recoil_permeability_across for block in blocks), 3)}"),
+            ("main multipole", str(array.multipole_order))]
+    if magnet.dimension == 3:
+        rows.insert(3, ("length", f"{2 * magnet.array_half_length:.6g} m"))
+    return [*rows, ("iron", iron_description(magnet))]
+
+
+def layout(magnet: Magnet) -> str:
+    """Return the number of rings and blocks in words, for example "3 rings of 16 sectors"."""
+    array = magnet.array
+    count = len(array.blocks_by_ring) if array.free_blocks is None else array.rings
+    texts = []
+    if count:
+        sizes = sorted(set(array.blocks_by_ring[:count]))
+        shapes = dict.fromkeys((ring.block or array.block).shape for ring in array.ring)
+        texts.append(f"{count} ring{'s' * (count > 1)} of {' or '.join(map(str, sizes))} "
+                     f"{', '.join(f'{shape}s' for shape in shapes or [array.block.shape])}")
+    if array.free_blocks is not None:
+        kinds = ", ".join(dict.fromkeys(array.free_blocks.shape))
+        texts.append(f"{len(array.free_blocks)} free blocks ({kinds})")
+    return " and ".join(texts)
+
+
+def iron_description(magnet: Magnet) -> str:
+    """Return the bodies of iron and their material in words."""
+    iron = iron_of(magnet.study)
+    if iron is None:
+        return "none"
+    bodies = []
+    for body in magnet.iron:
+        kind = "tube" if body.outline is None else "prism"
+        length = "" if np.isinf(body.z_max) else f", z {body.z_min:g} to {body.z_max:g} m"
+        bodies.append(f"{kind}, r {body.inner_radius:g} to {body.outer_radius:g} m{length}")
+    more = f" and {len(bodies) - 4} more" if len(bodies) > 4 else ""
+    if iron.curve is None:
+        material = f"relative permeability {iron.relative_permeability:g}"
+    else:
+        material = f"magnetization curve ({iron.curve.kind.replace('_', '–').title()})"
+        if iron.curve.kind == "steel":
+            material = f"steel {iron.curve.name}"
+    return f"{material}; {'; '.join(bodies[:4])}{more}"
+
+
+def _range(values: Iterable[float], digits: int) -> str:
+    """Return the value that all have in common, or the smallest and the largest."""
+    low, high = np.min(found := np.fromiter(values, float)), np.max(found)
+    return f"{low:.{digits}f}" if high - low < 10.0**-digits else (
+        f"{low:.{digits}f} to {high:.{digits}f}")

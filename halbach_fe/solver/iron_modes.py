@@ -1,0 +1,313 @@
+"""Finite elements of rotationally symmetric iron, one azimuthal mode at a time.
+
+GetDP assembles the stiffness of the half-plane in vacuum, K + m^2 L for mode m, see
+pro/iron_modes.pro. It is condensed to the unknowns of the iron: a Schur complement, which is dense
+on the iron's surface and holds all of the space around. The operators of the iron's Gauss points
+give its own part, which depends on the field and is assembled here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
+from numpy.typing import NDArray
+
+from halbach_fe import pro
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import GetDPError, OutputError
+from halbach_fe.core.files import make_folder
+from halbach_fe.solver.azimuthal_modes import unknowns_of
+from halbach_fe.solver.condensed_newton import factorize
+from halbach_fe.solver.dofs import Unknowns, read_matrix, read_solutions, read_unknowns
+from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.interpolation import Located, coordinates, nodal_operators
+from halbach_fe.solver.iron_grid import IronRectangle, Resolution, grid_lines, iron_cells
+from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
+from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
+from halbach_fe.solver.runs import MATRIX_FILE, Task, run_tasks
+from halbach_fe.solver.session import RunSize, Session
+
+Complexes = NDArray[np.complex128]
+
+PROBLEM = "iron_modes.pro"
+MESH = "iron.msh"
+
+MATRIX_TOLERANCE = 1e-9
+"""Largest difference between GetDP's matrix and the one from our Gauss points, relative to its
+largest value. GetDP's Gauss points have 12 digits; another numbering of the unknowns makes a
+difference of order 1."""
+
+
+@dataclass(frozen=True)
+class GaussPoints:
+    """Points of the half-plane, with operators from the unknowns to the gradient there.
+
+    Attributes
+    ----------
+    r, z : ndarray, shape (k,), in m
+    weights : ndarray, shape (k,), in m^3
+        Weights of integrals over r dr dz.
+    value, along_r, along_z : sparse array, shape (k, unknowns)
+        psi_m and its derivatives; divide ``value`` by r for the azimuthal one.
+    """
+
+    r: Floats
+    z: Floats
+    weights: Floats
+    value: sparse.csr_array
+    along_r: sparse.csr_array
+    along_z: sparse.csr_array
+
+    def restricted(self, unknowns: Ints) -> GaussPoints:
+        """Return the same points, with operators on some of the unknowns."""
+        return replace(self, value=self.value[:, unknowns], along_r=self.along_r[:, unknowns],
+                       along_z=self.along_z[:, unknowns])
+
+    @cached_property
+    def over_r(self) -> sparse.csr_array:
+        """The operator psi_m / r."""
+        return sparse.csr_array(sparse.diags_array(1 / self.r) @ self.value)
+
+    def gradient(self, mode: int) -> sparse.csr_array:
+        """Return the operator (3 k, unknowns) to (d/dr, m/r, d/dz) psi_m, one after the other.
+
+        The azimuthal component of the gradient of psi_m exp(i m theta) is i times the second.
+        """
+        return sparse.csr_array(sparse.vstack([self.along_r, mode * self.over_r, self.along_z]))
+
+
+@dataclass(frozen=True)
+class IronModes:
+    """The finite elements of iron in vacuum, for all azimuthal modes.
+
+    Attributes
+    ----------
+    mesh : VerifiedMesh
+    unknowns : Unknowns
+    plain, azimuthal : sparse array, shape (unknowns, unknowns)
+        K and L: the stiffness of mode m is K + m^2 L.
+    on_axis : ndarray of int
+        Unknowns that vanish for m > 0.
+    iron : ndarray of int
+        The unknowns of the iron.
+    gauss : GaussPoints
+        Gauss points of the iron's elements, on its unknowns.
+    body : ndarray of int, shape (k,)
+        Body that each of these points is in.
+    """
+
+    mesh: VerifiedMesh
+    unknowns: Unknowns
+    plain: sparse.csr_array
+    azimuthal: sparse.csr_array
+    on_axis: Ints
+    iron: Ints
+    gauss: GaussPoints
+    body: Ints
+
+    def matrix(self, mode: int) -> sparse.csr_array:
+        """Return the stiffness of a mode; unknowns that vanish have unit rows and columns."""
+        whole = sparse.csr_array(self.plain + mode**2 * self.azimuthal)
+        if mode == 0:
+            return whole
+        kept = np.ones(len(self.plain.indptr) - 1)
+        kept[self.on_axis] = 0
+        keep = sparse.diags_array(kept)
+        return sparse.csr_array(keep @ whole @ keep + sparse.diags_array(1 - kept))
+
+    @cached_property
+    def iron_on_axis(self) -> Ints:
+        """Indices into ``iron`` of the unknowns on the axis."""
+        return np.flatnonzero(np.isin(self.iron, self.on_axis))
+
+    def gradient(self, mode: int) -> sparse.csr_array:
+        """Return `GaussPoints.gradient` in the iron, without the unknowns that vanish."""
+        operator = self.gauss.gradient(mode)
+        if mode == 0 or not len(self.iron_on_axis):
+            return operator
+        kept = np.ones(len(self.iron))
+        kept[self.iron_on_axis] = 0
+        return sparse.csr_array(operator @ sparse.diags_array(kept))
+
+
+@dataclass(frozen=True)
+class Exterior:
+    """The space outside the iron in one mode, condensed to the iron's surface.
+
+    Attributes
+    ----------
+    stiffness : sparse array, shape (iron, iron)
+        Stiffness in vacuum, with all other unknowns eliminated.
+    rest : ndarray of int
+        The unknowns outside the iron, in the order of the factorization.
+    surface : ndarray of int
+        Indices into the iron's unknowns of those on its surface.
+    schur : ndarray, shape (surface, surface)
+        Stiffness of the space outside and of the iron's own vacuum, on the surface.
+    factor : SuperLU
+        Factorized stiffness of ``rest``, followed by the surface.
+    """
+
+    stiffness: sparse.csr_array
+    rest: Ints
+    surface: Ints
+    schur: Floats
+    factor: sparse_linalg.SuperLU
+
+    def extend(self, iron: Complexes) -> Complexes:
+        """Return the potential outside (rest, k) of potentials (iron, k) on the iron's unknowns."""
+        result = np.empty((len(self.rest), iron.shape[1]), complex)
+        right = np.zeros(len(self.rest) + len(self.surface))
+        for number, column in enumerate((self.schur @ iron[self.surface]).T):
+            # SuperLU solves for columns one by one several times faster than for many at once
+            for part, values in ((result.real, column.real), (result.imag, column.imag)):
+                right[len(self.rest):] = values
+                part[:, number] = self.factor.solve(right)[:len(self.rest)]
+        return result
+
+
+def exterior(modes: IronModes, mode: int) -> Exterior:
+    """Eliminate all unknowns of a mode except those of the iron.
+
+    The Schur complement is the product of the last blocks of the triangular factors, since the
+    surface comes last in the order of elimination.
+    """
+    matrix, iron = modes.matrix(mode), modes.iron
+    rest = np.setdiff1d(np.arange(matrix.shape[0]), iron)
+    rows = matrix[rest]
+    surface = np.flatnonzero(np.diff(rows[:, iron].tocsc().indptr))
+    rest = rest[np.argsort(factorize(rows[:, rest]).perm_c)]  # this order keeps the factors sparse
+    order = np.concatenate([rest, iron[surface]])
+    factor = sparse_linalg.splu(sparse.csc_array(matrix[order][:, order]), permc_spec="NATURAL",
+                                diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    kept = np.arange(len(order))
+    if not ((factor.perm_c == kept).all() and (factor.perm_r == kept).all()):
+        raise AssertionError("SuperLU changed the order of a positive definite matrix")
+    first = len(rest)
+    schur = factor.L[first:, first:].toarray() @ factor.U[first:, first:].toarray()
+    schur = (schur + schur.T) / 2
+    own = matrix[iron][:, iron]
+    change = sparse.csr_array(
+        ((schur - own[surface][:, surface].toarray()).ravel(),
+         (np.repeat(surface, len(surface)), np.tile(surface, len(surface)))), shape=own.shape)
+    return Exterior(sparse.csr_array(own + change), rest, surface, schur, factor)
+
+
+def assemble_modes(
+    name: str, bodies: Sequence[IronRectangle], resolution: Resolution, session: Session
+) -> IronModes:
+    """Have GetDP assemble the stiffness of the half-plane around iron, and verify it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the study.
+    bodies : sequence of IronRectangle
+    resolution : Resolution
+    session : Session
+
+    Raises
+    ------
+    GetDPError
+        If GetDP fails, or its matrix differs from that of our own Gauss points.
+    """
+    from halbach_fe.geo.half_plane import mesh_half_plane  # imports Gmsh, which only meshing needs
+
+    r, z = grid_lines(bodies, resolution)
+    body = iron_cells(bodies, r, z)
+    files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
+    make_folder(session.folder)
+    try:
+        mesh_half_plane(name, r, z, body >= 0, files.mesh).write(files.regions)
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write the mesh into {session.folder}: {error.strerror}.") from None
+    mesh = verify_mesh(files)
+    count = unknowns_of(mesh.inner, mesh.axis, 0)
+    found: dict[int, tuple[Unknowns, sparse.csr_array]] = {}
+
+    def task(mode: int) -> Task:
+        def stage(folder: Path) -> Job:
+            (folder / PROBLEM).write_bytes(resources.files(pro).joinpath(PROBLEM).read_bytes())
+            (folder / MESH).write_bytes(mesh.path.read_bytes())
+            return Job(problem=PROBLEM, mesh=MESH, resolution="Mode", outputs=(),
+                       solutions=SOLUTIONS_FILE, numbers={"MODE": mode}, unknowns=count,
+                       time_limit_s=session.time_limit_s)
+
+        def read(folder: Path) -> Floats:
+            unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type)
+            matrix = read_matrix(folder / MATRIX_FILE, count)
+            found[mode] = unknowns, matrix
+            return np.array(read_solutions(folder / SOLUTIONS_FILE, count, 1), float)
+
+        return Task(f"getdp-iron-mode{mode}", stage, read, (1, count), 1,
+                    RunSize("azimuthal_modes", mesh.elements, count, 1), matrix=True)
+
+    run_tasks([task(0), task(1)], session)
+    unknowns, plain = found[0]
+    everywhere = _gauss_points(mesh, np.arange(mesh.elements), unknowns)
+    for mode in (0, 1):
+        _check(everywhere, mode, found[mode][1])
+    in_iron = np.flatnonzero(mesh.in_iron)
+    points = _gauss_points(mesh, in_iron, unknowns)
+    iron = np.unique(points.along_r.indices)
+    number = body[np.searchsorted(r, points.r) - 1, np.searchsorted(z, points.z) - 1]
+    return IronModes(mesh, unknowns, plain, sparse.csr_array(found[1][1] - plain),
+                     _axis_unknowns(mesh, unknowns), iron, points.restricted(iron), number)
+
+
+def points_at(mesh: VerifiedMesh, located: Located, unknowns: Unknowns) -> GaussPoints:
+    """Return the operators at located points, without weights."""
+    place = coordinates(mesh, located)
+    value, (along_r, along_z) = nodal_operators(mesh, located, unknowns)
+    return GaussPoints(place[:, 0], place[:, 1], np.ones(len(place)), value, along_r, along_z)
+
+
+def _gauss_points(mesh: VerifiedMesh, cells: Ints, unknowns: Unknowns) -> GaussPoints:
+    """Return the nine Gauss points of rectangles, those of GetDP's rule GaussLegendre."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    reference = np.array([(u, v) for u in nodes for v in nodes])
+    count = len(cells) * len(reference)
+    located = Located(np.repeat(cells, len(reference)), np.tile(reference, (len(cells), 1)),
+                      sparse.eye_array(count, format="csr"))
+    corners = mesh.points[mesh.cells[cells]]
+    area = np.prod(np.ptp(corners, axis=1), axis=1)
+    found = points_at(mesh, located, unknowns)
+    return replace(found, weights=found.r * np.outer(
+        area, np.outer(weights, weights).ravel() / 4).ravel())
+
+
+def _check(points: GaussPoints, mode: int, theirs: sparse.csr_array) -> None:
+    """Check that GetDP's matrix equals that of our Gauss points.
+
+    Raises
+    ------
+    GetDPError
+        If the two matrices differ.
+    """
+    gradient = points.gradient(mode)
+    ours = gradient.T @ (sparse.diags_array(np.tile(points.weights, 3)) @ gradient)
+    difference = abs(ours - theirs).max() / abs(theirs).max()
+    if not difference <= MATRIX_TOLERANCE:
+        raise GetDPError(
+            f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
+            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+
+
+def _axis_unknowns(mesh: VerifiedMesh, unknowns: Unknowns) -> Ints:
+    """Return the unknowns of the functions that do not vanish on the axis."""
+    inner = np.flatnonzero(mesh.points[mesh.cells, 0].min(axis=1) == 0)
+    along = np.array([-1.0, 0.3, 1.0])  # the side of the axis has three functions
+    located = Located(
+        np.repeat(inner, len(along)),
+        np.tile(np.column_stack([np.full_like(along, -1), along]), (len(inner), 1)),
+        sparse.eye_array(len(inner) * len(along), format="csr"))
+    value = nodal_operators(mesh, located, unknowns)[0].tocoo()
+    return np.unique(value.coords[1][np.abs(value.data) > 1e-12])

@@ -1,0 +1,353 @@
+"""Cells of blocks: prisms on quadrilaterals, each with a polarization of its own.
+
+A block with four sides, such as a sector, a trapezoid or a cuboid, is cut along lines between its
+inner and its outer face. Any other outline is first cut into convex quadrilaterals. Arcs become
+chords whose ends lie farther out than the arc, so that the area is right. The cells of a block have
+together its volume and its centroid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.outline import Edge, Outline
+
+CHORD = np.pi / 6
+"""Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
+1.7 % of its radius on either side, if its area is right."""
+
+ROUND = 6
+"""Largest number of corners of a convex polygon that is cut at the middles of its sides. A rounder
+one is cut from its centroid to every other corner, which makes half as many cells."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of blocks, in the order of the blocks.
+
+    Attributes
+    ----------
+    block : ndarray of int, shape (n,)
+        Number of the block.
+    centre : ndarray, shape (n, 3), in m
+        Centroid, which is the origin of the cell's frame.
+    axes : ndarray, shape (n, 3, 3)
+        Axes of the frame as columns.
+    vertices : ndarray, shape (n, 4, 2), in m
+        Corners of the base in the frame, counter-clockwise; two coincide for a triangle.
+    half : ndarray, shape (n,), in m
+        Half the height.
+    cuboid : ndarray of bool, shape (n,)
+        Whether the base is a rectangle along the axes of the frame.
+    divisions : int
+        Number of nodes per direction.
+    """
+
+    block: Ints
+    centre: Floats
+    axes: Floats
+    vertices: Floats
+    half: Floats
+    cuboid: NDArray[np.bool_]
+    divisions: int = 2
+
+    def __len__(self) -> int:
+        return len(self.block)
+
+    @cached_property
+    def radius(self) -> Floats:
+        """Radius (n,) in m of the sphere about the centre that contains the cell."""
+        base = np.sum(self.vertices**2, axis=2).max(axis=1)
+        return np.sqrt(base + self.half**2)
+
+    @cached_property
+    def volume(self) -> Floats:
+        """Volume (n,) in m^3."""
+        return 2 * self.half * area_and_centroid(self.vertices)[0]
+
+    @cached_property
+    def _local_nodes(self) -> tuple[Floats, Floats]:
+        return gauss_nodes(self.vertices, self.half, self.divisions)
+
+    @cached_property
+    def nodes(self) -> Floats:
+        """Gauss nodes (n, q, 3) in m in every cell, along its own directions."""
+        return np.asarray(
+            self.centre[:, None] + self._local_nodes[0] @ np.swapaxes(self.axes, 1, 2))
+
+    @cached_property
+    def weights(self) -> Floats:
+        """Weights (n, q) of the nodes, whose sum over a cell is 1."""
+        return self._local_nodes[1]
+
+    @property
+    def cuts(self) -> Floats:
+        """Limits (g + 1,) of the parts about the nodes along a direction, from 0 to 1."""
+        weights = np.polynomial.legendre.leggauss(self.divisions)[1] / 2
+        return np.concatenate([[0.0], np.cumsum(weights)])
+
+    def mean(self, values: Floats) -> Floats:
+        """Return the means (n, 3) over the cells of values (n, q, 3) at their nodes."""
+        return np.einsum("nq,nqi->ni", self.weights, values)
+
+
+def gauss_nodes(vertices: Floats, half: Floats, divisions: int,
+                graded: bool = False) -> tuple[Floats, Floats]:
+    """Return nodes (n, q, 3) in m in the frames of prisms and their relative weights (n, q).
+
+    Nodes are products of Gauss nodes along both directions of the quadrilateral and the height.
+    If ``graded``, they are concentrated at the faces by ``t = 3 x^2 - 2 x^3``, which integrates the
+    logarithmic singularities at edges more accurately.
+    """
+    t, weight = np.polynomial.legendre.leggauss(divisions)
+    t, weight = (t + 1) / 2, weight / 2
+    if graded:
+        weight, t = weight * 6 * t * (1 - t), t * t * (3 - 2 * t)
+    r, s = (grid.ravel() for grid in np.meshgrid(t, t, indexing="ij"))
+    shape = np.array([(1 - r) * (1 - s), r * (1 - s), r * s, (1 - r) * s])
+    by_r = np.array([s - 1, 1 - s, s, -s])
+    by_s = np.array([r - 1, -r, r, 1 - r])
+    base = np.einsum("cq,nci->nqi", shape, vertices)
+    along, across = (np.einsum("cq,nci->nqi", d, vertices) for d in (by_r, by_s))
+    area = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
+    area = area * np.outer(weight, weight).ravel()
+    area /= area.sum(axis=1, keepdims=True)
+    nodes = np.empty((len(vertices), divisions**3, 3))
+    nodes[..., :2] = np.repeat(base, divisions, axis=1)
+    nodes[..., 2] = np.tile((2 * t - 1) * half[:, None], (1, divisions**2))
+    return nodes, np.repeat(area, divisions, axis=1) * np.tile(weight, divisions**2)
+
+
+def cells_of(blocks: Sequence[MagnetBlock], per_side: int, divisions: int = 2) -> Cells:
+    """Divide blocks into cells.
+
+    Parameters
+    ----------
+    blocks : sequence of MagnetBlock
+        Of finite length.
+    per_side : int
+        Cells along each side of a cube. Other blocks have cells of about the same proportions: the
+        number along a direction is that of a cube of the same volume, times the ratio of the sides.
+    divisions : int
+        Nodes per direction in every cell.
+    """
+    known: dict[tuple[object, ...], tuple[Floats, ...]] = {}
+    number, centres, axes, corners, halves, flags = [], [], [], [], [], []
+    for i, block in enumerate(blocks):
+        key = block.outline, block.z_min, block.z_max
+        if key not in known:
+            known[key] = _local_cells(block, per_side)
+        place, turn, vertices, half, cuboid = known[key]
+        number.append(np.full(len(half), i))
+        centres.append(block.from_frame(place))
+        axes.append(block.axes @ turn)
+        corners.append(vertices)
+        halves.append(half)
+        flags.append(cuboid)
+    if not number:
+        return Cells(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4, 2)),
+                     np.zeros(0), np.zeros(0, bool), divisions)
+    return Cells(np.concatenate(number), np.concatenate(centres), np.concatenate(axes),
+                 np.concatenate(corners), np.concatenate(halves), np.concatenate(flags), divisions)
+
+
+def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
+    """Return centres, axes, vertices, half heights and cuboid flags in the block's frame."""
+    height = block.z_max - block.z_min
+    size = np.cbrt(block.volume) / per_side
+    quads = _corrected(quadrilaterals(block.outline, size), block)
+    layers = max(1, round(height / size))
+    levels = block.z_min + height * (np.arange(layers) + 0.5) / layers
+    _, middle = area_and_centroid(quads)
+    local = quads - middle[:, None]
+    sides = np.roll(local, -1, axis=1) - local
+    scale = np.abs(local).max(axis=(1, 2))
+    cuboid = (np.abs(sides[:, 0] + sides[:, 2]).max(axis=1) < 1e-9 * scale) & (
+        np.abs(np.sum(sides[:, 0] * sides[:, 1], axis=1)) < 1e-9 * scale**2)
+    angle = np.where(cuboid, np.arctan2(sides[:, 0, 1], sides[:, 0, 0]), 0.0)
+    turn = np.zeros((len(quads), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 1, 0], turn[:, 0, 1] = np.sin(angle), -np.sin(angle)
+    turn[:, 2, 2] = 1.0
+    local = np.einsum("nci,nij->ncj", local, turn[:, :2, :2])
+    places = np.concatenate([np.column_stack([middle, np.full(len(middle), z)]) for z in levels])
+    return (places, np.tile(turn, (layers, 1, 1)), np.tile(local, (layers, 1, 1)),
+            np.full(len(places), height / layers / 2), np.tile(cuboid, layers))
+
+
+def area_and_centroid(polygons: Floats) -> tuple[Floats, Floats]:
+    """Return areas (n,) in m^2 and centroids (n, 2) in m of polygons (n, m, 2)."""
+    origin = polygons.mean(axis=1, keepdims=True)
+    x, y = np.moveaxis(polygons - origin, 2, 0)
+    following = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    cross = x * following[1] - following[0] * y
+    area = cross.sum(axis=1) / 2
+    centroid = np.stack([np.sum((x + following[0]) * cross, axis=1),
+                         np.sum((y + following[1]) * cross, axis=1)], axis=1) / 6
+    return area, origin[:, 0] + centroid / area[:, None]
+
+
+def _outline_centroid(block: MagnetBlock) -> Floats:
+    """Return the centroid (2,) in m of an outline by Green's theorem.
+
+    The quadrature is exact on straight edges, and to rounding on arcs.
+    """
+    t, weight = np.polynomial.legendre.leggauss(16)
+    total = np.zeros(2)
+    for edge in block.outline:
+        points, normals = edge.at((t + 1) / 2)
+        total += np.sum(weight[:, None] / 4 * points**2 * normals, axis=0)
+    return total / block.area
+
+
+def _corrected(quads: Floats, block: MagnetBlock) -> Floats:
+    """Scale and move quadrilaterals (k, 4, 2) to the area and the centroid of an outline."""
+    if not any(edge.arc for edge in block.outline):
+        return quads
+    areas, middles = area_and_centroid(quads)
+    middle = areas @ middles / areas.sum()
+    return (quads - middle) * np.sqrt(block.area / areas.sum()) + _outline_centroid(block)
+
+
+def quadrilaterals(outline: Outline, size: float) -> Floats:
+    """Cut an outline into convex quadrilaterals (k, 4, 2) of sides of about ``size``, in m."""
+    grid = _four_sided(outline)
+    if grid is not None:
+        return _grid(grid, size)
+    polygon = _polygon(outline, size)
+    pieces = _from_centroid(polygon) if _is_convex(polygon) else _merged(
+        polygon, _triangles(polygon))
+    return np.concatenate([_grid(_edges(piece), size) for piece in pieces])
+
+
+def _edges(quad: Floats) -> Outline:
+    corners = [(float(x), float(y)) for x, y in quad]
+    return tuple(Edge(corners[i], corners[(i + 1) % 4]) for i in range(4))
+
+
+def _four_sided(outline: Outline) -> Outline | None:
+    """Return an outline of four sides, convex between its corners, with any arcs at sides 1 and 3.
+
+    Return None for other outlines.
+    """
+    if len(outline) != 4 or not _is_convex(np.array([edge.start for edge in outline])):
+        return None
+    if outline[0].arc or outline[2].arc:
+        outline = outline[1:] + outline[:1]
+    return None if outline[0].arc or outline[2].arc else outline
+
+
+def _grid(outline: Outline, size: float) -> Floats:
+    """Cut an outline of four sides along straight lines between its sides 1 and 3."""
+    width = max(1, round((outline[1].length + outline[3].length) / 2 / size))
+    for edge in (outline[1], outline[3]):
+        if edge.arc:
+            width = max(width, int(np.ceil(abs(edge.angles[1]) / CHORD - 1e-9)))
+    depth = max(1, round((outline[0].length + outline[2].length) / 2 / size))
+    t = np.arange(width + 1) / width
+    far, near = (edge.at(place)[0] * _bulge(edge, width)
+                 for edge, place in ((outline[1], t), (outline[3], 1 - t)))
+    share = np.arange(depth + 1)[:, None, None] / depth
+    lines = (1 - share) * near + share * far  # (depth + 1, width + 1, 2)
+    quads = np.stack([lines[:-1, :-1], lines[1:, :-1], lines[1:, 1:], lines[:-1, 1:]], axis=2)
+    return quads.reshape(-1, 4, 2)
+
+
+def _bulge(edge: Edge, chords: int) -> float:
+    """Return the factor of the radius of the ends of an arc's chords that makes the area right."""
+    if not edge.arc:
+        return 1.0
+    angle = abs(edge.angles[1]) / chords
+    return float(np.sqrt(angle / np.sin(angle)))
+
+
+def _polygon(outline: Outline, size: float) -> Floats:
+    """Return the corners (m, 2) in m of an outline, with arcs divided into chords."""
+    corners = []
+    for i, edge in enumerate(outline):
+        chords = 1
+        if edge.arc:
+            chords = max(int(np.ceil(abs(edge.angles[1]) / CHORD - 1e-9)),
+                         round(edge.length / size))
+        points = edge.at(np.arange(chords) / chords)[0]
+        # a corner between an arc and a straight side stays in its place
+        points[0 if outline[i - 1].arc else 1:] *= _bulge(edge, chords)
+        corners.append(points)
+    return np.vstack(corners)
+
+
+def _cross(a: Floats, b: Floats, c: Floats) -> float:
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
+def _is_convex(polygon: Floats) -> bool:
+    """Tell whether a counter-clockwise polygon (m, 2) has no corner that points inwards."""
+    tiny = 1e-9 * float(np.ptp(polygon)) ** 2
+    return all(_cross(polygon[i - 2], polygon[i - 1], polygon[i]) > -tiny
+               for i in range(len(polygon)))
+
+
+def _from_centroid(polygon: Floats) -> list[Floats]:
+    """Cut a convex polygon (m, 2) into quadrilaterals about its centroid."""
+    centre = area_and_centroid(polygon[None])[1][0]
+    count = len(polygon)
+    if count <= ROUND:
+        middles = (polygon + np.roll(polygon, -1, axis=0)) / 2
+        return [np.array([polygon[i], middles[i], centre, middles[i - 1]]) for i in range(count)]
+    pieces = [np.array([centre, polygon[i], polygon[i + 1], polygon[(i + 2) % count]])
+              for i in range(0, count - 1, 2)]
+    if count % 2:
+        pieces.append(np.array([centre, polygon[-1], polygon[0], polygon[0]]))
+    return pieces
+
+
+def _triangles(polygon: Floats) -> list[tuple[int, int, int]]:
+    """Return the triangles of a polygon (m, 2), as numbers of its corners, by cutting off ears."""
+    left, found = list(range(len(polygon))), []
+    while len(left) > 3:
+        heights = []
+        for place in range(len(left)):
+            i, j, k = left[place - 1], left[place], left[(place + 1) % len(left)]
+            a, b, c = polygon[i], polygon[j], polygon[k]
+            ear = _cross(a, b, c) > 0 and not any(
+                _cross(a, b, p) >= 0 and _cross(b, c, p) >= 0 and _cross(c, a, p) >= 0
+                for p in polygon[[other for other in left if other not in (i, j, k)]])
+            longest = max(np.hypot(*(b - a)), np.hypot(*(c - b)), np.hypot(*(a - c)))
+            heights.append(_cross(a, b, c) / longest**2 if ear else -np.inf)
+        place = int(np.argmax(heights))  # the ear that is least like a needle
+        found.append((left[place - 1], left[place], left[(place + 1) % len(left)]))
+        del left[place]
+    return [*found, (left[0], left[1], left[2])]
+
+
+def _merged(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floats]:
+    """Return quadrilaterals of the triangles of a polygon (m, 2).
+
+    Two triangles that share a side become one if it is convex; others are cut in three.
+    """
+    pieces, left = [], list(triangles)
+    while left:
+        triangle = left.pop()
+        for turned in (triangle[place:] + triangle[:place] for place in range(3)):
+            i, j, k = turned
+            for other in left:
+                if j in other and k in other:
+                    opposite = next(corner for corner in other if corner not in (j, k))
+                    quad = polygon[[i, j, opposite, k]]
+                    if _is_convex(quad):
+                        pieces.append(quad)
+                        left.remove(other)
+                        break
+            else:
+                continue
+            break
+        else:
+            pieces += _from_centroid(polygon[list(triangle)])
+    return pieces

@@ -1,0 +1,106 @@
+"""The reaction of every single block, per tesla of remanence, for the response matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.sparse import bsr_array
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.solver.moments.solve import MAX_STEPS, TOLERANCE, System
+
+PANEL = 256
+"""Number of source cells whose interactions are in memory at a time."""
+
+AT_ONCE = 40_000_000
+"""Largest number of readings times unknowns at a time, 320 MB."""
+
+NODES = 3
+"""Nodes per direction in every cell."""
+
+Columns = Callable[[int, Ints | slice], Floats]
+"""Takes the number of a block and indices (k,) of points or a slice, and returns the reaction
+(k, 3, 3) in T per T: component ``[:, c, j]`` of B for a remanence along j."""
+
+
+def reaction_columns(
+    blocks: Sequence[MagnetBlock], points: Floats, cells_per_side: int = 1
+) -> Columns:
+    """Compute the reaction of the magnet to every single block, at points (n, 3) in m.
+
+    The equations are those of `halbach_fe.solver.moments.solve`, but within a cell the polarization
+    varies only as the field of near cells does. The readings are propagated back through the
+    interactions, so that the cost is proportional to the readings and to the square of the number
+    of cells. There is one cell a block by default.
+    """
+    system = System.of(blocks, cells_per_side, NODES)
+    found = np.zeros((len(blocks), len(points), 3, 3))
+    if np.any(system.susceptibility):
+        deviations, extra = _deviations(system)
+        step = max(1, AT_ONCE // (9 * len(system.remanence)))
+        for first in range(0, len(points), step):
+            part = slice(first, first + step)
+            found[:, part] = _some(system, np.array(points[part], float), deviations, extra)
+    return lambda number, some: found[number, some]
+
+
+def _deviations(system: System) -> tuple[Any, Any]:
+    """Return what the field of near cells makes of polarizations beyond uniform ones.
+
+    Returns
+    -------
+    deviations : sparse array, shape (3 n q, 3 n)
+        Deviation of the polarization at the nodes from its mean, per polarization of the cells.
+    extra : sparse array, shape (3 n, 3 n)
+        Mean field of these deviations over near cells.
+    """
+    cells = system.interaction.cells
+    count, nodes = cells.weights.shape
+    close, field = system.interaction.near_node_matrices()
+    targets, shape = close.targets, (3 * nodes * count, 3 * count)
+
+    def sparse(blocks: Floats) -> Any:
+        return bsr_array((blocks.reshape(-1, 3 * nodes, 3), close.sources, close.starts), shape)
+
+    # by reciprocity, as in near.add_of_deviations
+    share = (cells.weights * cells.volume[:, None])[targets] / cells.volume[close.sources, None]
+    means = sparse(field * share[..., None, None])
+    field -= np.einsum("pq,pqij->pij", cells.weights[targets], field)[:, None]
+    deviations = sparse(system.susceptibility[targets, None] @ field)
+    return deviations, means.T @ deviations
+
+
+def _some(system: System, points: Floats, deviations: Any, extra: Any) -> Floats:
+    """Return the columns (blocks, k, 3, 3) for some points (k, 3) in m."""
+    interaction, chi = system.interaction, system.susceptibility
+    count = len(chi)
+    rows, size = 3 * len(points), 3 * count
+    uniform, start = np.empty((rows, size)), np.empty((rows, size))
+    step = max(1, AT_ONCE // (4 * 3 * deviations.shape[0]))
+    for first in range(0, len(points), step):
+        by_node = interaction.readings(points[first:first + step])
+        part = slice(3 * first, 3 * first + 3 * len(by_node))
+        uniform[part] = by_node.sum(axis=3).reshape(-1, size)
+        start[part] = uniform[part] + _times(by_node.reshape(-1, deviations.shape[0]), deviations)
+    damping, total = 2 / (2 + system.largest_susceptibility), start
+    for _ in range(MAX_STEPS):
+        back = np.einsum("rni,nij->rnj", total.reshape(rows, count, 3), chi).reshape(rows, size)
+        change = start - total + _times(back, extra)
+        for first in range(0, count, PANEL):
+            last = min(first + PANEL, count)
+            change[:, 3 * first:3 * last] += back @ interaction.panel(first, last)
+        total = total + damping * change
+        if np.abs(change).max() <= TOLERANCE * np.abs(start).max():
+            break
+    found = np.zeros((system.blocks, rows, 3))
+    np.add.at(found, interaction.cells.block, np.moveaxis(
+        (total - uniform).reshape(rows, count, 3), 1, 0))
+    return found.reshape(system.blocks, len(points), 3, 3)
+
+
+def _times(rows: Floats, matrix: Any) -> Floats:
+    """Return the product of dense rows and a sparse matrix."""
+    return np.asarray((matrix.T @ rows.T).T)

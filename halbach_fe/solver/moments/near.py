@@ -1,0 +1,280 @@
+"""Exact interactions of cells that are near to each other, compiled by numba."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.solver.moments.kernel import Six, compiled, prism_field
+
+Flags = NDArray[np.bool_]
+
+
+@compiled
+def turned(axes: Floats, g: Six) -> Six:
+    """Return a field matrix of a frame along the axes of the magnet."""
+    xx, yy, zz, xy, xz, yz = g
+    ax, ay, az = axes[0]
+    bx, by, bz = axes[1]
+    cx, cy, cz = axes[2]
+    px, py, pz = (ax * xx + ay * xy + az * xz, ax * xy + ay * yy + az * yz,
+                  ax * xz + ay * yz + az * zz)
+    qx, qy, qz = (bx * xx + by * xy + bz * xz, bx * xy + by * yy + bz * yz,
+                  bx * xz + by * yz + bz * zz)
+    rx, ry, rz = (cx * xx + cy * xy + cz * xz, cx * xy + cy * yy + cz * yz,
+                  cx * xz + cy * yz + cz * zz)
+    return (px * ax + py * ay + pz * az, qx * bx + qy * by + qz * bz, rx * cx + ry * cy + rz * cz,
+            px * bx + py * by + pz * bz, px * cx + py * cy + pz * cz, qx * cx + qy * cy + qz * cz)
+
+
+@compiled
+def cell_field(axes: Floats, centre: Floats, vertices: Floats, half: float, cuboid: bool,
+               x: float, y: float, z: float) -> Six:
+    """Return the field matrix of a cell at a point of the magnet, along the magnet's axes."""
+    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
+    return turned(axes, prism_field(
+        vertices, half, cuboid, axes[0, 0] * dx + axes[1, 0] * dy + axes[2, 0] * dz,
+        axes[0, 1] * dx + axes[1, 1] * dy + axes[2, 1] * dz,
+        axes[0, 2] * dx + axes[1, 2] * dy + axes[2, 2] * dz))
+
+
+@compiled
+def mean_matrices(targets: Ints, sources: Ints, first: int, last: int, centre: Floats,
+                  axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
+                  weights: Floats, out: Floats) -> None:
+    """Write the means over target cells of the field matrices of source cells, (n, 6).
+
+    ``nodes`` (cells, q, 3) in m and ``weights`` (cells, q) define the means.
+    """
+    for pair in range(first, last):
+        t, s = targets[pair], sources[pair]
+        xx = yy = zz = xy = xz = yz = 0.0
+        for q in range(nodes.shape[1]):
+            g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
+                           nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
+            w = weights[t, q]
+            xx += w * g[0]
+            yy += w * g[1]
+            zz += w * g[2]
+            xy += w * g[3]
+            xz += w * g[4]
+            yz += w * g[5]
+        out[pair, 0], out[pair, 1], out[pair, 2] = xx, yy, zz
+        out[pair, 3], out[pair, 4], out[pair, 5] = xy, xz, yz
+
+
+@compiled
+def add_means(starts: Ints, sources: Ints, matrices: Floats, polarization: Floats,
+              first: int, last: int, out: Floats) -> None:
+    """Add the mean field of near cells to that of target cells ``first`` to ``last``, (n, 3)."""
+    for t in range(first, last):
+        for pair in range(starts[t], starts[t + 1]):
+            g = matrices[pair]
+            jx, jy, jz = polarization[sources[pair]]
+            out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
+            out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
+            out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def add_at_nodes(starts: Ints, sources: Ints, first: int, last: int, centre: Floats, axes: Floats,
+                 vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
+                 polarization: Floats, out: Floats) -> None:
+    """Add the field of near cells at the nodes (n, q, 3) of targets ``first`` to ``last``."""
+    for t in range(first, last):
+        for pair in range(starts[t], starts[t + 1]):
+            s = sources[pair]
+            jx, jy, jz = polarization[s]
+            for q in range(nodes.shape[1]):
+                g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
+                               nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
+                out[t, q, 0] += g[0] * jx + g[3] * jy + g[4] * jz
+                out[t, q, 1] += g[3] * jx + g[1] * jy + g[5] * jz
+                out[t, q, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def add_of_deviations(starts: Ints, sources: Ints, first: int, last: int, centre: Floats,
+                      axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
+                      deviations: Floats, volume: Floats, out: Floats) -> None:
+    """Add the mean over targets ``first`` to ``last`` of the field of deviations, (n, 3).
+
+    ``deviations`` (cells, q, 3) in T m^3 are dipoles at the nodes of near cells. By reciprocity the
+    mean over a cell of a dipole's field is the field of the cell, polarized uniformly, at the
+    dipole, over its volume; unlike the dipole's field it is not singular.
+    """
+    for t in range(first, last):
+        for pair in range(starts[t], starts[t + 1]):
+            s = sources[pair]
+            for q in range(nodes.shape[1]):
+                g = cell_field(axes[t], centre[t], vertices[t], half[t], cuboid[t],
+                               nodes[s, q, 0], nodes[s, q, 1], nodes[s, q, 2])
+                jx, jy, jz = (deviations[s, q, 0] / volume[t], deviations[s, q, 1] / volume[t],
+                              deviations[s, q, 2] / volume[t])
+                out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
+                out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
+                out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def add_of_parts(starts: Ints, sources: Ints, first: int, last: int, centre: Floats, axes: Floats,
+                 vertices: Floats, half: Floats, cuboid: Flags, cuts: Floats, points: Floats,
+                 polarization: Floats, out: Floats) -> None:
+    """Add the field of near cells, whose polarization differs from part to part, at points (n, 3).
+
+    ``cuts`` (g + 1,) are the limits of the parts along every direction of a cell, between 0 and 1,
+    and ``polarization`` (cells, g^3, 3) in T is that of the parts.
+    """
+    quad, each = np.empty((4, 2)), np.empty((polarization.shape[1], 6))
+    for t in range(first, last):
+        for pair in range(starts[t], starts[t + 1]):
+            s = sources[pair]
+            _parts_at(axes[s], centre[s], vertices[s], half[s], cuboid[s], cuts, points[t], quad,
+                      each)
+            for q in range(len(each)):
+                g = each[q]
+                jx, jy, jz = polarization[s, q, 0], polarization[s, q, 1], polarization[s, q, 2]
+                out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
+                out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
+                out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def _parts_at(axes: Floats, centre: Floats, vertices: Floats, half: float, cuboid: bool,
+              cuts: Floats, point: Floats, quad: Floats, out: Floats) -> None:
+    """Write the field matrices (g^3, 6) of the parts of a cell at a point; ``quad`` is scratch."""
+    number = len(cuts) - 1
+    dx, dy, dz = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    x = axes[0, 0] * dx + axes[1, 0] * dy + axes[2, 0] * dz
+    y = axes[0, 1] * dx + axes[1, 1] * dy + axes[2, 1] * dz
+    z = axes[0, 2] * dx + axes[1, 2] * dy + axes[2, 2] * dz
+    part = 0
+    for i in range(number):
+        for j in range(number):
+            _part(vertices, cuts[i], cuts[i + 1], cuts[j], cuts[j + 1], quad)
+            mx = my = 0.0
+            if cuboid:
+                mx, my = (quad[0, 0] + quad[2, 0]) / 2, (quad[0, 1] + quad[2, 1]) / 2
+                for corner in range(4):
+                    quad[corner, 0] -= mx
+                    quad[corner, 1] -= my
+            for k in range(number):
+                level = half * (cuts[k] + cuts[k + 1] - 1)
+                g = turned(axes, prism_field(quad, half * (cuts[k + 1] - cuts[k]), cuboid,
+                                             x - mx, y - my, z - level))
+                for c in range(6):
+                    out[part, c] = g[c]
+                part += 1
+
+
+@compiled
+def _part(base: Floats, r0: float, r1: float, s0: float, s1: float, out: Floats) -> None:
+    """Write the part of a quadrilateral between fractions of both its directions."""
+    for corner in range(4):
+        r = r1 if corner == 1 or corner == 2 else r0
+        s = s1 if corner > 1 else s0
+        for axis in range(2):
+            out[corner, axis] = ((1 - r) * (1 - s) * base[0, axis] + r * (1 - s) * base[1, axis]
+                                 + r * s * base[2, axis] + (1 - r) * s * base[3, axis])
+
+
+@compiled
+def touching(targets: Ints, sources: Ints, centre: Floats, radius: Floats, ratio: float) -> Flags:
+    """Tell which pairs of cells are nearer than ``ratio`` times the sum of their radii."""
+    found = np.empty(len(targets), np.bool_)
+    for pair in range(len(targets)):
+        t, s = targets[pair], sources[pair]
+        distance = sqrt((centre[t, 0] - centre[s, 0]) ** 2 + (centre[t, 1] - centre[s, 1]) ** 2
+                        + (centre[t, 2] - centre[s, 2]) ** 2)
+        found[pair] = distance < ratio * (radius[t] + radius[s])
+    return found
+
+
+@compiled
+def dipole_field(x: float, y: float, z: float) -> Six:
+    """Return the field matrix of a unit dipole in T m^3 at x, y, z from it, times 4 pi."""
+    inverse = 1 / (x * x + y * y + z * z)
+    cube = inverse * sqrt(inverse)
+    five = 3 * cube * inverse
+    return (five * x * x - cube, five * y * y - cube, five * z * z - cube,
+            five * x * y, five * x * z, five * y * z)
+
+
+@compiled
+def node_matrices(targets: Ints, sources: Ints, first: int, last: int, centre: Floats,
+                  axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
+                  out: Floats) -> None:
+    """Write the field matrices (pairs, q, 6) of source cells at the nodes of target cells."""
+    for pair in range(first, last):
+        t, s = targets[pair], sources[pair]
+        for q in range(nodes.shape[1]):
+            g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
+                           nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
+            for c in range(6):
+                out[pair, q, c] = g[c]
+
+
+@compiled
+def far_panel(first: int, last: int, begin: int, nodes: Floats, weights: Floats, volume: Floats,
+              out: Floats) -> None:
+    """Write the mean field of cells ``first`` to ``last`` in all other cells.
+
+    Sources and targets are sums over nodes (n, q, 3) in m with weights (n, q). The result
+    ``out[3 t + i, 3 (s - begin) + j]`` is 0 for s = t.
+    """
+    for t in range(len(nodes)):
+        for s in range(first, last):
+            xx = yy = zz = xy = xz = yz = 0.0
+            if s != t:
+                for p in range(nodes.shape[1]):
+                    for q in range(nodes.shape[1]):
+                        g = dipole_field(nodes[t, p, 0] - nodes[s, q, 0],
+                                         nodes[t, p, 1] - nodes[s, q, 1],
+                                         nodes[t, p, 2] - nodes[s, q, 2])
+                        w = weights[t, p] * weights[s, q]
+                        xx += w * g[0]
+                        yy += w * g[1]
+                        zz += w * g[2]
+                        xy += w * g[3]
+                        xz += w * g[4]
+                        yz += w * g[5]
+            f = volume[s] / (4 * np.pi)
+            i, j = 3 * t, 3 * (s - begin)
+            out[i, j], out[i + 1, j + 1], out[i + 2, j + 2] = f * xx, f * yy, f * zz
+            out[i, j + 1] = out[i + 1, j] = f * xy
+            out[i, j + 2] = out[i + 2, j] = f * xz
+            out[i + 1, j + 2] = out[i + 2, j + 1] = f * yz
+
+
+@compiled
+def readings_of_cells(first: int, last: int, points: Floats, reach: float, radius: Floats,
+                      centre: Floats, axes: Floats, vertices: Floats, half: Floats, cuboid: Flags,
+                      cuts: Floats, nodes: Floats, moments: Floats, out: Floats) -> None:
+    """Write the field at points ``first`` to ``last`` per polarization about every node.
+
+    The result (points, 3, cells, q, 3) has the component of the polarization last. Cells within
+    ``reach`` radii of a point consist of exact parts, others of dipoles at the nodes, with
+    ``moments`` (cells, q) in m^3.
+    """
+    quad, each = np.empty((4, 2)), np.empty((nodes.shape[1], 6))
+    for t in range(first, last):
+        for s in range(len(centre)):
+            dx, dy, dz = (points[t, 0] - centre[s, 0], points[t, 1] - centre[s, 1],
+                          points[t, 2] - centre[s, 2])
+            if dx * dx + dy * dy + dz * dz < (reach * radius[s]) ** 2:
+                _parts_at(axes[s], centre[s], vertices[s], half[s], cuboid[s], cuts,
+                          points[t], quad, each)
+            else:
+                for q in range(nodes.shape[1]):
+                    g = dipole_field(points[t, 0] - nodes[s, q, 0], points[t, 1] - nodes[s, q, 1],
+                                     points[t, 2] - nodes[s, q, 2])
+                    for c in range(6):
+                        each[q, c] = g[c] * moments[s, q] / (4 * np.pi)
+            for q in range(nodes.shape[1]):
+                for i in range(3):
+                    out[t, i, s, q, i] = each[q, i]
+                    for j in range(i):
+                        out[t, i, s, q, j] = out[t, j, s, q, i] = each[q, i + j + 2]

@@ -1,0 +1,245 @@
+"""Reaction of the recoil permeability of separate blocks, by the method of moments.
+
+Inside a block ``B = mu_0 mu_r H + B_r``, so that its polarization is ``J = B_r + chi mu_0 H`` with
+``chi = mu_r - 1``, and mu_0 H is the field of the polarization of all blocks in vacuum. The
+reaction is the field of ``J - B_r``.
+
+Every block is divided into cells, often a single one. Three steps follow one another:
+
+1. Galerkin's method for polarizations that are uniform in every cell: the means over cells of both
+   sides agree. The fixed point is found by damped iteration.
+2. The field of these at the nodes of every cell gives a polarization that differs from node to
+   node (I. H. Sloan, Math. Comp. 30 (1976) 758, the iterated solution). To first order in chi it is
+   exact at the nodes.
+3. The field of its deviations from the means changes the means, again by Galerkin's method.
+   By reciprocity that field is an integral of the deviations times the field of a uniform cell,
+   which is what makes step 3 accurate to second order in chi.
+
+The moment of a single cube, of mu_r = 1.05 and in one cell, is found with an error of 2e-3 of its
+reaction by 2 nodes per direction, 3e-4 by 3 and 4e-5 by 4; without step 3 the error is 4e-3, and
+still 1e-3 with 64 cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.solver.moments.cells import Cells, cells_of
+from halbach_fe.solver.moments.interaction import Interaction
+
+CELLS_PER_SIDE = 2
+"""Default number of cells along the sides of a cube."""
+
+TOLERANCE = 1e-8
+"""Largest change of a polarization, relative to the largest remanence, that ends the iteration.
+The reaction is some 1e-2 of the remanence, so that the error is 1e-6 of it."""
+
+MAX_STEPS = 100
+"""Largest number of steps. Each reduces the error by chi/(2 + chi) or more, a third for chi = 1."""
+
+ERROR_SHARE = 0.7
+"""Error bar, relative to the change that half as many cells per side make.
+
+Over random magnets of cuboids, trapezoids, hexagons, cylinders and L-shaped prisms, with chi from
+0.05 to 1, the error was at most 0.15 to 0.35 of the change in 68 % of readings far from the blocks
+and 0.85 at a tenth of a block from them; in 95 % it was at most 0.6 and 1.4.
+"""
+
+FLOOR = 5e-4
+"""Smallest error bar relative to the reaction, for the expansions of far clusters."""
+
+Applied = Callable[[Floats], Floats]
+"""Takes points (n, 3) in m and returns mu_0 H (n, 3) in T of other sources there."""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Polarized blocks.
+
+    Attributes
+    ----------
+    interaction : Interaction
+        The cells, and the sums over them.
+    induced : ndarray, shape (cells, q, 3), in T
+        Polarization ``J - B_r`` about every node of the cells.
+    blocks : int
+        Number of blocks, of which some may have no cells.
+    steps : int
+        Steps of the iteration.
+    """
+
+    interaction: Interaction
+    induced: Floats
+    blocks: int
+    steps: int
+
+    @property
+    def cells(self) -> Cells:
+        """The cells of the blocks."""
+        return self.interaction.cells
+
+    def reaction(self, points: Floats) -> Floats:
+        """Return the field (n, 3) in T of the induced polarization at points (n, 3) in m.
+
+        It is to be added to the field of the blocks' remanence in vacuum. Inside a block it is the
+        part of mu_0 H.
+        """
+        return self.interaction.field_at(points, self.induced)
+
+    def block_moments(self) -> Floats:
+        """Return mu_0 times the induced moment of every block, (blocks, 3) in T m^3."""
+        cells = self.cells
+        total = np.zeros((self.blocks, 3))
+        np.add.at(total, cells.block, self.interaction.dipoles(self.induced).sum(axis=1))
+        return total
+
+
+@dataclass(frozen=True)
+class System:
+    """Cells of blocks with their materials; it can be solved again and again with other fields.
+
+    Attributes
+    ----------
+    interaction : Interaction
+    remanence : ndarray, shape (cells, 3), in T
+    susceptibility : ndarray, shape (cells, 3, 3)
+        Recoil permeability less 1.
+    blocks : int
+        Number of blocks. Those that have neither remanence nor susceptibility have no cells.
+    """
+
+    interaction: Interaction
+    remanence: Floats
+    susceptibility: Floats
+    blocks: int
+
+    @classmethod
+    def of(cls, blocks: Sequence[MagnetBlock], cells_per_side: int | None = None,
+           divisions: int = 2) -> System:
+        """Divide blocks into cells; see `halbach_fe.solver.moments.cells.cells_of`.
+
+        Raises
+        ------
+        ValueError
+            If a block is infinitely long.
+        """
+        if any(np.isinf(block.z_max - block.z_min) for block in blocks):
+            raise ValueError("the method of moments needs blocks of finite length")
+        remanence = np.array([np.array(block.easy_axis) * block.remanence for block in blocks])
+        tensors = np.array([block.recoil_tensor for block in blocks]) - np.eye(3)
+        there = [number for number in range(len(blocks))
+                 if np.any(remanence[number]) or np.any(tensors[number])]
+        cells = cells_of([blocks[number] for number in there],
+                         cells_per_side or CELLS_PER_SIDE, divisions)
+        cells = replace(cells, block=np.array(there, int)[cells.block])
+        return cls(Interaction(cells), remanence[cells.block], tensors[cells.block], len(blocks))
+
+    def solve(self, applied: Applied | None = None) -> Moments:
+        """Return the polarization of the blocks in their own field and an applied one."""
+        cells, interaction = self.interaction.cells, self.interaction
+        outer = np.zeros_like(cells.nodes)
+        if applied is not None:
+            outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
+        mean_outer = cells.mean(outer)
+        scale = float(np.abs(self.remanence).max(initial=0.0) + np.abs(mean_outer).max(initial=0.0))
+        if scale == 0:
+            return Moments(interaction, outer, self.blocks, 0)
+        uniform, steps = self._self_consistent(self.remanence + self._respond(mean_outer), scale)
+        deviation = self._respond(interaction.node_field(uniform) + outer)
+        deviation -= cells.mean(deviation)[:, None]
+        share = interaction.degree_for(np.abs(deviation).max(initial=0.0) / scale)
+        correction, more = self._self_consistent(
+            self._respond(interaction.mean_field_of_deviations(deviation, share)), scale)
+        induced = deviation + (uniform + correction - self.remanence)[:, None]
+        return Moments(interaction, induced, self.blocks, steps + more)
+
+    @property
+    def largest_susceptibility(self) -> float:
+        """Largest susceptibility of any cell along any direction."""
+        return float(np.linalg.norm(self.susceptibility, ord=2, axis=(1, 2)).max(initial=0.0))
+
+    def _respond(self, field: Floats) -> Floats:
+        """Return the polarization that a field (cells, ..., 3) in T induces."""
+        return np.einsum("nij,n...j->n...i", self.susceptibility, field)
+
+    def _self_consistent(self, sources: Floats, scale: float) -> tuple[Floats, int]:
+        """Return the uniform polarizations J = sources + chi H(J), and the number of steps.
+
+        The eigenvalues of -H(J)/J are between 0 and 1, hence the damping: the error decreases by
+        chi/(2 + chi) a step. ``scale`` in T is what the tolerance relates to.
+        """
+        damping, polarization = 2 / (2 + self.largest_susceptibility), sources
+        field, step = np.zeros_like(sources), sources
+        for count in range(1, MAX_STEPS + 1):
+            size = float(np.abs(step).max(initial=0.0)) / scale
+            field = field + self.interaction.mean_field(step, self.interaction.degree_for(size))
+            step = damping * (sources + self._respond(field) - polarization)
+            polarization = polarization + step
+            if np.abs(step).max(initial=0.0) <= TOLERANCE * scale:
+                return polarization, count
+        raise HalbachError(
+            f"The polarization of the blocks does not settle in {MAX_STEPS} steps: the last "
+            f"changed it by {np.abs(step).max() / scale:.1e} of the remanence. Please report this "
+            "with the study.")
+
+
+def solve_moments(
+    blocks: Sequence[MagnetBlock], *, cells_per_side: int | None = None, divisions: int = 2,
+    applied: Applied | None = None,
+) -> Moments:
+    """Return the polarization that the blocks' own field and an applied one induce in them.
+
+    Parameters
+    ----------
+    blocks : sequence of MagnetBlock
+        Of finite length, in their true places; they may touch. Each counts as uniformly magnetized.
+    cells_per_side : int, optional
+        See `cells_of`; default 2, eight cells for a cube.
+    divisions : int
+        Nodes per direction in every cell.
+    applied : callable, optional
+        mu_0 H of other sources, such as iron.
+
+    Returns
+    -------
+    Moments
+    """
+    return System.of(blocks, cells_per_side, divisions).solve(applied)
+
+
+def refinement(blocks: Sequence[MagnetBlock],
+               cells_per_side: int | None = None) -> tuple[System, System]:
+    """Return blocks in cells, at least two along the sides of a cube, and in half as many."""
+    fine = max(2, cells_per_side or CELLS_PER_SIDE)
+    return System.of(blocks, fine), System.of(blocks, fine // 2)
+
+
+def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:
+    """Return the reaction and its error bar, both (n, 3) in T, at points (n, 3) in m.
+
+    ``fine`` and ``coarse`` are the solutions of both systems of `refinement`. The bar is
+    `ERROR_SHARE` of the length of their difference, for every component.
+    """
+    field, other = fine.reaction(points), coarse.reaction(points)
+    change, size = (np.linalg.norm(value, axis=1, keepdims=True) for value in (
+        field - other, field))
+    return field, np.tile(ERROR_SHARE * change + FLOOR * size, (1, 3))
+
+
+def reaction_with_errors(
+    blocks: Sequence[MagnetBlock], points: Floats, applied: Applied | None = None,
+    cells_per_side: int | None = None,
+) -> tuple[Floats, Floats]:
+    """Return the reaction (n, 3) in T of the blocks at points (n, 3) in m, and its error bars.
+
+    See `solve_moments` for the other arguments; fewer than two cells a side are not possible, since
+    half as many give the bars.
+    """
+    fine, coarse = (system.solve(applied) for system in refinement(blocks, cells_per_side))
+    return field_with_errors(fine, coarse, points)

@@ -1,0 +1,317 @@
+"""Keys of a study that describe the array of permanent-magnet blocks."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from halbach_fe.study.free_blocks import FreeBlocks
+from halbach_fe.study.halbach_order import check_order
+from halbach_fe.study.material_keys import Material, with_grade
+from halbach_fe.study.types import (
+    Angle,
+    Coordinate,
+    Displacement,
+    Gap,
+    Length,
+    RecoilPermeability,
+    Remanence,
+    Rotation,
+    StudyModel,
+)
+
+MultipoleOrder = Annotated[int, Field(ge=1, le=20)]
+BlocksPerRing = Annotated[int, Field(ge=4, le=512)]
+BlockMoment = Annotated[float, Field(gt=0.0, le=1e6)]
+
+
+class SectorBlock(StudyModel):
+    """A block that is a sector of an annulus.
+
+    ``angular_gap_deg`` is the angle between the side faces of neighbouring blocks.
+    """
+
+    shape: Literal["sector"]
+    angular_gap_deg: Annotated[float, Field(ge=0.0, lt=360.0)] = 0.0
+
+
+class TrapezoidBlock(StudyModel):
+    """A block that is a trapezoid with flat faces at the inner and the outer radius.
+
+    ``side_gap_m`` is the distance between the facing, parallel side faces of neighbouring blocks.
+    """
+
+    shape: Literal["trapezoid"]
+    side_gap_m: Gap = 0.0
+
+
+class CuboidBlock(StudyModel):
+    """A cuboid block: as thick as the array's outer minus inner radius, and ``width_m`` wide.
+
+    With ``orientation = "position"`` the block's thickness is along the radius. With
+    ``"magnetization"`` it is along the nominal magnetization of its slot, as is usual in arrays
+    that are built from magnetized cubes.
+    """
+
+    shape: Literal["cuboid"]
+    width_m: Length
+    orientation: Literal["position", "magnetization"] = "position"
+
+
+Block = Annotated[SectorBlock | TrapezoidBlock | CuboidBlock, Field(discriminator="shape")]
+
+
+class BlockException(StudyModel):
+    """Deviations of some blocks from the array's common values.
+
+    The exception holds for the blocks of ``ring``, of ``slot``, or for the one block of both; with
+    neither key it holds for all blocks.
+
+    Material: ``remanence_T``, ``recoil_permeability`` and ``recoil_permeability_across`` replace
+    the array's values; ``recoil_permeability`` alone holds in all directions.
+
+    Magnetization: ``magnetization_angle_deg`` replaces the direction of the magnetization and
+    leaves the block's shape as it is. ``mounted_from`` names the ring and slot that the block was
+    made for; its magnetization keeps the direction that it has relative to the block.
+    ``magnetization_factor`` multiplies the magnetization: 0 for a missing block, -1 for a block
+    that was mounted upside down. ``magnetization_gradient`` is the magnetization of the outer half
+    minus that of the inner half of the block, as a fraction of their mean. ``inner_corner_loss`` is
+    the fraction of the magnetization that the two corners at the bore have lost, each over a sixth
+    of the block's width and a sixth of its thickness.
+
+    Position: ``displacement_m`` displaces the block along its own radial, azimuthal and axial
+    direction, and ``rotation_deg`` is a rotation vector along the same axes, about the block's
+    middle. ``shift_m`` displaces the block along x, y and z, and ``twist_deg`` rotates it about the
+    magnet's axis.
+
+    If several exceptions hold for a block, their displacements and rotations add up, and their
+    factors multiply; of every other key, the last value counts. The finite-element part of the
+    field, which is only the reaction of permeability and iron, treats every block as if it were in
+    its nominal place, whole and uniformly magnetized.
+    """
+
+    ring: Annotated[int, Field(ge=1)] | None = None
+    slot: Annotated[int, Field(ge=1)] | None = None
+    recoil_permeability: RecoilPermeability | None = None
+    recoil_permeability_across: RecoilPermeability | None = None
+    remanence_T: Remanence | None = None
+    magnetization_angle_deg: Angle | None = None
+    mounted_from: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
+    magnetization_factor: Annotated[float, Field(ge=-2.0, le=2.0)] = 1.0
+    magnetization_gradient: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
+    inner_corner_loss: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    displacement_m: Displacement = (0.0, 0.0, 0.0)
+    rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    shift_m: Displacement = (0.0, 0.0, 0.0)
+    twist_deg: Angle = 0.0
+
+
+class Ring(StudyModel):
+    """A ring of its own: what differs from the values of the array.
+
+    Every key that is left out has the array's value. Rings without ``z_m`` are stacked along z in
+    the order of the file, ``ring_gap_m`` after each of them, and the stack is centred at z = 0;
+    rings of different ``layer`` are stacked independently, so that layers lie inside one another.
+    ``z_m`` is the middle of a ring that is not part of a stack.
+    """
+
+    layer: Annotated[int, Field(ge=1, le=100)] = 1
+    z_m: Coordinate | None = None
+    multipole_order: MultipoleOrder | None = None
+    blocks_per_ring: BlocksPerRing | None = None
+    inner_radius_m: Length | None = None
+    outer_radius_m: Length | None = None
+    ring_length_m: Length | None = None
+    ring_gap_m: Gap | None = None
+    first_block_angle_deg: Angle | None = None
+    first_magnetization_angle_deg: Angle | None = None
+    recoil_permeability: RecoilPermeability | None = None
+    recoil_permeability_across: RecoilPermeability | None = None
+    remanence_T: Remanence | None = None
+    block_moment_A_m2: BlockMoment | None = None
+    block: Block | None = None
+    material: Material | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_grade(cls, given: Any) -> Any:
+        return with_grade(given) if isinstance(given, dict) else given
+
+
+PLACEHOLDERS: dict[str, Any] = {"blocks_per_ring": 4, "inner_radius_m": 0.1,
+                                "outer_radius_m": 0.2, "block": {"shape": "sector"}}
+"""Values for the keys of rings in an array that has free blocks only."""
+
+
+class Array(StudyModel):
+    """The permanent-magnet array: rings of blocks, free blocks, or both.
+
+    ``rings`` equal rings have ``blocks_per_ring`` = N blocks each. The middle of slot ``i`` (from
+    1) is at the angle ``first_block_angle_deg + (i-1) 360/N`` about the z axis. The angle of its
+    magnetization is ``first_magnetization_angle_deg + (1 + multipole_order) (i-1) 360/N``
+    (K. Halbach, Nucl. Instrum. Methods 169 (1980) 1). Rings are numbered from 1 at the lowest z;
+    ``ring_length_m`` is along z, ``ring_gap_m`` lies between rings.
+
+    Rings that differ are listed as tables ``[[array.ring]]`` instead, and numbered in the order of
+    the file; a value that all of them give need not be given here. ``free_blocks`` are blocks
+    anywhere, from a table; they follow the rings in number. An array of free blocks alone needs no
+    other key.
+
+    ``recoil_permeability`` is relative and holds along the easy axis;
+    ``recoil_permeability_across`` holds perpendicular to it (default: the same). Exactly one of
+    ``remanence_T`` and ``block_moment_A_m2``, the magnetic moment of every block, gives the
+    strength. ``material`` names a grade of magnet (``"N42SH"``), which gives the remanence, the
+    recoil permeability, ``prior.common_mode_sd`` and the keys of ``demagnetization`` where the
+    study does not.
+    """
+
+    multipole_order: MultipoleOrder = 1
+    blocks_per_ring: BlocksPerRing
+    rings: Annotated[int, Field(ge=0, le=1000)] = 1
+    inner_radius_m: Length
+    outer_radius_m: Length
+    ring_length_m: Length | None = None
+    ring_gap_m: Gap = 0.0
+    first_block_angle_deg: Angle = 0.0
+    first_magnetization_angle_deg: Angle = 0.0
+    recoil_permeability: RecoilPermeability = 1.0
+    recoil_permeability_across: RecoilPermeability | None = None
+    remanence_T: Remanence | None = None
+    block_moment_A_m2: BlockMoment | None = None
+    material: Material | None = None
+    block: Block
+    ring: tuple[Ring, ...] = ()
+    free_blocks: FreeBlocks | None = None
+    exceptions: tuple[BlockException, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_values_of_rings(cls, given: Any) -> Any:
+        """Fill in what the array's rings or free blocks say in place of the array itself."""
+        if not isinstance(given, dict):
+            return given
+        values = with_grade(dict(given))
+        rings, free = values.get("ring") or (), values.get("free_blocks")
+        if rings and isinstance(rings, list | tuple):
+            values.setdefault("rings", len(rings))
+            for key in ("blocks_per_ring", "inner_radius_m", "outer_radius_m", "block"):
+                found = [value for value in (_value(ring, key) for ring in rings)
+                         if value is not None]
+                if values.get(key) is None and len(found) == len(rings):
+                    values[key] = found[0]
+            strengths = ("remanence_T", "block_moment_A_m2")
+            if all(values.get(key) is None for key in strengths):
+                own = [with_grade(ring) if isinstance(ring, dict) else ring for ring in rings]
+                if all(any(_value(ring, key) is not None for key in strengths) for ring in own):
+                    values |= {key: _value(own[0], key) for key in strengths}
+        elif free is not None and all(values.get(key) is None or values[key] == 0
+                                      for key in ("rings", "blocks_per_ring", "block")):
+            try:
+                table = FreeBlocks.model_validate(free)
+            except ValidationError:  # reported by the validation of the key itself
+                return values | {"rings": 0} | PLACEHOLDERS
+            inner, outer = table.radii_m
+            values = PLACEHOLDERS | {"inner_radius_m": inner, "outer_radius_m": outer} | values
+            values |= {"rings": 0, "free_blocks": table}
+        return values
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Array:
+        if self.outer_radius_m <= self.inner_radius_m:
+            raise ValueError(
+                f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
+                f"({self.inner_radius_m}); exchange or correct them"
+            )
+        if self.rings == 0 and self.free_blocks is None:
+            raise ValueError("an array needs at least one ring, or free_blocks")
+        if self.ring:
+            if self.rings != len(self.ring):
+                raise ValueError(f"rings = {self.rings}, but there are {len(self.ring)} tables "
+                                 "[[array.ring]]; leave out `rings`")
+            for number in range(1, self.rings + 1):
+                try:
+                    self.of_ring(number)
+                except ValidationError as error:
+                    reason = error.errors(include_url=False)[0]["msg"]
+                    raise ValueError(f"ring {number}: {reason.removeprefix('Value error, ')}"
+                                     ) from None
+        elif self.rings:
+            self._check_strength()
+            check_order(self.multipole_order, self.blocks_per_ring)
+        self._check_names()
+        self._check_exceptions()
+        return self
+
+    def _check_strength(self) -> None:
+        if (self.remanence_T is None) == (self.block_moment_A_m2 is None):
+            raise ValueError("give exactly one of remanence_T and block_moment_A_m2")
+        if self.block_moment_A_m2 is not None and self.ring_length_m is None:
+            raise ValueError("block_moment_A_m2 needs ring_length_m, to know the block's volume")
+
+    def _check_names(self) -> None:
+        """Refuse free blocks that have the name of a block of a ring."""
+        names = set(self.free_blocks.name) if self.free_blocks is not None else ()
+        for ring, count in enumerate(self.blocks_by_ring[:self.rings] if names else (), start=1):
+            for slot in range(1, count + 1):
+                if (name := block_name(ring, slot)) in names:
+                    raise ValueError(f"a free block is called {name}, which is the name of the "
+                                     f"block in ring {ring}, slot {slot}; rename it")
+
+    def _check_exceptions(self) -> None:
+        sizes = self.blocks_by_ring
+        places = set(self.free_blocks.places) if self.free_blocks and self.exceptions else set()
+        for exception in self.exceptions:
+            for ring, slot, text in (
+                    (exception.ring, exception.slot, "an exception names"),
+                    (*(exception.mounted_from or (None, None)),
+                     "an exception's block was meant for")):
+                possible = sizes if ring is None else sizes[ring - 1:ring]
+                if not possible or (slot or 1) > max(possible) or (
+                        ring is not None and ring > self.rings and slot is not None
+                        and (ring - self.rings, slot) not in places):
+                    raise ValueError(f"{text} ring {ring}, slot {slot} of an array of "
+                                     f"{_described(sizes)}")
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the array consists of equal rings only."""
+        return not self.ring and self.free_blocks is None
+
+    @property
+    def blocks_by_ring(self) -> tuple[int, ...]:
+        """Number of blocks of every ring, those of the free blocks last."""
+        own = tuple(ring.blocks_per_ring or self.blocks_per_ring for ring in self.ring)
+        regular = own or (self.blocks_per_ring,) * self.rings
+        return regular + (self.free_blocks.blocks_by_ring if self.free_blocks else ())
+
+    def of_ring(self, ring: int) -> Array:
+        """Return an array of one ring with the values that hold for a ring (from 1)."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        values.update(rings=1, ring=(), free_blocks=None, exceptions=())
+        if self.ring:
+            own = {name: value for name, value in self.ring[ring - 1]
+                   if name in values and value is not None}
+            for one, other in (("remanence_T", "block_moment_A_m2"),
+                               ("block_moment_A_m2", "remanence_T")):
+                if one in own:
+                    values[other] = None
+            values.update(own)
+        return type(self).model_validate(values)
+
+
+def block_name(ring: int, slot: int) -> str:
+    """Return the name of a block of a ring: ``r01s05`` is ring 1, slot 5."""
+    return f"r{ring:02d}s{slot:02d}"
+
+
+def _value(ring: Any, key: str) -> Any:
+    """Return the value of a key of a ring, which is a table of the file or already a `Ring`."""
+    return ring.get(key) if isinstance(ring, dict) else getattr(ring, key, None)
+
+
+def _described(sizes: tuple[int, ...]) -> str:
+    """Return "3 rings of 16 blocks", or the numbers of blocks of unequal rings."""
+    if len(set(sizes)) == 1:
+        return f"{len(sizes)} rings of {sizes[0]} blocks"
+    return f"{len(sizes)} rings of {', '.join(map(str, sizes))} blocks"

@@ -1,0 +1,304 @@
+"""Keys of a study that describe free blocks: blocks of any shape, anywhere, at any angle.
+
+Free blocks come from a table with one row per block. The study holds the table by column, so that
+it is complete without the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ModelWrapValidatorHandler, model_validator
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.study.material_keys import Material, columns_with_grades
+from halbach_fe.study.polygons import crossing
+from halbach_fe.study.types import (
+    MAX_LENGTH_M,
+    MIN_LENGTH_M,
+    Angle,
+    Coordinate,
+    Length,
+    Line,
+    RecoilPermeability,
+    Remanence,
+    StudyModel,
+)
+
+Shape = Literal["cuboid", "sector", "trapezoid", "cylinder", "polygon", "prism"]
+
+SIZES: dict[Shape, tuple[str, ...]] = {
+    "cuboid": ("size_x_m", "size_y_m"),
+    "sector": ("inner_radius_m", "outer_radius_m", "angle_deg"),
+    "trapezoid": ("size_x_m", "inner_width_m", "outer_width_m"),
+    "cylinder": ("radius_m",),
+    "polygon": ("sides", "radius_m"),
+    "prism": ("outline_m",),
+}
+"""Columns that give the size of each shape across its own z axis; ``size_z_m`` is along it."""
+
+REMANENCE_VECTOR = ("remanence_x_T", "remanence_y_T", "remanence_z_T")
+"""Components of the remanence along x, y and z of the magnet."""
+
+MAX_BLOCKS = 1_000_000
+MAX_PLACES, MAX_PLACES_PER_BLOCK = 1_000_000, 100
+"""Largest number of rings times slots, and the same per block of a large table: results by ring and
+slot are stored for all places."""
+
+MAX_CORNERS = 100
+MAX_PATH = 4000
+
+HALF_TURN_DEG = 0.99 * 180.0
+"""Arcs of this angle or more are cut in two, so that their sector has more than four edges."""
+
+LEVEL_M = 1e-6
+"""Blocks whose heights differ by less than this, in m, form a ring."""
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
+Corner = tuple[Coordinate, Coordinate]
+Signed = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=MAX_BLOCKS)]
+
+
+class RowError(ValueError):
+    """A block of the table is not consistent; ``number`` is that of its row, from 0."""
+
+    def __init__(self, sentence: str, number: int) -> None:
+        super().__init__(sentence)
+        self.number = number
+
+
+class FreeBlocks(StudyModel):
+    """Blocks from a table, one row per block; ``file`` is a CSV or HDF5 file in the study's folder.
+
+    When a study is read, the columns of the file replace its name. A column may be missing where no
+    block needs it, and a cell may be empty (null) where its block does not.
+
+    ``name`` names a block (letters, digits, ``-`` and ``_``) and is unique; ``type`` is the type of
+    block. ``shape`` is one of
+
+    * ``cuboid``: ``size_x_m``, ``size_y_m`` and ``size_z_m`` along its own axes;
+    * ``sector``: ``inner_radius_m``, ``outer_radius_m`` and ``angle_deg`` about its own z axis, its
+      middle on its own x axis;
+    * ``trapezoid``: ``size_x_m`` along its own x axis, with flat parallel faces of
+      ``inner_width_m`` (at negative x) and ``outer_width_m`` (at positive x) along y;
+    * ``cylinder``, also a thin rod: ``radius_m`` about its own z axis;
+    * ``polygon``: a regular polygon of ``sides`` corners at ``radius_m``, the first on its own x
+      axis;
+    * ``prism``: any polygon, with the corners ``outline_m`` in its own (x, y) plane.
+
+    All are prisms, ``size_z_m`` long along their own z axis and centred at its origin. The origin
+    lies at ``x_m``, ``y_m``, ``z_m`` in the magnet: the middle of a block, except for a sector (a
+    point on the axis of its arcs) and a prism (where its corners are counted from). The rotation
+    vector ``rotation_x_deg``, ``rotation_y_deg``, ``rotation_z_deg`` turns the magnet's axes into
+    the block's own (default: no rotation).
+
+    The strength is ``remanence_T`` along the block's own x axis, or the remanence vector
+    ``remanence_x_T``, ``remanence_y_T``, ``remanence_z_T`` along the axes of the magnet.
+    ``material`` names a grade of magnet, whose remanence is along the block's own x axis.
+    ``recoil_permeability`` holds along the remanence, ``recoil_permeability_across`` perpendicular
+    to it. ``magnetization_gradient`` and ``inner_corner_loss`` are those of
+    `halbach_fe.study.array.BlockException`, for shapes of four edges.
+
+    ``ring`` and ``slot`` number the blocks for exceptions, priors and pictures. Without them,
+    blocks of the same height z form a ring, and slots are counted by their angle about the z axis.
+    """
+
+    file: Annotated[Line, Field(min_length=1, max_length=MAX_PATH)] | None = None
+    name: tuple[Name, ...] = ()
+    type: tuple[Line | None, ...] = ()
+    shape: tuple[Shape, ...] = ()
+    ring: tuple[Count, ...] = ()
+    slot: tuple[Count, ...] = ()
+    x_m: tuple[Coordinate, ...] = ()
+    y_m: tuple[Coordinate, ...] = ()
+    z_m: tuple[Coordinate, ...] = ()
+    rotation_x_deg: tuple[Angle | None, ...] = ()
+    rotation_y_deg: tuple[Angle | None, ...] = ()
+    rotation_z_deg: tuple[Angle | None, ...] = ()
+    size_x_m: tuple[Length | None, ...] = ()
+    size_y_m: tuple[Length | None, ...] = ()
+    size_z_m: tuple[Length | None, ...] = ()
+    inner_radius_m: tuple[Length | None, ...] = ()
+    outer_radius_m: tuple[Length | None, ...] = ()
+    angle_deg: tuple[Annotated[float, Field(gt=0.0, lt=360.0)] | None, ...] = ()
+    inner_width_m: tuple[Length | None, ...] = ()
+    outer_width_m: tuple[Length | None, ...] = ()
+    radius_m: tuple[Length | None, ...] = ()
+    sides: tuple[Annotated[int, Field(ge=3, le=MAX_CORNERS)] | None, ...] = ()
+    outline_m: tuple[Annotated[tuple[Corner, ...], Field(min_length=3, max_length=MAX_CORNERS)]
+                     | None, ...] = ()
+    material: tuple[Material | None, ...] = ()
+    remanence_T: tuple[Remanence | None, ...] = ()
+    remanence_x_T: tuple[Signed | None, ...] = ()
+    remanence_y_T: tuple[Signed | None, ...] = ()
+    remanence_z_T: tuple[Signed | None, ...] = ()
+    recoil_permeability: tuple[RecoilPermeability | None, ...] = ()
+    recoil_permeability_across: tuple[RecoilPermeability | None, ...] = ()
+    magnetization_gradient: tuple[Annotated[float, Field(ge=-1.0, le=1.0)] | None, ...] = ()
+    inner_corner_loss: tuple[Annotated[float, Field(ge=0.0, le=1.0)] | None, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_grades(cls, given: Any) -> Any:
+        return columns_with_grades(given) if isinstance(given, dict) else given
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FreeBlocks:
+        if self.file is not None:
+            raise ValueError("the file has not been read; use read_study, which reads it")
+        if not len(self):
+            raise ValueError("there is no block; give a file, or columns")
+        for column in COLUMNS:
+            values = getattr(self, column)
+            needed = column in ("name", "shape", "x_m", "y_m", "z_m")
+            if len(values) != len(self) and (values or needed):
+                raise ValueError(f"column {column} has {len(values)} rows, and there are "
+                                 f"{len(self)} names of blocks")
+        if bool(self.ring) != bool(self.slot):
+            raise ValueError("give ring and slot together, or neither")
+        _check_unique(self.name, "name")
+        _check_unique(list(zip(self.ring, self.slot, strict=True)), "ring and slot")
+        if self.ring and (places := max(self.ring) * max(self.slot)) > max(
+                MAX_PLACES, MAX_PLACES_PER_BLOCK * len(self)):
+            raise ValueError(f"the numbers of ring and slot make {places} places, of which most "
+                             "would be empty; count from 1")
+        self._check_sizes()
+        self._check_strengths()
+        return self
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _once(cls, given: Any, handler: ModelWrapValidatorHandler[FreeBlocks]) -> FreeBlocks:
+        """Accept a validated table as it is: large ones take seconds, and studies change often."""
+        return given if isinstance(given, cls) else handler(given)
+
+    def _check_sizes(self) -> None:
+        shapes = np.array(self.shape)
+        for column in dict.fromkeys(column for sizes in SIZES.values() for column in sizes):
+            given = self.given(column)
+            for shape, sizes in SIZES.items():
+                self._refuse((shapes == shape) & (given != (column in sizes)), (
+                    f"a {shape}, needs {column}" if column in sizes
+                    else f"a {shape}, has no {column}; leave the cell empty"))
+        inner, outer = (self.numbers(f"{side}_radius_m", np.nan) for side in ("inner", "outer"))
+        self._refuse(outer <= inner, "a sector, has an outer_radius_m that is not larger than its "
+                     "inner_radius_m")
+        corners = np.array([len(outline or ()) for outline in self.outline_m or [()] * len(self)])
+        for count in set(corners.tolist()) - {0}:
+            members = np.flatnonzero(corners == count)
+            wrong = np.zeros(len(self), bool)
+            wrong[members] = crossing(np.array([self.outline_m[n] for n in members]))
+            self._refuse(wrong, "a prism, has an outline_m whose edges cross, or that has no "
+                         "area")
+        has_four = (np.isin(shapes, ("cuboid", "trapezoid")) | (corners == 4)
+                    | (self.numbers("sides", 0) == 4)
+                    | (self.numbers("angle_deg", 360.0) < HALF_TURN_DEG))
+        for column in ("magnetization_gradient", "inner_corner_loss"):
+            self._refuse((self.numbers(column, 0.0) != 0) & ~has_four, "which has not four edges, "
+                         f"has no {column}; leave the cell empty")
+
+    def _check_strengths(self) -> None:
+        components = np.array([self.given(column) for column in REMANENCE_VECTOR])
+        self._refuse(self.given("remanence_T") == components.any(axis=0),
+                     f"needs either remanence_T or {', '.join(REMANENCE_VECTOR)}")
+        self._refuse(components.any(axis=0) & ~components.all(axis=0),
+                     f"needs all of {', '.join(REMANENCE_VECTOR)}")
+
+    def given(self, column: str) -> NDArray[np.bool_]:
+        """Tell which blocks have a value in a column, (n,)."""
+        values = getattr(self, column) or (None,) * len(self)
+        return np.array([value is not None for value in values])
+
+    def _refuse(self, wrong: NDArray[np.bool_], reason: str) -> None:
+        """Raise RowError for the first block that is wrong, with the reason why."""
+        if wrong.any():
+            number = int(np.argmax(wrong))
+            comma = "," if reason.startswith(("a ", "which ")) else ""
+            raise RowError(f"block {self.name[number]} in row {number + 1}{comma} {reason}", number)
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    def value(self, column: str, number: int) -> float | int | str | tuple[Corner, ...] | None:
+        """Return the value of a column for a block (from 0), None where it has none."""
+        values: Sequence[float | None] = getattr(self, column)
+        return values[number] if values else None
+
+    def numbers(self, column: str, default: float) -> Floats:
+        """Return a column as an array (n,), with a default value for empty cells."""
+        values = getattr(self, column)
+        if not values:
+            return np.full(len(self), default)
+        return np.array([default if value is None else value for value in values], float)
+
+    @property
+    def origins_m(self) -> Floats:
+        """Origins of the blocks' own axes in the magnet, (n, 3) in m."""
+        return np.column_stack([self.x_m, self.y_m, self.z_m])
+
+    @property
+    def rotations_rad(self) -> Floats:
+        """Rotation vectors of the blocks, (n, 3) in rad."""
+        return np.radians(np.column_stack([
+            self.numbers(f"rotation_{axis}_deg", 0.0) for axis in "xyz"]))
+
+    @cached_property
+    def places(self) -> tuple[tuple[int, int], ...]:
+        """Ring and slot of every block, counted from 1 within the free blocks."""
+        if self.ring:
+            return tuple(zip(self.ring, self.slot, strict=True))
+        level = np.round(np.array(self.z_m) / LEVEL_M).astype(int)
+        heights, ring = np.unique(level, return_inverse=True)
+        if 2 * len(heights) > len(self):  # hardly two blocks at one height: no rings
+            ring = np.zeros(len(self), int)
+        angle = np.arctan2(self.y_m, self.x_m) % (2 * np.pi)
+        angle[angle > 2 * np.pi - 1e-9] = 0.0
+        slot = np.empty(len(self), int)
+        order = np.lexsort((np.hypot(self.x_m, self.y_m), np.round(angle, 9), ring))
+        starts = np.searchsorted(ring[order], np.arange(ring.max() + 1))
+        slot[order] = np.arange(len(self)) - starts[ring[order]]
+        return tuple(zip((ring + 1).tolist(), (slot + 1).tolist(), strict=True))
+
+    @cached_property
+    def blocks_by_ring(self) -> tuple[int, ...]:
+        """Largest slot of every ring of free blocks."""
+        sizes = np.zeros(max(ring for ring, _ in self.places), int)
+        np.maximum.at(sizes, np.array(self.places)[:, 0] - 1, np.array(self.places)[:, 1])
+        return tuple(sizes.tolist())
+
+    @property
+    def radii_m(self) -> tuple[float, float]:
+        """Rough inner and outer radius in m of the space about the z axis that the blocks fill."""
+        half = [self.numbers(column, 0.0) / 2
+                for column in ("size_x_m", "size_y_m", "inner_width_m", "outer_width_m")]
+        corners = [max((math.hypot(*corner) for corner in outline or ()), default=0.0)
+                   for outline in self.outline_m or [()] * len(self)]
+        reach = np.max([*half, self.numbers("radius_m", 0.0), corners], axis=0)
+        radius = self.numbers("outer_radius_m", 0.0)  # of sectors
+        centre = np.hypot(self.x_m, self.y_m)
+        inner = np.where(radius > 0, self.numbers("inner_radius_m", 0.0) - centre,
+                         centre - reach).min()
+        outer = (centre + np.maximum(reach, radius)).max()
+        inner = float(np.clip(inner, MIN_LENGTH_M, MAX_LENGTH_M / 2))
+        return inner, float(np.clip(outer, 1.01 * inner, MAX_LENGTH_M))
+
+
+COLUMNS = tuple(name for name in FreeBlocks.model_fields if name != "file")
+"""All columns of a table of free blocks."""
+
+
+def _check_unique(values: Sequence[Hashable], name: str) -> None:
+    """Raise RowError if a value occurs twice."""
+    if len(set(values)) == len(values):
+        return
+    seen: set[Hashable] = set()
+    for number, value in enumerate(values):
+        if value in seen:
+            raise RowError(f"{name} must be unique to a block, but {value} occurs twice", number)
+        seen.add(value)

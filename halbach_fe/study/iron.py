@@ -1,0 +1,173 @@
+"""Keys of a study that describe iron: its shape and its magnetization curve."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from halbach_fe.study import materials
+from halbach_fe.study.polygons import crossing
+from halbach_fe.study.types import Coordinate, Gap, Length, Line, StudyModel
+
+
+class TableCurve(StudyModel):
+    """A magnetization curve as a table of H in A/m and B in T.
+
+    The table is either the CSV file ``file``, with the header ``H_A_per_m,B_T`` (its path is
+    relative to the study's folder), or the two lists ``H_A_per_m`` and ``B_T``. When a study is
+    read, the numbers of the file replace its name.
+    """
+
+    kind: Literal["table"]
+    file: Annotated[Line, Field(min_length=1, max_length=4000)] | None = None
+    H_A_per_m: tuple[float, ...] = ()
+    B_T: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TableCurve:
+        if self.file is None:
+            if not (self.H_A_per_m or self.B_T):
+                raise ValueError("give a file, or H_A_per_m and B_T")
+            materials.table_curve(np.array(self.H_A_per_m), np.array(self.B_T))
+        elif self.H_A_per_m or self.B_T:
+            raise ValueError("give either a file, or H_A_per_m and B_T, not both")
+        return self
+
+
+class SteelCurve(StudyModel):
+    """A magnetization curve that comes with halbach-fe, by name."""
+
+    kind: Literal["steel"]
+    name: str
+
+    @model_validator(mode="after")
+    def _known(self) -> SteelCurve:
+        if self.name not in materials.steels():
+            raise ValueError(f"no steel is called '{self.name}'; there are "
+                             f"{', '.join(materials.steels())}")
+        return self
+
+
+class FroehlichKennellyCurve(StudyModel):
+    """The magnetization curve B = mu_0 H + J_s H / (H + h) of Froehlich and Kennelly.
+
+    J_s is the saturation polarization; h follows from the initial relative permeability.
+    """
+
+    kind: Literal["froehlich_kennelly"]
+    initial_relative_permeability: Annotated[float, Field(ge=2.0, le=1e6)]
+    saturation_polarization_T: Annotated[float, Field(ge=0.01, le=materials.MAX_POLARIZATION)]
+
+    @model_validator(mode="after")
+    def _possible(self) -> FroehlichKennellyCurve:
+        materials.froehlich_kennelly(self.initial_relative_permeability,
+                                     self.saturation_polarization_T)
+        return self
+
+
+class BrauerCurve(StudyModel):
+    """Brauer's magnetization curve H = (k1 exp(k2 B^2) + k3) B.
+
+    Where dH/dB would exceed that of vacuum, the curve continues with the slope of vacuum.
+    """
+
+    kind: Literal["brauer"]
+    k1_m_per_H: Annotated[float, Field(gt=0.0, le=1e6)]
+    k2_per_T2: Annotated[float, Field(gt=0.0, le=100.0)]
+    k3_m_per_H: Annotated[float, Field(ge=0.0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _possible(self) -> BrauerCurve:
+        materials.brauer(self.k1_m_per_H, self.k2_per_T2, self.k3_m_per_H)
+        return self
+
+
+IronCurve = Annotated[TableCurve | SteelCurve | FroehlichKennellyCurve | BrauerCurve,
+                      Field(discriminator="kind")]
+
+
+class IronMaterial(StudyModel):
+    """Iron with either a constant ``relative_permeability`` or a magnetization ``curve``."""
+
+    relative_permeability: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
+    curve: IronCurve | None = None
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        if (self.relative_permeability is None) == (self.curve is None):
+            raise ValueError("give exactly one of relative_permeability and curve")
+        return self
+
+
+class IronRing(IronMaterial):
+    """A coaxial iron tube outside the array.
+
+    The iron has either a constant ``relative_permeability`` or a magnetization ``curve``.
+    ``length_m`` is along z, centred at z = 0 (default: as long as the array).
+    """
+
+    inner_radius_m: Length
+    outer_radius_m: Length
+    length_m: Length | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronRing:
+        if self.outer_radius_m <= self.inner_radius_m:
+            raise ValueError(
+                f"outer_radius_m ({self.outer_radius_m}) must be larger than inner_radius_m "
+                f"({self.inner_radius_m})"
+            )
+        return self
+
+
+class IronTube(StudyModel):
+    """A coaxial tube or, if it is short, a disc with or without a hole (an end plate, a shield).
+
+    ``inner_radius_m = 0`` makes a full disc. ``length_m`` is along z, centred at ``z_m`` (default:
+    as long as the array). Tubes that touch make a stepped bore.
+    """
+
+    kind: Literal["tube"]
+    inner_radius_m: Gap
+    outer_radius_m: Length
+    length_m: Length | None = None
+    z_m: Coordinate = 0.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronTube:
+        if self.outer_radius_m <= self.inner_radius_m:
+            raise ValueError(f"outer_radius_m ({self.outer_radius_m}) must be larger than "
+                             f"inner_radius_m ({self.inner_radius_m})")
+        return self
+
+
+class IronPrism(StudyModel):
+    """A prism along z with the polygonal section ``outline_m``, for poles and yokes.
+
+    ``copies`` of it stand at equal angles about the z axis. ``length_m`` is along z, centred at
+    ``z_m`` (default: as long as the array; without meaning in 2D).
+    """
+
+    kind: Literal["prism"]
+    outline_m: Annotated[tuple[tuple[Coordinate, Coordinate], ...],
+                         Field(min_length=3, max_length=1000)]
+    copies: Annotated[int, Field(ge=1, le=512)] = 1
+    length_m: Length | None = None
+    z_m: Coordinate = 0.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronPrism:
+        if crossing(np.array([self.outline_m]))[0]:
+            raise ValueError("outline_m must have edges that do not cross, and some area")
+        return self
+
+
+IronBody = Annotated[IronTube | IronPrism, Field(discriminator="kind")]
+
+
+class Iron(IronMaterial):
+    """Iron of any number of bodies, all of one material."""
+
+    bodies: Annotated[tuple[IronBody, ...], Field(min_length=1, max_length=1000)]

@@ -1,0 +1,196 @@
+"""Grades of magnets: a table that is consistent, names that are found, and rows refused by name."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from scipy import stats
+
+from halbach_fe.study import grades as module
+from halbach_fe.study.grades import check_grade, grade, grades, read_grades
+from halbach_fe.study.magnet import Demagnetization
+
+FOLDER = resources.files("halbach_fe.study")
+TABLE, SOURCES = FOLDER / "grades.csv", FOLDER / "grade_sources.csv"
+LINES = [line for line in TABLE.read_text(encoding="utf-8").splitlines()
+         if not line.startswith("#")]
+HEADER = LINES[0].split(",")
+MU_0 = 4e-7 * math.pi
+OERSTED, GAUSS = 1e3 / (4 * math.pi), 1e-4  # in A/m and T
+
+ROW = {
+    "name": "X1", "aliases": "X one;X-I", "family": "NdFeB", "remanence_min_T": "1.2",
+    "remanence_max_T": "1.3", "normal_coercivity_A_per_m": "9e5",
+    "intrinsic_coercivity_A_per_m": "1e6", "energy_product_min_J_per_m3": "270000",
+    "energy_product_max_J_per_m3": "310000", "recoil_permeability": "1.05",
+    "remanence_coefficient_per_K": "-0.001", "coercivity_coefficient_per_K": "",
+    "coefficients_from_C": "20", "coefficients_to_C": "100", "max_temperature_C": "100",
+    "density_min_kg_per_m3": "7400", "density_max_kg_per_m3": "7500", "source": "maker",
+    "other_sources": "",
+}
+
+
+def read(folder: Path, *rows: dict[str, str]) -> dict[str, module.Grade]:
+    """Return the grades of rows that are written to files and read back."""
+    with (folder / "grades.csv").open("w", encoding="utf-8", newline="") as file:
+        file.write("# a comment\n")
+        table = csv.DictWriter(file, HEADER)
+        table.writeheader()
+        table.writerows(rows)
+    (folder / "sources.csv").write_text('key,document\nmaker,"A sheet, rev. 2"\n')
+    return read_grades(folder / "grades.csv", folder / "sources.csv")
+
+
+@pytest.mark.parametrize("name", list(grades()))
+def test_every_grade_is_consistent(name: str):
+    """What a maker promises fits together, and the study's keys accept it."""
+    one = grades()[name]
+    check_grade(one)
+    assert one.source
+    low, high = one.remanence_T
+    assert low < one.nominal_remanence < high
+    assert 0 < one.remanence_sd < 0.06  # the widest range, of isotropic ferrite, is 16 %
+    defaults = one.demagnetization_defaults
+    assert all(key in Demagnetization.model_fields for key in defaults)
+    if {"remanence_coefficient_per_K", "coercivity_coefficient_per_K"} <= defaults.keys():
+        Demagnetization(**defaults, temperature_C=one.max_temperature_C)
+
+
+def test_the_table_has_every_column_that_is_read():
+    """The control of the rows that the tests write: they have the columns of the real table."""
+    assert set(ROW) == set(HEADER)
+
+
+def test_every_source_is_used():
+    """No document is listed that nothing was taken from, and none is missing."""
+    with SOURCES.open(encoding="utf-8") as file:
+        listed = {row["key"] for row in csv.DictReader(
+            line for line in file if not line.startswith("#"))}
+    used = {key for row in csv.DictReader(LINES)
+            for key in (row["source"], *row["other_sources"].split())}
+    assert used == listed
+
+
+@pytest.mark.parametrize(("name", "gauss", "oersted"), [
+    # the tables of K&J Magnetics in their own units, typed from the page and not from the CSV
+    ("N42", (13_000, 13_200), 12_000), ("N42SH", (13_000, 13_300), 20_000),
+    ("N48H", (13_600, 14_200), 16_000), ("N40UH", (12_600, 12_900), 25_000),
+])
+def test_units_are_those_of_the_sheet(name: str, gauss: tuple[int, int], oersted: int):
+    """The conversion of units holds; coercivities are rounded to 1 kA/m."""
+    one = grade(name)
+    assert one.remanence_T == pytest.approx([value * GAUSS for value in gauss], rel=1e-12)
+    assert one.intrinsic_coercivity_A_per_m == pytest.approx(oersted * OERSTED, abs=501)
+
+
+def test_nominal_remanence_and_its_standard_deviation():
+    """They are those of a uniform distribution over the range."""
+    one = grade("YXG28H")
+    low, high = one.remanence_T
+    uniform = stats.uniform(low, high - low)
+    assert one.nominal_remanence == pytest.approx(uniform.mean(), rel=1e-12)
+    assert one.remanence_sd == pytest.approx(uniform.std() / uniform.mean(), rel=1e-12)
+
+
+def test_the_energy_product_is_that_of_a_straight_line():
+    """(BH)_max tells the recoil permeability of the fully magnetized rare-earth grades.
+
+    Independently of the sheets' own recoil permeability of 1.05, B_r^2 / (4 mu_0 (BH)_max) at the
+    middle of the ranges is it; both are rounded (see `ENERGY_TOLERANCE`).
+    """
+    for one in grades().values():
+        if one.family == "ferrite":
+            continue
+        energy = sum(one.energy_product_J_per_m3) / 2
+        implied = one.nominal_remanence**2 / (4 * MU_0 * energy)
+        assert implied == pytest.approx(one.recoil_permeability, rel=module.ENERGY_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["N42SH", "n42sh", "N 42 SH", "n42-sh", "42SH"])
+def test_names_are_found_in_any_spelling(name: str):
+    assert grade(name) is grades()["N42SH"]
+
+
+@pytest.mark.parametrize(("name", "hint"), [
+    ("N42HS", "no magnet grade is called 'N42HS'; similar are N42H, N42UH, N42SH"),
+    ("YXG29H", "similar are YXG2"),
+    ("steel", "there are N35, N38"),
+    ("", "there are N35, N38"),
+])
+def test_an_unknown_name_is_refused_with_a_hint(name: str, hint: str):
+    with pytest.raises(ValueError, match="no magnet grade") as error:
+        grade(name)
+    assert hint in str(error.value)
+
+
+def test_the_grades_are_read_once_and_cannot_be_changed():
+    assert grades() is grades()
+    with pytest.raises(TypeError):
+        grades()["N42"] = grade("N35")  # type: ignore[index]
+
+
+def test_a_good_row_passes(tmp_path: Path):
+    """The control of all rows that are refused below."""
+    one = read(tmp_path, ROW)["X1"]
+    assert one.aliases == ("X one", "X-I")
+    assert one.source == "A sheet, rev. 2"
+    assert one.coefficient_range_C == (20.0, 100.0)
+    assert one.demagnetization_defaults == {
+        "intrinsic_coercivity_A_per_m": 1e6, "remanence_coefficient_per_K": -0.001,
+        "reference_temperature_C": 20.0}
+
+
+BAD_ROWS = {
+    "no source": ({"source": ""}, "grade X1 needs"),
+    "unknown source": ({"source": "hearsay"}, "grade X1 needs hearsay"),
+    "unknown other source": ({"other_sources": "maker hearsay"}, "grade X1 needs hearsay"),
+    "no value": ({"recoil_permeability": ""}, "grade X1 needs recoil_permeability"),
+    "no number": ({"max_temperature_C": "hot"}, "max_temperature_C must be a number"),
+    "family": ({"family": "steel"}, "its family must be one of NdFeB"),
+    "exchanged": ({"remanence_min_T": "1.3", "remanence_max_T": "1.2"},
+                  "remanence_T must begin with the smaller value"),
+    "one value": ({"remanence_min_T": "1.3"}, "remanence_T must be a range"),
+    "gauss": ({"remanence_max_T": "13000"}, "remanence_T must be 0.15 to 1.55, not 13000"),
+    "kA/m": ({"intrinsic_coercivity_A_per_m": "1000"}, "must be 100000 to 4e+06, not 1000"),
+    "oersted": ({"normal_coercivity_A_per_m": "11000"}, "normal_coercivity_A_per_m must be"),
+    "MGOe": ({"energy_product_max_J_per_m3": "39"}, "energy_product_J_per_m3 must be"),
+    "per cent": ({"remanence_coefficient_per_K": "-0.12"}, "must be -0.003 to -0.0001, not -0.12"),
+    "sign": ({"remanence_coefficient_per_K": "0.001"}, "remanence_coefficient_per_K must be"),
+    "rising coercivity": ({"coercivity_coefficient_per_K": "0.003"}, "except for ferrite"),
+    "g/cm3": ({"density_min_kg_per_m3": "7.4"}, "density_kg_per_m3 must be"),
+    "H_cB above H_cJ": ({"intrinsic_coercivity_A_per_m": "8.9e5"}, "not be larger than H_cJ"),
+    "H_cB above B_r": ({"normal_coercivity_A_per_m": "1.01e6",
+                        "intrinsic_coercivity_A_per_m": "2e6"}, "B_r / (mu_0 mu_rec) = 9.85e+05"),
+    "too much energy": ({"energy_product_min_J_per_m3": "300000",
+                         "energy_product_max_J_per_m3": "330000"}, "(BH)_max must not be larger"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ROWS)
+def test_a_bad_row_is_refused(tmp_path: Path, name: str):
+    change, expected = BAD_ROWS[name]
+    with pytest.raises(ValueError, match="grade X1") as error:
+        read(tmp_path, ROW | change)
+    assert expected in str(error.value)
+
+
+def test_the_coercivity_of_ferrite_may_rise():
+    """Its anisotropy field rises faster than its polarization falls."""
+    one = grade("Y30")
+    assert one.coercivity_coefficient_per_K > 0
+    check_grade(one)
+    with pytest.raises(ValueError, match="except for ferrite"):
+        check_grade(replace(one, family="SmCo5"))
+
+
+@pytest.mark.parametrize("alias", ["X1", "x-1", "Xone", "x i"])
+def test_two_rows_must_not_share_a_name(tmp_path: Path, alias: str):
+    other = ROW | {"name": "X2", "aliases": ""}
+    assert set(read(tmp_path, ROW, other)) == {"X1", "X2"}
+    with pytest.raises(ValueError, match="grade X2: X1 is also called"):
+        read(tmp_path, ROW, other | {"aliases": alias})
