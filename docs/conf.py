@@ -37,8 +37,9 @@ CONTENTS = {
     "Gallery": ("gallery", *(f"gallery/{study}" for study in (
         "faser", "linear-3d", "nonlinear-2d", "quadrupole", "mri", "sensitivity", "calibration",
         "diagnosis"))),
-    "How to": ("how-to/own-geometry", "how-to/own-steel", "how-to/own-effect", "how-to/own-map",
-               "how-to/next-magnet", "how-to/many-cores", "how-to/cluster"),
+    "How to": ("how-to/describe-your-magnet", "how-to/own-geometry", "how-to/own-steel",
+               "how-to/own-effect", "how-to/own-map", "how-to/next-magnet", "how-to/many-cores",
+               "how-to/cluster"),
     "In depth": ("study-file", "file-formats", "theory", "accuracy", "inference", "diagnosis",
                  "design", "simulated-campaigns", "scaling", "reliability", "security"),
     "Reference": ("reference/study", "reference/commands", "reference/python")}

@@ -1,16 +1,19 @@
 """The demagnetization margin: H along the easy axis compared with the knee of the B-H curve.
 
 Inside a block ``mu_0 H`` is the sum of the exact field of all blocks in vacuum, from their magnetic
-surface charge, and the finite-element reaction field of the permeability of the blocks and of the
-iron. H diverges logarithmically at the edges of blocks. The smallest margin therefore depends on
-the size of the cells, but the share of the volume past the knee converges.
+surface charge, and the reaction field of the permeability of the blocks and of the iron: by the
+method of moments where the study's route is that one, and by finite elements elsewhere. H diverges
+logarithmically at the edges of blocks. The smallest margin therefore depends on the size of the
+cells, but the share of the volume past the knee converges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -21,11 +24,13 @@ from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import places_in
+from halbach_fe.geometry.outline import Edge, places_in
+from halbach_fe.solver.azimuthal_modes import is_axisymmetric
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
 from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
+from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.magnet import Demagnetization
@@ -142,17 +147,18 @@ class DemagnetizationMap(ShownInNotebook):
         first = int(np.searchsorted(passed, share + 1e-12))
         return float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
 
-    def by_block(self) -> list[dict[str, float | int]]:
+    def by_block(self) -> list[dict[str, Any]]:
         """Return a row per magnetized block: H, margins, and the coercivity that it would need."""
         share_of_coercivity = float(knee(self.material, self.material.temperature_C)
                                     / self.material.intrinsic_coercivity_A_per_m)
-        rows: list[dict[str, float | int]] = []
+        rows: list[dict[str, Any]] = []
         for number in np.unique(self.cells.block):
             mine = self.cells.block == number
             along, volume = self.along[mine], self.cells.volumes[mine]
             worst = int(np.argmin(along))
             x, y, z = self.cells.middles[mine][worst].tolist()
             rows.append({
+                "block": self.blocks[number].name,
                 "ring": self.blocks[number].ring, "slot": self.blocks[number].slot,
                 "mean_H_A_per_m": float(np.average(along, weights=volume)),
                 "least_H_A_per_m": float(along[worst]), "x_m": x, "y_m": y, "z_m": z,
@@ -234,18 +240,75 @@ def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> C
 
 
 def _cut_block(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Floats]:
-    """Return vertices, corners, centres and volumes of the cells of a block, as in `Cells`."""
+    """Return vertices, corners, centres and volumes of the cells of a block, as in `Cells`.
+
+    A block of four edges with straight sides is cut along its thickness and width, any other shape
+    first into a part about each corner.
+    """
+    outline = block.outline
+    if len(outline) == 4 and not (outline[0].arc or outline[2].arc):
+        return _cut_part(block, partial(places_in, outline), across)
+    parts = [_cut_part(block, place, max(1, across // 2)) for place in corner_parts(block)]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _, _ in parts)])
+    vertices, corners, middles, volumes = zip(*parts, strict=True)
+    return (np.vstack(vertices),
+            np.vstack([own + start for own, start in zip(corners, starts[:-1], strict=True)]),
+            np.vstack(middles), np.concatenate(volumes))
+
+
+def corner_parts(block: MagnetBlock) -> list[Callable[[Floats, Floats], Floats]]:
+    """Return the parts of a block's outline about its corners, as functions like `places_in`.
+
+    A part has the corner, the middles of the two edges that meet there, and the middle of the
+    outline as its own corners (a Coons patch).
+
+    Raises
+    ------
+    StudyError
+        If some part of the outline cannot be seen from its middle.
+    """
+    outline = block.outline
+    middle = np.mean([edge.at(np.array([0.0, 0.5]))[0] for edge in outline], axis=(0, 1))
+
+    def part(after: Edge, before: Edge) -> Callable[[Floats, Floats], Floats]:
+        def place(depth: Floats, width: Floats) -> Floats:
+            u, v = depth[:, None, None], width[None, :, None]
+            one, other = after.at(depth / 2)[0][:, None], before.at(1 - width / 2)[0][None]
+            corner = np.array(after.start)
+            ends = after.at(np.array([0.5]))[0][0], before.at(np.array([0.5]))[0][0]
+            along = (1 - v) * one + v * ((1 - u) * ends[1] + u * middle)
+            across = (1 - u) * other + u * ((1 - v) * ends[0] + v * middle)
+            bilinear = ((1 - u) * (1 - v) * corner + u * (1 - v) * ends[0]
+                        + (1 - u) * v * ends[1] + u * v * middle)
+            return np.asarray(along + across - bilinear)
+        return place
+
+    for edge in outline:
+        points, normals = edge.at(np.linspace(0.0, 1.0, 9))
+        if np.einsum("ij,ij->i", points - middle, normals).min() <= 0:
+            raise StudyError(
+                f"Input `array.free_blocks` of study must have blocks whose whole outline can be "
+                f"seen from its middle, for a map of the demagnetization; instead block "
+                f"{block.name} has another. Divide it into several blocks.")
+    return [part(after, before)
+            for before, after in zip((outline[-1], *outline[:-1]), outline, strict=True)]
+
+
+def _cut_part(
+    block: MagnetBlock, place: Callable[[Floats, Floats], Floats], across: int
+) -> tuple[Floats, Ints, Floats, Floats]:
+    """Return the cells of a part of a block, as `_cut_block`; ``place`` is like `places_in`."""
     half = np.array([0.5])
-    (inner,), (outer,) = places_in(block.outline, np.array([0.0, 1.0]), half)
+    (inner,), (outer,) = place(np.array([0.0, 1.0]), half)
     size = float(np.hypot(*(outer - inner))) / across
-    start, stop = places_in(block.outline, half, np.array([0.0, 1.0]))[0]
+    start, stop = place(half, np.array([0.0, 1.0]))[0]
     wide = _count(float(np.hypot(*(stop - start))), size)
     infinite = np.isinf(block.z_max)
     high = 0 if infinite else _count(block.z_max - block.z_min, size)
     z = np.zeros(1) if infinite else np.linspace(block.z_min, block.z_max, high + 1)
 
     def lattice(depth: Floats, width: Floats, height: Floats) -> Floats:
-        flat = places_in(block.outline, depth, width).reshape(-1, 2)
+        flat = place(depth, width).reshape(-1, 2)
         places = np.column_stack([np.tile(flat, (len(height), 1)), np.repeat(height, len(flat))])
         return places if block.in_magnet_frame else block.from_frame(places)
 
@@ -273,7 +336,11 @@ def _field_strength(
     """Return H (cells, 3) in A/m at the centres of the cells."""
     points = cells.middles
     field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
-    if not magnet.is_vacuum:
+    if not magnet.is_vacuum and _by_moments(magnet):
+        reacting = magnet.with_(solver__method="reaction")
+        field += solve_separate(reacting, session).field_with_errors(points)[0]
+    elif not magnet.is_vacuum:
+        _check_equal_rings(magnet)
         reacting = magnet.with_(solver__method="reaction")
         formulation = CROSS_SECTION if magnet.dimension == 2 else SCALAR_POTENTIAL
         if magnet.is_nonlinear:
@@ -287,6 +354,28 @@ def _field_strength(
             tensors = np.array([block.recoil_tensor for block in blocks])[cells.block]
             field = np.linalg.solve(tensors, field[..., None])[..., 0]
     return (field + external_field(magnet, points)) / MU_0
+
+
+def _by_moments(magnet: Magnet) -> bool:
+    """Tell whether the reaction comes from the method of moments, for separate blocks in 3D."""
+    route = magnet.study.solver.route
+    asked = route == "moments" or not magnet.array.is_uniform or (
+        route == "auto" and not is_axisymmetric(magnet))
+    return asked and applies(magnet.with_(solver__method="reaction"))
+
+
+def _check_equal_rings(magnet: Magnet) -> None:
+    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D.
+
+    Raises
+    ------
+    StudyError
+    """
+    if magnet.dimension == 3 and not magnet.array.is_uniform:
+        raise StudyError(
+            f"Input `array` of study {magnet.name} must consist of equal rings for a map of the "
+            "demagnetization with iron that is not a coaxial tube or disc; instead it has rings "
+            "of their own or free blocks. Leave the iron out, or make it coaxial.")
 
 
 def write_vtu(found: DemagnetizationMap, path: Path) -> None:

@@ -2,9 +2,10 @@
 
 A sector or a trapezoid can be turned by 180 degrees about its radial axis. A cuboid can be turned
 by 180 degrees about each of its axes, and by 90 degrees about an axis across which the two sides
-are equal. A block fits a slot if its nominal magnetization points in the direction that the design
-requires there, after the block is moved to the slot (in the orientation of its shape there) and
-turned by one of these rotations.
+are equal. A block fits a slot if it has the slot's shape, and its nominal magnetization points in
+the direction that the design requires there, after the block is moved to the slot (in the
+orientation of its shape there) and turned by one of these rotations. Nothing fits the slot of a
+missing block, which stays empty.
 
 The "own axes" of a block are the axes of its shape: radial (or along the design magnetization),
 transverse and along z.
@@ -24,6 +25,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
+from halbach_fe.inference.block_prior import shape_axes
 from halbach_fe.study.array import BlockException
 
 LARGEST_ANGLE = np.radians(2.0)
@@ -34,6 +36,9 @@ is."""
 
 SAME_SIZE = 1e-6
 """Relative difference up to which two sides of a cuboid count as equal."""
+
+CUBE = (1.0, 1.0, 1.0)
+"""Sides of a cube, which all other blocks' turns leave unchanged as well."""
 
 EXACT = 1e-9
 """Tolerance for matrices and properties that must be equal; rounding errors are 1e-15."""
@@ -50,21 +55,25 @@ class Mounts:
     frames : ndarray, shape (slots, 3, 3)
         Rotations from the own axes of a slot's shape to the axes of the magnet.
     turns : ndarray, shape (turns, 3, 3)
-        Rotations of a block, in its own axes, that leave its shape unchanged. The first is the
+        Rotations of a block, in its own axes, that leave some shape unchanged. The first is the
         identity.
+    allowed : ndarray of bool, shape (turns, slots)
+        Which of them leave the shape of the block in a slot unchanged.
     designed : ndarray, shape (slots, 3)
-        Directions of the design magnetization of each slot, in own axes.
+        Directions of the design magnetization of each slot, in own axes; 0 where the block is
+        missing.
     current : ndarray, shape (slots, 3)
         Directions of the nominal magnetization of the block that is in each slot now, in own axes;
         0 where the block is missing.
     kinds, current_kinds : ndarray of int, shape (slots,)
         Kind of block that the design requires in each slot, and kind of the block that is there
-        now. Blocks of the same remanence and recoil permeabilities are of the same kind.
+        now. Blocks of the same shape, remanence and recoil permeabilities are of the same kind.
     """
 
     places: tuple[tuple[int, int], ...]
     frames: Floats
     turns: Floats
+    allowed: NDArray[np.bool_]
     designed: Floats
     current: Floats
     kinds: Ints
@@ -80,8 +89,10 @@ class Mounts:
         kinds : ndarray of int, shape (blocks,)
         """
         same_kind = self.kinds[:, None] == kinds
-        return np.array([same_kind & (self.designed @ turn @ directions.T > np.cos(LARGEST_ANGLE))
-                         for turn in self.turns])
+        return np.array([
+            same_kind & allowed[:, None]
+            & (self.designed @ turn @ directions.T > np.cos(LARGEST_ANGLE))
+            for turn, allowed in zip(self.turns, self.allowed, strict=True)])
 
     def carried(self, to: Ints, turn: Ints) -> Floats:
         """Return rotations (n, 3, 3) from the own axes of moved blocks to the axes of the magnet.
@@ -101,14 +112,19 @@ class Mounts:
 def mounts_of(magnet: Magnet) -> Mounts:
     """Return the slots of a magnet with its present blocks."""
     meant, built = as_meant(magnet).blocks, magnet.blocks
-    frames = np.array([rotation_about_z(np.radians(block.facing_deg))
-                       for block in meant])
-    kinds = _kinds(meant)
+    frames = np.array([shape_axes(block) for block in meant])
+    shapes, own_turns = _shapes(meant)
+    kinds = _kinds(meant, shapes)
     sources = np.array([source for source, _ in mountings(magnet)])
+    every = shape_turns(CUBE)
+    found = np.array([[any(np.array_equal(turn, own) for own in turns) for turns in own_turns]
+                      for turn in every])
+    some = found.any(axis=1)
+    there = np.array([[block.remanence != 0] for block in built])
     return Mounts(
-        tuple((block.ring, block.slot) for block in meant), frames,
-        shape_turns(_sides(magnet)), _directions(meant, frames), _directions(built, frames), kinds,
-        kinds[sources])
+        tuple((block.ring, block.slot) for block in meant), frames, every[some],
+        found[some][:, shapes], there * _directions(meant, frames), _directions(built, frames),
+        kinds, kinds[sources])
 
 
 def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
@@ -130,15 +146,46 @@ def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
     return np.asarray(turns[np.argsort(angle, kind="stable")])
 
 
-def _sides(magnet: Magnet) -> tuple[float, float, float] | None:
-    """Return the sides in m of cuboid blocks, or None for blocks of another shape."""
-    array = magnet.array
-    if array.block.shape != "cuboid":
-        return None
-    # in 2D the block is infinitely long: any length along z that differs from the other sides
-    length = array.ring_length_m if magnet.dimension == 3 else None
-    return (array.outer_radius_m - array.inner_radius_m, array.block.width_m,
-            length or 2 * array.outer_radius_m + array.block.width_m)
+def _shapes(blocks: Sequence[MagnetBlock]) -> tuple[Ints, list[Floats]]:
+    """Return equal numbers for blocks of equal shape, (blocks,), and the turns of each shape."""
+    known: list[tuple[Floats, tuple[bool, ...]]] = []
+    numbers, turns = np.empty(len(blocks), int), []
+    for place, block in enumerate(blocks):
+        corners, arcs = _corners(block), tuple(edge.arc for edge in block.outline)
+        number = next((number for number, (other, others) in enumerate(known) if arcs == others
+                       and np.allclose(corners, other, 0, SAME_SIZE * np.ptp(corners[:-1]))),
+                      len(known))
+        if number == len(known):
+            known.append((corners, arcs))
+            turns.append(_turns_of(corners, any(arcs)))
+        numbers[place] = number
+    return numbers, turns
+
+
+def _corners(block: MagnetBlock) -> Floats:
+    """Return the corners (n + 1, 2) of a block's outline in its own axes, about their mean, in m.
+
+    The last row is its length along z; a block of a cross-section is longer than it is wide.
+    """
+    corners = np.array([[*edge.start, 0.0] for edge in block.outline])
+    if block.label is None:
+        corners = corners @ shape_axes(block)
+    corners -= corners.mean(axis=0)
+    length = 2 * float(np.ptp(corners)) if np.isinf(block.z_max) else block.z_max - block.z_min
+    return np.vstack([corners[:, :2], [length, 0.0]])
+
+
+def _turns_of(corners: Floats, arcs: bool) -> Floats:
+    """Return the turns (n, 3, 3) that leave a shape unchanged, from its `_corners`."""
+    outline, length = corners[:-1], float(corners[-1, 0])
+    tolerance = SAME_SIZE * float(np.ptp(outline))
+    half = np.abs(outline).max(axis=0)
+    if len(outline) == 4 and not arcs and np.allclose(np.abs(outline), half, 0, tolerance):
+        return shape_turns((2 * float(half[0]), 2 * float(half[1]), length))
+    mirrored = outline * [1.0, -1.0]
+    if all(np.linalg.norm(outline - corner, axis=1).min() < tolerance for corner in mirrored):
+        return shape_turns(None)
+    return np.eye(3)[None]
 
 
 def _directions(blocks: Sequence[MagnetBlock], frames: Floats) -> Floats:
@@ -148,9 +195,10 @@ def _directions(blocks: Sequence[MagnetBlock], frames: Floats) -> Floats:
     return np.einsum("nji,nj->ni", frames, vectors / np.where(size > 0, size, 1.0))
 
 
-def _kinds(blocks: Sequence[MagnetBlock]) -> Ints:
-    """Return equal numbers for blocks of equal remanence and recoil permeabilities."""
-    kinds = [tuple(float(f"{value:.9g}") for value in _properties(block)[:3]) for block in blocks]
+def _kinds(blocks: Sequence[MagnetBlock], shapes: Ints) -> Ints:
+    """Return equal numbers for blocks of equal shape, remanence and recoil permeabilities."""
+    kinds = [(shape, *(float(f"{value:.9g}") for value in _properties(block)[:3]))
+             for block, shape in zip(blocks, shapes.tolist(), strict=True)]
     numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds))}
     return np.array([numbers[kind] for kind in kinds])
 

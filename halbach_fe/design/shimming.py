@@ -35,7 +35,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
-from halbach_fe.inference.block_prior import loose_blocks, types_of
+from halbach_fe.inference.block_prior import first_of_types, loose_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles, met
@@ -495,7 +495,7 @@ def _no_spares() -> SpareBlocks:
 
 
 def _nominal_spares(magnet: Magnet, mounts: Mounts) -> SpareBlocks:
-    """Return a new block for every slot, distributed as in the study's prior."""
+    """Return a new block for every slot with a block, distributed as in the study's prior."""
     size, settings = magnet.dimension, magnet.study.prior
     vectors = np.array([block.magnetization for block in as_meant(magnet).blocks])
     prior = nominal_prior(vectors[:, :size].ravel(), size, settings.magnitude_sd,
@@ -506,8 +506,9 @@ def _nominal_spares(magnet: Magnet, mounts: Mounts) -> SpareBlocks:
         back = mounts.frames[number, :size, :size].T
         own[number, :size, :size] = back @ rows @ rows.T @ back.T
     mean = np.einsum("nji,nj->ni", mounts.frames, vectors)
-    return SpareBlocks(("nominal",) * len(vectors), mean, own, mounts.designed, mounts.kinds,
-                       np.arange(len(vectors)))
+    there = np.flatnonzero(mounts.designed.any(axis=1))
+    return SpareBlocks(("nominal",) * len(there), mean[there], own[there],
+                       mounts.designed[there], mounts.kinds[there], there)
 
 
 def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> SpareBlocks:
@@ -518,7 +519,8 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
     """
     size = magnet.dimension
     mean, root = loose_blocks(magnet, table)
-    first = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
+    number = first_of_types(as_meant(magnet)) | first_of_types(magnet)
+    first = np.array([number[label] for label in table.type])
     own, spread = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     own[:, :size], spread[:, :size, :size] = mean, root
     common = magnet.study.prior.common_mode_sd**2 * np.einsum("ni,nj->nij", own, own)

@@ -5,6 +5,7 @@ from a random assignment. It visits one slot after another, and makes the exchan
 of the same type, or with a block left over, that lowers ``sum |c_n|^2`` most, until no exchange
 lowers the sum. The best of several random starts is the result. All exchanges of a slot are
 evaluated at once from the contribution of every block in every slot, which is computed beforehand.
+The slot of a missing block stays empty.
 
 An "order" is an assignment: an array (slots,) with the row of the table of the block in each slot.
 """
@@ -21,8 +22,14 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
-from halbach_fe.inference.block_prior import as_mounted, loose_blocks, types_of
+from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.inference.block_prior import (
+    as_mounted,
+    first_of_types,
+    loose_blocks,
+    shape_axes,
+    types_of,
+)
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles
 from halbach_fe.stats.gaussian import rotation_roots
@@ -163,18 +170,19 @@ def sort_blocks(
 
 def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) -> _SlotResponses:
     """Compute the contribution of every block to the multipoles in every slot."""
-    size, blocks = magnet.dimension, magnet.blocks
+    size = magnet.dimension
     vectors, roots = loose_blocks(magnet, table)
-    turns = np.array([rotation_about_z(np.radians(block.facing_deg))
-                      for block in blocks])[:, :size, :size]
-    columns = model.matrix.reshape(len(model.matrix), len(blocks), size)
+    there = present(magnet)
+    blocks = [magnet.blocks[number] for number in there]
+    turns = np.array([shape_axes(block) for block in blocks])[:, :size, :size]
+    columns = _columns(magnet, model)
     carried = np.einsum("ksi,sij->ksj", columns, turns)
     mean = np.einsum("ksj,bj->kbs", carried, vectors)
     labels = {label: number for number, label in enumerate(types_of(magnet))}
     of_slot = {slot: labels[label] for label, slots in types_of(magnet).items() for slot in slots}
     # The order hardly changes the main multipole: scale it with the blocks' median strength.
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))
-                                      / np.median(_magnitudes(model.nominal, size)))
+                                      / np.median(_magnitudes(model.nominal, size)[there]))
 
     def units(values: Complexes) -> Floats:
         return 1e4 / main * np.concatenate([values[1:].real, values[1:].imag])
@@ -185,6 +193,17 @@ def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) ->
         np.array([of_slot[block.slot] for block in blocks]))
 
 
+def present(magnet: Magnet) -> Ints:
+    """Return the numbers of the slots that get a block: those where none is missing."""
+    return np.array([number for number, block in enumerate(magnet.blocks) if block.remanence])
+
+
+def _columns(magnet: Magnet, model: MultipoleModel) -> Complexes:
+    """Return the columns (1 + k, slots, D) of the model that belong to the slots with a block."""
+    return model.matrix.reshape(
+        len(model.matrix), len(magnet.blocks), magnet.dimension)[:, present(magnet)]
+
+
 def _magnitudes(vectors: Floats, dimension: int) -> Floats:
     """Return the magnitudes of magnetizations, given as a vector of all their components."""
     return np.linalg.norm(vectors.reshape(-1, dimension), axis=1)
@@ -193,7 +212,7 @@ def _magnitudes(vectors: Floats, dimension: int) -> Floats:
 def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
     """Raise a MeasurementError if the table has too few blocks of a type."""
     for label, slots in types_of(magnet).items():
-        needed = sum(block.slot in slots for block in magnet.blocks)
+        needed = sum(magnet.blocks[number].slot in slots for number in present(magnet))
         measured = table.type.count(label)
         if measured < needed:
             raise MeasurementError(must_be(
@@ -224,7 +243,8 @@ def _random_order(responses: _SlotResponses, generator: np.random.Generator) -> 
 def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
     """Return the assignment by the table's own rings and slots, or None if a slot has no block."""
     row_of = {place: row for row, place in enumerate(table.places) if place[0]}
-    places = [(block.ring, block.slot) for block in magnet.blocks]
+    places = [(magnet.blocks[number].ring, magnet.blocks[number].slot)
+              for number in present(magnet)]
     if not all(place in row_of for place in places):
         return None
     return np.array([row_of[place] for place in places])
@@ -297,8 +317,8 @@ def _multipoles_of(magnet: Magnet, responses: _SlotResponses, order: Ints) -> Mu
 
     The uncertainty is that of the measured moments, of the coil's calibration and of the mounting.
     """
-    every, size = np.arange(len(order)), responses.vectors.shape[1]
-    columns = responses.model.matrix.reshape(len(responses.model.matrix), len(order), size)
+    every = np.arange(len(order))
+    columns = _columns(magnet, responses.model)
     carried = np.einsum("ksi,sij->ksj", columns, responses.turns)
     vectors = responses.vectors[order]
     mean = responses.model.offset + responses.mean[:, order, every].sum(axis=1)
@@ -317,7 +337,9 @@ def _with_places(magnet: Magnet, table: BlockTable, order: Ints) -> BlockTable:
     slot of their type.
     """
     ring, slot = np.zeros(len(table), int), np.zeros(len(table), int)
-    places = np.array([types_of(magnet)[label][0] - 1 for label in table.type])
-    for number, (row, block) in enumerate(zip(order, magnet.blocks, strict=True)):
+    first = first_of_types(as_meant(magnet))
+    places = np.array([first[label] for label in table.type])
+    for number, row in zip(present(magnet), order, strict=True):
+        block = magnet.blocks[number]
         ring[row], slot[row], places[row] = block.ring, block.slot, number
     return replace(table, ring=ring, slot=slot, moment=as_mounted(magnet, table, places))

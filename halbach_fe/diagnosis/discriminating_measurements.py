@@ -220,7 +220,6 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
     """Return the measurements that can be made of a study's magnet, the cheapest first."""
     study, observation = diagnosis.before.study, diagnosis.before.observation
     present = present_scan(diagnosis, data)
-    array = study.array
     sigma = _point_sigma(diagnosis)
     centre = NominalFields(study, np.zeros((1, 3)), np.zeros(1),
                            lambda other: np.zeros((1, 3))).field[0]
@@ -239,7 +238,8 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
                 independent_noise(np.array([NMR_RELATIVE_SD * size])), np.eye(3), np.eye(3),
                 mapped=False)))
     radii = np.unique(np.round(observation.radii, 6))
-    radius = 0.8 * array.inner_radius_m
+    magnet = build_magnet(study)
+    radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
     heights = np.unique(np.round(observation.map_points[:, 2], 9))
@@ -248,8 +248,7 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
         "second_radius", f"circles of radius {1e3 * radius:.0f} mm",
         _point_scan(np.vstack([_circle(radius, z) for z in heights]), sigma)))
     if study.dimension == 3:
-        magnet = build_magnet(study)
-        half, reach = magnet.array_half_length, array.outer_radius_m
+        half, reach = magnet.array_half_length, magnet.array_outer_radius
         farthest = min(4 * reach, 0.4 * (boundary_half_length(magnet, "extruded") - half))
         beyond = [side * (half + farthest * step) for side in (-1, 1)
                   for step in np.linspace(0.2, 1, 5)]

@@ -8,8 +8,8 @@ solved in full.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,6 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.exact_block_field import block_gradients, unit_fields
 from halbach_fe.solver.external_field import external_field
-from halbach_fe.study.array import BlockException
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
@@ -125,7 +124,10 @@ class NominalFields:
 
     def block_fields_of(self, study: Study) -> Floats:
         """Return B (blocks, n, 3) in T of each nominal block of another study."""
-        blocks = build_magnet(study).blocks
+        return self._fields_of(build_magnet(study).blocks)
+
+    def _fields_of(self, blocks: Sequence[MagnetBlock]) -> Floats:
+        """Return B (blocks, n, 3) in T of each of some blocks."""
         return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
                                                 strict=True)])
@@ -133,11 +135,9 @@ class NominalFields:
     @cached_property
     def gradient_fields(self) -> Floats:
         """Change of B per unit of each block's magnetization gradient, (blocks, n, 3) in T."""
-        array = self.study.array
-        uneven = array.with_(
-            exceptions=(*array.exceptions, BlockException(magnetization_gradient=1.0)))
-        study = self.study.with_(array=uneven)
-        return np.asarray(self.block_fields_of(study) - self.block_fields)
+        uneven = [replace(block, gradient=1.0) if len(block.outline) == 4 else block
+                  for block in self.blocks]
+        return np.asarray(self._fields_of(uneven) - self.block_fields)
 
     def block_translation_derivative(self, block: int, direction: Floats) -> Floats:
         """Return the derivative of B (n, 3) in T/m when block number ``block`` moves.

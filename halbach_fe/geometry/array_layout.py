@@ -107,11 +107,12 @@ def _with_exceptions(
     block = replace(
         block, easy_axis=vector(easy_axis), remanence=remanence * factor,
         recoil_permeability=permeability, recoil_permeability_across=across, **changed)
-    if (block.gradient or block.corner_loss) and len(block.outline) != 4:
+    if (block.gradient or block.corner_loss) and (
+            len(block.outline) != 4 or block.outline[0].arc):
         raise StudyError(
             f"Input `array.exceptions` of study must give magnetization_gradient and "
-            f"inner_corner_loss for blocks with four edges only; instead block {block.name} has "
-            f"{len(block.outline)}. Leave the keys out there.")
+            f"inner_corner_loss for blocks with four edges only, of which two are straight; "
+            f"instead block {block.name} has other ones. Leave the keys out there.")
     return _displaced(block, exceptions)
 
 

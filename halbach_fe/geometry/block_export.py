@@ -102,7 +102,8 @@ def _ring_row(block: MagnetBlock) -> dict[str, Any]:
 def _free_row(block: MagnetBlock, table: FreeBlocks, number: int) -> dict[str, Any]:
     """Return the columns of shape and pose of a free block, as the table has them."""
     columns = ("type", "shape", "material", *(c for sizes in SIZES.values() for c in sizes))
-    row = {column: table.value(column, number) for column in (*columns, "size_z_m")}
+    row: dict[str, Any] = {column: table.value(column, number)
+                           for column in (*columns, "size_z_m")}
     if block.in_place:
         return row | {column: table.value(column, number) or 0.0 for column in (*PLACE, *TURN)}
     if not np.isinf(block.z_max):

@@ -11,21 +11,21 @@ and by 2e-3 at mu = 1.3 (NGSolve, order 4). Without the correction the errors wo
 Deviations from the nominal magnetization are taken along it, across it in the plane of the ring,
 and along z. If the place of every block is known, the prior of a block is its own measurement.
 Otherwise the measured blocks of a type are samples of a normal distribution, which is the prior of
-all blocks of that type.
+all blocks of that type. A missing block has the prior mean 0 and no uncertainty, whether its table
+has a row for it or not.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
-from operator import attrgetter
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
@@ -133,33 +133,41 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     HalbachWarning
         If the prior is the distribution of the samples of a type that do not look normal.
     """
-    meant = _prior_as_meant(as_meant(magnet), table)
     size = magnet.dimension
     moves = mountings(magnet)
+    meant = _prior_as_meant(as_meant(magnet), table,
+                            {source for source, matrix in moves if matrix.any()})
     sources = np.array([source for source, _ in moves])
-    turns = np.array([matrix for _, matrix in moves])[:, :size, :size]
+    turns = np.array([matrix * bool(block.remanence) for (_, matrix), block in zip(
+        moves, magnet.blocks, strict=True)])[:, :size, :size]
     mean = meant.gaussian.mean.reshape(len(moves), size, 1)[sources]
     nominal = np.concatenate([block.magnetization[:size] for block in magnet.blocks])
     return replace(meant, nominal=nominal, gaussian=Gaussian(
         (turns @ mean).ravel(), remounted_root(meant.gaussian.root, turns, sources)))
 
 
-def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
-    """Return the prior of a magnet whose blocks are all mounted in their intended slots."""
+def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> MeasuredPrior:
+    """Return the prior of a magnet whose blocks are all mounted in their intended slots.
+
+    ``used`` are the numbers of the blocks that the real magnet has; of others nothing need be
+    known.
+    """
     blocks, size = magnet.blocks, magnet.dimension
     slots = types_of(magnet)
     _check_types(magnet, table, slots)
-    _check_complete(magnet, table)
-    index = _block_of_rows(magnet, table, slots)
+    _check_complete(magnet, table, used)
+    index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])
     deviations = np.linalg.solve(frames[index], measured[:, :, None])[:, :, 0] - [1, 0, 0]
     _check_near(table, deviations)
     deviations, frames = deviations[:, :size], frames[:, :size, :size]
-    members = {label: deviations[np.array(table.type) == label] for label in slots}
     placed = bool(table.ring.any())
-    intensities: dict[str, float | None] = dict.fromkeys(slots)
+    needed = {blocks[number].slot for number in used} if not placed else set()
+    members = {label: deviations[np.array(table.type) == label] for label, own in slots.items()
+               if label in table.type or needed.intersection(own)}
+    intensities: dict[str, float | None] = dict.fromkeys(members)
     mean, own = np.zeros((len(blocks), size)), np.zeros((len(blocks), size, size))
     shared = [np.zeros((len(blocks), size, 0))]
     if placed:
@@ -168,7 +176,8 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(magnet, slots, attrgetter("angle_deg"),
+        _check_alike(magnet, slots,
+                     lambda block: rotation_about_z(np.radians(block.angle_deg)),
                      "Give ring and slot of every measured block.")
         slot_of = np.array([block.slot for block in blocks])
         for label, samples in members.items():
@@ -178,6 +187,7 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
             mean += frame @ (np.eye(size)[0] + samples.mean(axis=0))
             own += frame @ covariance @ frame.transpose(0, 2, 1)
             shared.append(frame @ np.linalg.cholesky(covariance / len(samples)))  # of the mean
+    own[~own.any(axis=(1, 2))] = np.eye(size)  # of blocks that the magnet does not have
     gaussian = measured_prior(mean, own, np.concatenate(shared, axis=2),
                               np.radians(magnet.study.prior.mounting_sd_deg),
                               magnet.study.prior.common_mode_sd)
@@ -216,14 +226,13 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     magnet = as_meant(magnet)
     blocks, slots, size = magnet.blocks, types_of(magnet), magnet.dimension
     _check_types(magnet, table, slots)
-    _check_alike(magnet, slots, attrgetter("facing_deg"), "Make them types of their own.")
-    index = _block_of_rows(magnet, table, slots)
+    _check_alike(magnet, slots, shape_axes, "Make them types of their own.")
+    index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])[index]
     _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([rotation_about_z(-np.radians(blocks[i].facing_deg))
-                    for i in index])
+    own = np.array([shape_axes(blocks[i]).T for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
 
@@ -244,14 +253,10 @@ def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
     -------
     ndarray, shape (rows, 3), in A m^2
     """
-    index = _block_of_rows(magnet, table, types_of(magnet))
-
-    def aside(place: int) -> float:
-        block = magnet.blocks[place]
-        return block.facing_deg - block.angle_deg
-
-    turns = np.array([rotation_about_z(np.radians(aside(new) - aside(old)))
-                      for new, old in zip(places.tolist(), index.tolist(), strict=True)])
+    index = _block_of_rows(as_meant(magnet), table)
+    own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ shape_axes(block)
+                    for block in magnet.blocks])  # axes of the shape in those of the place
+    turns = own[places] @ own[index].transpose(0, 2, 1)
     return np.einsum("nij,nj->ni", turns, table.moment)
 
 
@@ -268,7 +273,28 @@ def _tested(
 def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
     """Return the slots of every type of block, by the label of the type."""
     return magnet.study.prior.types or {
-        str(slot): (slot,) for slot in range(1, max(magnet.blocks_by_ring) + 1)}
+        str(slot): (slot,) for slot in sorted({block.slot for block in magnet.blocks})}
+
+
+def first_of_types(magnet: Magnet) -> dict[str, int]:
+    """Return the number of the first block of every type, from 0, by the label of the type.
+
+    It is in the first slot of the type that has blocks; types without blocks are left out.
+    """
+    of_slot = {block.slot: number for number, block in reversed(list(enumerate(magnet.blocks)))
+               if block.remanence}
+    return {label: next(of_slot[slot] for slot in slots if slot in of_slot)
+            for label, slots in types_of(magnet).items() if any(slot in of_slot for slot in slots)}
+
+
+def shape_axes(block: MagnetBlock) -> Floats:
+    """Return the axes of a block's shape in its nominal place, as columns (3, 3).
+
+    x is radial, or along the nominal magnetization for cuboids that are oriented along it; for a
+    free block they are the axes of its table.
+    """
+    return (rotation_about_z(np.radians(block.facing_deg)) if block.label is None
+            else rotation_matrix(block.orientation_rad))
 
 
 def _frame(block: MagnetBlock) -> Floats:
@@ -280,14 +306,11 @@ def _frame(block: MagnetBlock) -> Floats:
     return np.asarray(axes * float(np.linalg.norm(block.magnetization)))
 
 
-def _of_block(block: MagnetBlock, tensor: Floats, angle_deg: float) -> Floats:
-    """Return ``mu^-1 (1 + (mu - 1) N)`` (3, 3), with N the demagnetizing ``tensor`` of the block.
-
-    It maps vectors in axes that are turned about z by ``angle_deg`` to vectors in the array's axes.
-    """
+def _of_block(block: MagnetBlock, tensor: Floats) -> Floats:
+    """Return ``mu^-1 (1 + (mu - 1) N)`` (3, 3) of a block with the demagnetizing tensor N."""
     mu = block.recoil_tensor
     inside = np.eye(3) + (mu - np.eye(3)) @ tensor
-    return np.asarray(np.linalg.solve(mu, inside) @ rotation_about_z(np.radians(angle_deg)))
+    return np.asarray(np.linalg.solve(mu, inside))
 
 
 def _conversions(
@@ -316,7 +339,7 @@ def _conversions(
     volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
     tensors = demagnetizing_tensors(real)
     return np.array([
-        _of_block(block, tensor, block.angle_deg) / volume
+        _of_block(block, tensor) @ rotation_about_z(np.radians(block.angle_deg)) / volume
         for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
 
 
@@ -340,12 +363,13 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
 
 def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
     """Raise a MeasurementError if a type or place is not in the study."""
-    places = {(block.ring, block.slot) for block in magnet.blocks}
+    places = {(block.ring, block.slot) for block in magnet.blocks if block.remanence}
+    first = first_of_types(magnet)
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
-        if label not in slots:
+        if label not in first:
             raise MeasurementError(must_be(
                 f"type of block {serial}", table.source,
-                f"one of the study's: {', '.join(slots)}", f"'{label}'",
+                f"one of the study's: {', '.join(first)}", f"'{label}'",
                 "Name the slots of each type in the study's prior.types."))
         if ring and (ring, slot) not in places:
             raise MeasurementError(must_be(
@@ -359,9 +383,13 @@ def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, 
                 f"'{label}', which belongs to slot {', '.join(map(str, slots[label]))}"))
 
 
-def _check_complete(magnet: Magnet, table: BlockTable) -> None:
-    """Raise a MeasurementError if some blocks have a place but not every place has a block."""
-    places = {(block.ring, block.slot) for block in magnet.blocks}
+def _check_complete(magnet: Magnet, table: BlockTable, used: Set[int]) -> None:
+    """Raise a MeasurementError if some blocks have a place but not every place has a block.
+
+    That holds for the places of the blocks with the numbers ``used``.
+    """
+    places = {(block.ring, block.slot) for number, block in enumerate(magnet.blocks)
+              if number in used and block.remanence}
     missing = sorted(places - set(table.places))
     if table.ring.any() and missing:
         raise MeasurementError(must_be(
@@ -369,12 +397,11 @@ def _check_complete(magnet: Magnet, table: BlockTable) -> None:
             f"none for ring {missing[0][0]}, slot {missing[0][1]} ({len(missing)} such places)"))
 
 
-def _block_of_rows(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> Ints:
+def _block_of_rows(magnet: Magnet, table: BlockTable) -> Ints:
     """Return the block number (rows,) of each row; without a place, the first of its type."""
-    first_of_slot = {block.slot: number
-                     for number, block in reversed(list(enumerate(magnet.blocks)))}
+    first = first_of_types(magnet)
     return np.array([
-        magnet.number_of(ring, slot) if ring else first_of_slot[slots[label][0]]
+        magnet.number_of(ring, slot) if ring else first[label]
         for label, (ring, slot) in zip(table.type, table.places, strict=True)])
 
 
@@ -413,24 +440,25 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[MagnetBlock], float],
+    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[MagnetBlock], Floats],
     hint: str
 ) -> None:
     """Raise a StudyError if the study's blocks of a type differ, seen from their own axes.
 
-    The axes of a block are turned about z by the angle that ``axes`` returns for its slot. A moment
-    must mean the same deviation from the nominal magnetization for all blocks of a type.
+    ``axes`` returns the axes of a block as columns (3, 3). A moment must mean the same deviation
+    from the nominal magnetization for all blocks of a type.
     """
-    blocks = magnet.blocks
+    blocks = [block for block in magnet.blocks if block.remanence]
     finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block
               for block in blocks]
     tensors = demagnetizing_tensors(finite)
     seen = np.array([
-        np.linalg.solve(_frame(block), _of_block(block, tensor, axes(block)))
+        np.linalg.solve(_frame(block), _of_block(block, tensor) @ axes(block))
         / block.volume for block, tensor in zip(finite, tensors, strict=True)])
     for label, own in slots.items():
-        first, *others = [number for number, block in enumerate(blocks) if block.slot in own]
-        for number in others:
+        members = [number for number, block in enumerate(blocks) if block.slot in own]
+        first = members[0] if members else -1
+        for number in members[1:]:
             if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():
                 raise StudyError(must_be(
                     f"`prior.types.{label}`", f"study {magnet.name}",

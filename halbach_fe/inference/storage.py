@@ -139,8 +139,9 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "parameters_learnt": update.parameters_learnt,
         "log_evidence": update.log_evidence,
         "information_left_out": update.left_out,
-        "contraction_by_block": linear_gaussian.contraction(
-            update.prior, update.posterior, update.study.dimension).round(6).tolist(),
+        "contraction_by_block": [None if np.isnan(value) else value for value in
+                                 linear_gaussian.contraction(
+            update.prior, update.posterior, update.study.dimension).round(6).tolist()],
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
         "scores": [asdict(score) for score in update.scores],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -41,7 +42,8 @@ def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
         "knee_A_per_m": float(knee(material, temperature)),
         "least_H_A_per_m": float(found.along[worst]),
         "least_margin_A_per_m": float(found.margin[worst]),
-        "at_m": found.cells.middles[worst].tolist(), "ring": block.ring, "slot": block.slot,
+        "at_m": found.cells.middles[worst].tolist(), "block": block.name, "ring": block.ring,
+        "slot": block.slot,
         "share_beyond_knee": found.share_beyond_now,
         "limit_temperature_C": {share: limit if math.isfinite(limit) else None
                                 for share, limit in limits.items()},
@@ -75,9 +77,9 @@ def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
                rows=worst_block_table(rows), blocks=len(rows), view=_view(found, rows))
 
 
-def worst_block_table(rows: list[dict[str, float | int]]) -> list[dict[str, str]]:
+def worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
-    return [{"ring": str(row["ring"]), "slot": str(row["slot"]),
+    return [{"block": row["block"], "ring": str(row["ring"]), "slot": str(row["slot"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
@@ -161,7 +163,7 @@ def _slots_figure(found: DemagnetizationMap) -> Figure:
     return figure
 
 
-def _view(found: DemagnetizationMap, rows: list[dict[str, float | int]]) -> Markup:
+def _view(found: DemagnetizationMap, rows: list[dict[str, Any]]) -> Markup:
     """Return the view of the magnet with blocks coloured by their smallest margin."""
     size, count = found.study.dimension, len(found.blocks)
     magnetization: Floats = np.array([block.magnetization[:size] for block in found.blocks])

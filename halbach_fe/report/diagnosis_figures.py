@@ -318,7 +318,7 @@ def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
 
 def _deviations(update: InferenceResult) -> dict[str, Floats]:
     """Return posterior less prior mean of each component, (rings, slots)."""
-    return {name: update.magnet.by_ring(values) for name, values in
+    return {name: update.magnet.by_ring(values[:, 0]) for name, values in
             _parts(update, update.posterior.mean - update.prior.mean).items()}
 
 

@@ -112,7 +112,9 @@ def _conflict_sentence(result: InferenceResult) -> str:
     """Return a warning if prior, model and readings are in conflict, else an empty string."""
     if result.prior_conflict <= result.conflict_limit:
         return ""
-    shift = float(np.max(np.abs(result.posterior.mean - result.prior.mean) / result.prior.sd))
+    free = result.prior.sd > 0  # a missing block has no parameters to change
+    change = np.abs(result.posterior.mean - result.prior.mean)[free] / result.prior.sd[free]
+    shift = float(change.max(initial=0.0))
     return (f"Prior, model and readings cannot all be right: chi² per reading is "
             f"{result.prior_conflict:.3g}, where 1 is expected and more than "
             f"{result.conflict_limit:.2g} is rare, and the largest change of a block is "
@@ -139,12 +141,13 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
     nominal = result.response.nominal.reshape(-1, dimension)
     shift = (result.posterior.mean - result.response.nominal).reshape(-1, dimension)
     length = np.linalg.norm(nominal, axis=1)
+    length[length == 0] = np.nan  # the place of a missing block is left blank
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
     picture = 100 * result.magnet.by_ring(along)
     rings, slots = picture.shape
     figure = Figure(figsize=(8, _figure_height(rings)), layout="constrained")
     axis = figure.subplots()
-    limit = float(np.nanmax(np.abs(picture))) or 1.0
+    limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
     image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
                         origin="lower",
                         extent=(0.5, slots + 0.5, 0.5, rings + 0.5))
@@ -168,7 +171,8 @@ def _contraction_figure(result: InferenceResult) -> Figure:
     axis = figure.subplots()
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
     if rings == 1:
-        bars = axis.bar(slots, percent[0], color=POSTERIOR)
+        there = ~np.isnan(percent[0])
+        bars = axis.bar(slots[there], percent[0, there], color=POSTERIOR)
         if len(slots) <= NUMBERED_SLOTS:
             axis.bar_label(bars, fmt="%.0f", fontsize=7)
         axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))

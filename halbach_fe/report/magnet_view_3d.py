@@ -147,16 +147,18 @@ def view_of_inference(result: InferenceResult) -> Markup:
     """Return the view of an inference result: posterior magnetizations and residuals."""
     size = result.study.dimension
     nominal = result.response.nominal.reshape(-1, size)
-    easy = nominal / np.linalg.norm(nominal, axis=1)[:, None]
-    length = np.einsum("ij,ij->i", nominal, easy)
+    length = np.linalg.norm(nominal, axis=1)
+    there = length > 0  # the change of a missing block is shown as 0
+    length[~there] = 1.0
+    easy = nominal / length[:, None]
     mean = result.posterior.mean.reshape(-1, size)
     number = np.arange(len(easy) + 1)
     along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
     change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
     sd = 100 * result.posterior.sd_of(along) / length
     values = BlockValues(mean, Colours(change, "posterior change<br>along the easy axis in %", [
-        f"{percent:+.2f} ± {error:.2f} % along the easy axis"
-        for percent, error in zip(change, sd, strict=True)]))
+        f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
+        for percent, error, magnetized in zip(change, sd, there, strict=True)]))
     scores = result.standardized(result.prediction_posterior)
     return magnet_view(
         result.magnet, values, _worst_residuals(result.observation.positions, scores))
@@ -209,22 +211,30 @@ def _merge_rings(
 ) -> tuple[Sequence[MagnetBlock], BlockValues]:
     """Return the blocks to draw and their values, with neighbouring rings merged if necessary.
 
+    Missing blocks are not drawn.
+
     In an array of more than `MOST_BLOCKS` blocks, the blocks of several neighbouring rings in the
     same slot are drawn as a single block. It has their mean magnetization, and the colour and text
     of the block whose value is largest in magnitude.
     """
     blocks, slots = magnet.blocks, magnet.array.blocks_per_ring
     step = _rings_per_prism(magnet)
-    if step == 1:
+    groups = [[number for number in range(first + slot, min(first + step * slots, len(blocks)),
+                                          slots) if blocks[number].remanence]
+              for first in range(0, len(blocks), step * slots) for slot in range(slots)
+              ] if step > 1 else [[number] for number, block in enumerate(blocks)
+                                  if block.remanence]
+    groups = [group for group in groups if group]
+    if step == 1 and len(groups) == len(blocks):
         return blocks, values
-    groups = [range(first + slot, min(first + step * slots, len(blocks)), slots)
-              for first in range(0, len(blocks), step * slots) for slot in range(slots)]
     colours = values.colours
     if colours is not None:
         magnitude = np.abs(colours.values)
         worst = [group[int(np.argmax(magnitude[group]))] for group in groups]
+        where = [f"largest in ring {blocks[number].ring}: " if step > 1 else ""
+                 for number in worst]
         colours = replace(colours, values=colours.values[worst], words=[
-            f"largest in ring {blocks[number].ring}: {colours.words[number]}" for number in worst])
+            text + colours.words[number] for text, number in zip(where, worst, strict=True)])
     magnetization = np.array([values.magnetization[group].mean(axis=0) for group in groups])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
             BlockValues(magnetization, colours))
@@ -268,7 +278,7 @@ def _hover_text(block: MagnetBlock, more: int, values: BlockValues, number: int)
     """Return the text of a block; ``more`` is the number of further rings merged into it."""
     magnetization = values.magnetization[number]
     rings = f"rings {block.ring} to {block.ring + more}" if more else f"ring {block.ring}"
-    lines = [f"{rings}, slot {block.slot}",
+    lines = [block.label or f"{rings}, slot {block.slot}",
              "M = (" + ", ".join(f"{1e-3 * part:.1f}" for part in magnetization) + ") kA/m"]
     if values.colours is not None:
         lines.append(values.colours.words[number])

@@ -17,10 +17,11 @@ from halbach_fe.study.types import COMPONENTS
 
 def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
     """Return errors of the mean in A/m, and the rms of error over standard deviation."""
-    error = magnetizations.mean - truth
+    error, sd = magnetizations.mean - truth, magnetizations.sd
+    free = sd > 0  # a missing block has no uncertainty
     return {"largest_error_A_per_m": float(np.abs(error).max()),
             "rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
-            "z_rms": float(np.sqrt(np.mean((error / magnetizations.sd) ** 2)))}
+            "z_rms": float(np.sqrt(np.mean((error[free] / sd[free]) ** 2)))}
 
 
 def write_magnetizations(

@@ -110,15 +110,18 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
 
 
 def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
-    """Draw the first ring's blocks with arrows of their easy axes, and the iron, in mm."""
+    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm."""
     t = np.linspace(0, 1, 9)
-    flat = magnet.dimension == 2
-    for block in magnet.blocks if flat else magnet.blocks[:magnet.blocks_by_ring[0]]:
+    height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
+    for block in magnet.blocks:
+        if magnet.dimension == 3 and abs(block.middle[2] - height) > (
+                block.z_max - block.z_min) / 2 - 1e-9:
+            continue
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
         outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
         axis.plot(*outline.T, color="#777777", lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
-        length = 0.15 * float(np.ptp(outline, axis=0).max())
+        length = 0.3 * float(np.ptp(outline, axis=0).min())
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})

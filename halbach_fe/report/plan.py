@@ -122,8 +122,10 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     places = np.arange(1, max(magnet.blocks_by_ring) + 1)
 
     def by_slot(sd: Floats) -> Floats:
+        """Return the rms over the blocks of each slot; NaN where all of them are missing."""
         variance = (sd**2).reshape(len(slots), -1).sum(axis=1)
-        return np.sqrt([variance[slots == place].mean() for place in places])
+        sums = np.array([variance[slots == place].sum() for place in places])
+        return np.sqrt(np.where(sums > 0, sums, np.nan))
 
     before = by_slot(plan.prior_sd)
     for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),

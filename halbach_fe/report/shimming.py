@@ -75,25 +75,30 @@ def move_table(shim: Shim) -> list[dict[str, str]]:
 
 def _placement_text(shim: Shim, placement: Placement) -> str:
     """Return where a block comes from, where it goes and how it is turned, in words."""
-    places = shim.mounts.places
-    ring, slot = places[placement.to]
-    spare = placement.block - len(places)
-    source = (f"spare {shim.spares[spare]}" if spare >= 0
-              else "ring {} slot {}".format(*places[placement.block]))
-    where = "in place" if placement.block == placement.to else f"to ring {ring} slot {slot}"
+    spare = placement.block - len(shim.mounts.places)
+    source = (f"spare {shim.spares[spare]}" if spare >= 0 else _place_text(shim, placement.block))
+    where = ("in place" if placement.block == placement.to
+             else f"to {_place_text(shim, placement.to)}")
     vector = np.array(shim.mounts.turn_deg(placement.turn))
     angle = float(np.linalg.norm(vector))
     if not angle:
         return f"{source} {where}"
     axis = vector / angle
-    block = shim.study.array.block
+    array, block = shim.study.array, shim.study.array.block
     follows = block.shape == "cuboid" and block.orientation == "magnetization"
-    own = ("magnetization's", "transverse", "axial") if follows else (
-        "radial", "azimuthal", "axial")
+    own = (("own x", "own y", "own z") if not array.is_uniform
+           else ("magnetization's", "transverse", "axial") if follows
+           else ("radial", "azimuthal", "axial"))
     names = [name for name, part in zip(own, axis, strict=True) if abs(part) > 1 - 1e-6]
     about = names[0] if names else "(" + ", ".join(f"{part:.3g}" for part in axis) + ")"
     sign = -1 if names and axis.sum() < 0 else 1
     return f"{source} {where}, then turned by {sign * angle:.0f}° about its {about} axis"
+
+
+def _place_text(shim: Shim, number: int) -> str:
+    """Return the place of a block in words: the block's name if it is a free block."""
+    block = shim.magnet.blocks[number]
+    return block.label or f"ring {block.ring} slot {block.slot}"
 
 
 def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> None:

@@ -68,7 +68,8 @@ Source = Callable[[Floats], Floats]
 SOURCE_MODES = 0.03
 """Modes of the source are left out if all higher ones are below this value, relative to the largest
 one. They only matter where they saturate the iron locally: blocks 1 mm from a tube of 2 mm at 51 mm
-need modes up to 55, and 24, 48 and 72 modes change the reaction in the bore by 22, 2 and 0.2 %.
+need modes up to 55. The reaction in the bore is then 0.2 % from that of 96 modes on a finer grid;
+with modes up to 37 it is 5 % off.
 """
 
 FEWEST_MODES, MOST_MODES = 12, 128

@@ -166,11 +166,11 @@ def contraction(prior: Gaussian, after: Gaussian, size: int) -> Floats:
 
     C_0 and C_1 are the prior and posterior covariances of the ``size`` consecutive parameters of a
     block. The contraction is 0 if the readings carry no information about the block, and 1 if they
-    determine it completely.
+    determine it completely. It is NaN for a block without prior uncertainty: a missing block.
     """
     before, now = ((distribution.sd**2).reshape(-1, size).sum(axis=1)
                    for distribution in (prior, after))
-    return np.asarray(1 - now / before)
+    return np.asarray(1 - now / np.where(before > 0, before, np.nan))
 
 
 def whitened_row_blocks(

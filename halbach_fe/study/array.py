@@ -23,6 +23,8 @@ from halbach_fe.study.types import (
 
 MultipoleOrder = Annotated[int, Field(ge=1, le=20)]
 BlocksPerRing = Annotated[int, Field(ge=4, le=512)]
+MAX_RINGS = 1000
+
 BlockMoment = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
@@ -113,9 +115,11 @@ class Ring(StudyModel):
     Every key that is left out has the array's value. Rings without ``z_m`` are stacked along z in
     the order of the file, ``ring_gap_m`` after each of them, and the stack is centred at z = 0;
     rings of different ``layer`` are stacked independently, so that layers lie inside one another.
-    ``z_m`` is the middle of a ring that is not part of a stack.
+    ``z_m`` is the middle of a ring that is not part of a stack. ``count`` stands for so many equal
+    rings, one after the other.
     """
 
+    count: Annotated[int, Field(ge=1, le=MAX_RINGS)] = 1
     layer: Annotated[int, Field(ge=1, le=100)] = 1
     z_m: Coordinate | None = None
     multipole_order: MultipoleOrder | None = None
@@ -132,6 +136,13 @@ class Ring(StudyModel):
     block_moment_A_m2: BlockMoment | None = None
     block: Block | None = None
     material: Material | None = None
+
+    @model_validator(mode="after")
+    def _once(self) -> Ring:
+        if self.count > 1:
+            raise ValueError("rings that are counted are stacked: leave out z_m, or give every "
+                             "ring a table of its own")
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -168,7 +179,7 @@ class Array(StudyModel):
 
     multipole_order: MultipoleOrder = 1
     blocks_per_ring: BlocksPerRing
-    rings: Annotated[int, Field(ge=0, le=1000)] = 1
+    rings: Annotated[int, Field(ge=0, le=MAX_RINGS)] = 1
     inner_radius_m: Length
     outer_radius_m: Length
     ring_length_m: Length | None = None
@@ -194,6 +205,7 @@ class Array(StudyModel):
         values = with_grade(dict(given))
         rings, free = values.get("ring") or (), values.get("free_blocks")
         if rings and isinstance(rings, list | tuple):
+            rings = values["ring"] = [one for ring in rings for one in _repeated(ring)]
             values.setdefault("rings", len(rings))
             for key in ("blocks_per_ring", "inner_radius_m", "outer_radius_m", "block"):
                 found = [value for value in (_value(ring, key) for ring in rings)
@@ -303,6 +315,14 @@ class Array(StudyModel):
 def block_name(ring: int, slot: int) -> str:
     """Return the name of a block of a ring: ``r01s05`` is ring 1, slot 5."""
     return f"r{ring:02d}s{slot:02d}"
+
+
+def _repeated(ring: Any) -> list[Any]:
+    """Return the equal rings that a table with ``count`` stands for, each with a count of 1."""
+    count = ring.get("count", 1) if isinstance(ring, dict) else 1
+    if not isinstance(count, int) or not 1 < count <= MAX_RINGS or ring.get("z_m") is not None:
+        return [ring]  # its own validation tells what is wrong
+    return [ring | {"count": 1}] * count
 
 
 def _value(ring: Any, key: str) -> Any:

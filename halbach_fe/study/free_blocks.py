@@ -146,7 +146,12 @@ class FreeBlocks(StudyModel):
     @model_validator(mode="before")
     @classmethod
     def _with_grades(cls, given: Any) -> Any:
-        return columns_with_grades(given) if isinstance(given, dict) else given
+        """Fill in what the grades say, and leave out columns without any value."""
+        if not isinstance(given, dict):
+            return given
+        return columns_with_grades({
+            column: values for column, values in given.items()
+            if not isinstance(values, list | tuple) or any(value is not None for value in values)})
 
     @model_validator(mode="after")
     def _consistent(self) -> FreeBlocks:
@@ -204,10 +209,10 @@ class FreeBlocks(StudyModel):
                          f"has no {column}; leave the cell empty")
 
     def _check_strengths(self) -> None:
-        components = np.array([self.given(column) for column in REMANENCE_VECTOR])
-        self._refuse(self.given("remanence_T") == components.any(axis=0),
+        components = np.sum([self.given(column) for column in REMANENCE_VECTOR], axis=0)
+        self._refuse(self.given("remanence_T") == (components > 0),
                      f"needs either remanence_T or {', '.join(REMANENCE_VECTOR)}")
-        self._refuse(components.any(axis=0) & ~components.all(axis=0),
+        self._refuse((components > 0) & (components < len(REMANENCE_VECTOR)),
                      f"needs all of {', '.join(REMANENCE_VECTOR)}")
 
     def given(self, column: str) -> NDArray[np.bool_]:
@@ -277,8 +282,8 @@ class FreeBlocks(StudyModel):
         """Rough inner and outer radius in m of the space about the z axis that the blocks fill."""
         half = [self.numbers(column, 0.0) / 2
                 for column in ("size_x_m", "size_y_m", "inner_width_m", "outer_width_m")]
-        corners = [max((math.hypot(*corner) for corner in outline or ()), default=0.0)
-                   for outline in self.outline_m or [()] * len(self)]
+        corners = np.array([max((math.hypot(*corner) for corner in outline or ()), default=0.0)
+                            for outline in self.outline_m or [()] * len(self)])
         reach = np.max([*half, self.numbers("radius_m", 0.0), corners], axis=0)
         radius = self.numbers("outer_radius_m", 0.0)  # of sectors
         centre = np.hypot(self.x_m, self.y_m)

@@ -238,7 +238,8 @@ def _check_count(count: int, where: str) -> None:
 
 def _parsed(column: str, cells: list[Any], rows: Callable[[int], str], where: str) -> list[Cell]:
     """Return the values of a column, None where a cell is empty or NaN (not equal to itself)."""
-    kind, expected = _text, "printable text"
+    kind: Callable[[object], Cell] = _text
+    expected = "printable text"
     quick: list[Cell] | None = None
     if column == "outline_m":
         kind, expected = _outline, "corners as `x y; x y; x y`"
@@ -268,7 +269,7 @@ def _numbers(cells: list[Any]) -> list[Cell] | None:
                 None if cell != cell else float(cell) for cell in cells]
         if not (NUMERIC.issuperset("".join(cells)) and max(map(len, cells)) <= MAX_CELL):
             return None
-        values = [float(cell) if cell else None for cell in cells]
+        values: list[Cell] = [float(cell) if cell else None for cell in cells]
     except (TypeError, ValueError):
         return None
     return values if np.isfinite([value or 0.0 for value in values]).all() else None

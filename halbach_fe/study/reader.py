@@ -96,7 +96,9 @@ def _with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dic
     """Return the document with the table of free blocks in place of its file's name."""
     array = document.get("array")
     free = array.get("free_blocks") if isinstance(array, dict) else None
-    file = free.get("file") if isinstance(free, dict) else None
+    if not (isinstance(array, dict) and isinstance(free, dict)):
+        return document
+    file = free.get("file")
     if not (isinstance(file, str) and file.isprintable() and 0 < len(file) <= MAX_PATH):
         return document  # the validation says what is wrong
     if len(free) > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +11,11 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.bodies import Body, TrueMagnet, vector
 from halbach_fe.synthetic.helmholtz_coil import moments
+from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
+
+ALONG_Z = 1e-6
+"""Sine of the angle to the magnet's axis below which a magnetization has no direction across."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,18 @@ def _deviating(body: Body, deviation: Floats) -> Body:
     """Return the body with another magnetization M.
 
     ``deviation`` (3,) is the change as fractions of M: along M, perpendicular to it in the plane of
-    the ring, and along z.
+    the ring, and perpendicular to both, which is along z unless M leaves the plane.
     """
     nominal = body.magnetization
-    axes = np.array([nominal, np.cross([0, 0, 1], nominal), np.linalg.norm(nominal) * np.eye(3)[2]])
+    size = np.linalg.norm(nominal)
+    if not size:  # the block is missing
+        return body
+    along = nominal / size
+    across = np.cross([0, 0, 1], along)
+    if np.linalg.norm(across) < ALONG_Z:
+        across = np.cross([0, 1, 0], along)
+    across /= np.linalg.norm(across)
+    axes = size * np.array([along, across, np.cross(along, across)])
     return body.with_magnetization(nominal + deviation @ axes)
 
 
@@ -67,7 +79,9 @@ def coil_table(
     study: Study, nominal: TrueMagnet, single: TrueMagnet, coil_sd: float,
     generator: np.random.Generator
 ) -> tuple[BlockTable, float]:
-    """Measure the moments of the single blocks in a Helmholtz coil.
+    """Measure the moments of the single blocks in a Helmholtz coil before they are mounted.
+
+    Ring and slot are those that a block was made for. Missing blocks are left out.
 
     Parameters
     ----------
@@ -83,25 +97,36 @@ def coil_table(
         Relative error of the coil, drawn with the standard deviation ``prior.common_mode_sd``. It
         is the same for all blocks, whose moments are measured too small if it is positive.
     """
-    length = study.array.ring_length_m or study.array.outer_radius_m
-    true = moments(single.bodies, length)
-    sigma = coil_sd * np.linalg.norm(moments(nominal.bodies, length), axis=1)
+    length = study.array.ring_length_m or study.array.outer_radius_m  # of infinite blocks
+    there: dict[tuple[int, int], int] = {}
+    for number, body in enumerate(nominal.bodies):
+        if any(body.remanence):
+            there.setdefault(body.made_for or (body.ring, body.slot), number)
+    bodies = _before_mounting(nominal, there.values())
+    true = moments(_before_mounting(single, there.values()), length)
+    sigma = coil_sd * np.linalg.norm(moments(bodies, length), axis=1)
     calibration = float(study.prior.common_mode_sd * generator.standard_normal())
     measured = true / (1 + calibration) + sigma[:, None] * generator.standard_normal(true.shape)
     # the last digits differ from solve to solve
     digits = 10 - int(np.log10(np.abs(measured).max()))
     label = {slot: name for name, slots in study.prior.types.items() for slot in slots}
     reference = study.prior.reference_temperature_C
-    bodies = nominal.bodies
-    shapes = [replace(body.shape, length=min(length, body.shape.length)) for body in bodies]
+    shapes = [replace(body.shape, length=length) if np.isinf(body.shape.length) else body.shape
+              for body in bodies]
     return BlockTable(
-        serial=tuple(f"B{number:04d}" for number in range(1, len(bodies) + 1)),
-        type=tuple(label.get(body.slot, str(body.slot)) for body in bodies),
-        ring=np.array([body.ring for body in bodies]),
-        slot=np.array([body.slot for body in bodies]),
+        serial=tuple(f"B{number + 1:04d}" for number in there.values()),
+        type=tuple(label.get(slot) or body.type or str(slot)
+                   for (_, slot), body in zip(there, bodies, strict=True)),
+        ring=np.array([ring for ring, _ in there]), slot=np.array([slot for _, slot in there]),
         moment=measured.round(digits), sigma=sigma.round(digits),
         volume=np.array([shape.volume for shape in shapes]),
         temperature=np.full(len(bodies), np.nan if reference is None else reference)), calibration
+
+
+def _before_mounting(magnet: TrueMagnet, numbers: Iterable[int]) -> tuple[Body, ...]:
+    """Return some bodies, by number, without what happened to their magnetizations later."""
+    return tuple(replace(body, remanence=vector(np.array(body.remanence) / body.factor))
+                 for body in (magnet.bodies[number] for number in numbers))
 
 
 def magnetizations(magnet: TrueMagnet) -> list[dict[str, object]]:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.synthetic.bodies import ZERO_VECTOR, Vector
+from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Vector
 
 IDEAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

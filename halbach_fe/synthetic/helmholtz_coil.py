@@ -1,4 +1,4 @@
-"""The moment of a single block that a Helmholtz coil measures, by NGSolve.
+"""The moment of a single block that a Helmholtz coil measures, by NGSolve or by Gauss points.
 
 The demagnetizing field of a block of recoil permeability mu changes its moment, which is
 ``int (B_r + (mu - 1) mu_0 H) dV / mu_0``. The field ``mu_0 H = -grad psi`` follows from the same
@@ -15,12 +15,21 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
 from halbach_fe.synthetic.ngsolve_reaction import outline_face
 from halbach_fe.synthetic.optional_packages import import_extra
+from halbach_fe.synthetic.separate_reaction import lone_moment_matrix
+from halbach_fe.synthetic.shapes import Shape
+from halbach_fe.synthetic.true_magnet import Body
 
 PRECISION = 1e-12
 """Relative tolerance of the conjugate gradients."""
+
+VACUUM = tuple(np.eye(3).ravel().tolist())
+"""The permeability of vacuum, row by row."""
+
+MOST_SOLVES = 24
+"""Largest number of different blocks for which NGSolve solves, some seconds each. Of more different
+ones, `lone_moment_matrix` gives the moments to some 1e-4."""
 
 
 def moments(bodies: tuple[Body, ...], length: float) -> Floats:
@@ -29,13 +38,19 @@ def moments(bodies: tuple[Body, ...], length: float) -> Floats:
     Bodies of infinite length are given the finite ``length`` in m. Bodies of the same shape and
     permeability share their solves.
     """
-    found = []
+    kinds = []
     for body in bodies:
-        shape = body.shape
+        shape, seat = body.shape, body.seat_orientation.as_matrix()
         if np.isinf(shape.length):
             shape = replace(shape, length=length)
-        matrix = _known_matrix(shape, tuple(body.permeability.round(12).ravel()))
-        found.append(matrix @ body.remanence * body.mean_factor)
+        tensor = seat.T @ body.permeability @ seat
+        kinds.append((shape, tuple((tensor.round(12) + 0.0).ravel().tolist())))
+    few = len({kind for kind in kinds if kind[1] != VACUUM}) <= MOST_SOLVES
+    found = []
+    for body, (shape, permeability) in zip(bodies, kinds, strict=True):
+        matrix = (_known_matrix if few else _estimated_matrix)(shape, permeability)
+        own = body.seat_orientation.inv().apply(body.remanence) * body.mean_factor
+        found.append(body.seat_orientation.apply(matrix @ own))
     return np.array(found)
 
 
@@ -50,6 +65,12 @@ def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
     return moment_matrix(shape, tensor, None if vacuum else _known_mesh(shape))
 
 
+@lru_cache(maxsize=4096)
+def _estimated_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
+    """Return `lone_moment_matrix`, cached; ``permeability`` is the tensor row by row."""
+    return lone_moment_matrix(shape, np.reshape(permeability, (3, 3)))
+
+
 @lru_cache(maxsize=1)
 def _known_mesh(shape: Shape) -> Any:
     return block_mesh(shape)
@@ -60,9 +81,9 @@ def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: i
 
     Parameters
     ----------
-    shape : SectorBody or PrismBody
+    shape : Shape
     permeability : ndarray, shape (3, 3)
-        Relative recoil permeability in the block's own axes, as is the matrix.
+        Relative recoil permeability in the shape's axes, as is the matrix.
     mesh : ngsolve.Mesh, optional
         A `block_mesh` of the shape, which is made if it is not given.
     order : int
@@ -100,7 +121,7 @@ def block_mesh(shape: Shape, size: float | None = None) -> Any:
     error of the moment is then 4e-5 for a sector of the FASER dipole.
     """
     ngs, occ = import_extra("ngsolve"), import_extra("netgen.occ")
-    thickness = shape.outer - shape.inner if isinstance(shape, SectorBody) else shape.depth
+    thickness = shape.thickness
     size = size or thickness / 3
     block = outline_face(shape, np.zeros(2), 0.0, -shape.length / 2).Extrude(
         occ.Vec(0, 0, shape.length))

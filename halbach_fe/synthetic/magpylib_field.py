@@ -1,14 +1,15 @@
-"""The field of bodies in vacuum, by magpylib.
+"""The field of bodies in vacuum, by magpylib in three dimensions and in closed form in two.
 
 A body of remanence B_r and recoil permeability mu_r follows ``B = mu_0 mu_r H + B_r``. Here it is
 replaced by one of polarization B_r and permeability 1, as if its material did not respond to the
-field. `halbach_fe.synthetic.ngsolve_reaction` adds the field of that response.
+field. `halbach_fe.synthetic.reaction` adds the field of that response. All fields are mu_0 H, which
+is B outside bodies.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,16 +17,18 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
-from halbach_fe.synthetic.bodies import Body, SectorBody, Shape
+from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.optional_packages import import_extra
-
-LONG = 250.0
-"""Length that stands for an infinite one, relative to the distance of the points from the middle.
-
-The ends change the field by a term in 1/length^2. Extrapolation from this length and its double
-removes that term; the remaining error is 1e-9 of the remanence, about magpylib's rounding error for
-bodies of this length.
-"""
+from halbach_fe.synthetic.plane_field import plane_field
+from halbach_fe.synthetic.shapes import (
+    CylinderBody,
+    Fractions,
+    PrismBody,
+    SectorBody,
+    Shape,
+    triangulated,
+)
+from halbach_fe.synthetic.true_magnet import Body
 
 SAME_PLACE = 10
 """Decimals of coordinates in m to which two points count as the same: 1e-10 m, or 1e-9 T."""
@@ -38,16 +41,18 @@ by at most 1e-7 T.
 """
 
 AT_ONCE = 10_000
-"""Number of points between two reports of progress."""
+"""Number of points for which magpylib is called at once."""
+
+SEARCHED = 1_000_000
+"""Largest number of bodies times points that are searched for equal positions: 24 MB."""
 
 Progress = Callable[[int, int], None]
 """Function that is called with the amount of work done and its total."""
 
-Fractions = tuple[float, float]
 Piece = tuple[Shape, Fractions, Fractions]
 """A shape, and the fractions of its thickness and half width that limit a part of it.
 
-See `halbach_fe.synthetic.bodies.BodyPart`.
+See `halbach_fe.synthetic.true_magnet.BodyPart`.
 """
 
 WHOLE: tuple[Fractions, Fractions] = ((0.0, 1.0), (-1.0, 1.0))
@@ -82,86 +87,100 @@ class _Task:
 def vacuum_field(
     bodies: Sequence[Body], points: Floats, progress: Progress = no_progress
 ) -> Floats:
-    """Return B (n, 3) in T of bodies in vacuum, at points (n, 3) in m outside them.
+    """Return mu_0 H (n, 3) in T of bodies in vacuum, at points (n, 3) in m; it is B outside them.
 
     The field of infinite bodies is that of a cross-section and does not depend on the points' z.
     Bodies of the same shape share the computation at points that have the same coordinates in the
     axes of both, as many points of a map on circles have.
     """
-    tasks = tasks_of(bodies, points)
-    total = sum(len(task.points) * len(task.polarizations) for task in tasks)
+    total = sum(1 + len(body.parts) for body in bodies) * len(points)
     done, field = 0, np.zeros((len(points), 3))
-    for task in tasks:
-        columns = []
-        for polarization in task.polarizations:
-            parts = []
-            for chunk in np.array_split(task.points, len(task.points) // AT_ONCE + 1):
-                parts.append(_field(task.piece, polarization, chunk))
-                done += len(chunk)
-                progress(done, total)
-            columns.append(np.vstack(parts))
-        own = np.stack(columns, axis=2)
+    for task in tasks_of(bodies, points):
+        own = np.stack([piece_field(task.piece, polarization, task.points)
+                        for polarization in task.polarizations], axis=2)
         for number, index, weights in task.users:
             body_field = own[index] @ (np.ones(1) if weights is None else weights)
-            field += bodies[number].orientation.apply(body_field)
+            field += body_field @ bodies[number].shape_orientation.as_matrix().T
+        done += len(task.users) * len(points)
+        progress(done, total)
     return field
 
 
-def tasks_of(bodies: Sequence[Body], points: Floats) -> list[_Task]:
+def tasks_of(bodies: Sequence[Body], points: Floats) -> Iterator[_Task]:
     """Divide the computation of `vacuum_field` into tasks.
 
     Where pieces of the same shape share enough points, one task computes the fields of three unit
     polarizations for all of them; otherwise each piece has a task with its own polarization.
     """
+    if not len(points):
+        return
     groups: dict[Piece, list[tuple[int, Floats]]] = {}
     for number, body in enumerate(bodies):
-        remanence = np.array(body.remanence)
+        remanence = body.seat_orientation.inv().apply(body.remanence)
         groups.setdefault((body.shape, *WHOLE), []).append((number, remanence))
         for part in body.parts:  # deviation of the part from the body
             groups.setdefault((body.shape, part.u, part.v), []).append(
                 (number, (part.factor - 1) * remanence))
-    tasks = []
+    at_once = max(1, SEARCHED // len(points))
     for piece, members in groups.items():
-        seen = [bodies[number].orientation.inv().apply(points - bodies[number].position)
-                for number, _ in members]
-        if np.isinf(piece[0].length):
-            seen = [local * [1, 1, 0] for local in seen]
+        for first in range(0, len(members), at_once):
+            yield from _tasks(piece, members[first:first + at_once], bodies, points)
+
+
+def _tasks(
+    piece: Piece, members: list[tuple[int, Floats]], bodies: Sequence[Body], points: Floats
+) -> Iterator[_Task]:
+    """Yield the tasks of some pieces of the same shape, see `tasks_of`."""
+    seen = [bodies[number].in_shape(points) for number, _ in members]
+    if np.isinf(piece[0].length):
+        seen = [local * [1, 1, 0] for local in seen]
+    if len(members) > 3:
         together = np.vstack(seen)
-        _, first, inverse = np.unique(together.round(SAME_PLACE), axis=0, return_index=True,
+        # one number for a place: many times faster than np.unique of rows
+        places = together.round(SAME_PLACE) @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
+        _, first, inverse = np.unique(places.round(SAME_PLACE), return_index=True,
                                       return_inverse=True)
-        if 3 * len(first) < len(together):
-            places = inverse.reshape(len(members), len(points))
-            tasks.append(_Task(piece, np.eye(3), together[first], tuple(
-                (number, places[row], polarization)
-                for row, (number, polarization) in enumerate(members))))
-        else:
-            tasks += [_Task(piece, polarization[None], local, ((number, slice(None), None),))
-                      for (number, polarization), local in zip(members, seen, strict=True)]
-    return tasks
+        if 3 * len(first) < len(together) and np.allclose(
+                together[first][inverse], together, rtol=0, atol=10 * 10.0**-SAME_PLACE):
+            rows = inverse.reshape(len(members), len(points))
+            yield _Task(piece, np.eye(3), together[first], tuple(
+                (number, rows[row], polarization)
+                for row, (number, polarization) in enumerate(members)))
+            return
+    for (number, polarization), local in zip(members, seen, strict=True):
+        yield _Task(piece, polarization[None], local, ((number, slice(None), None),))
 
 
-def _field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
-    """Return B (n, 3) in T of a piece at points (n, 3) in m, both in its own axes.
+def unit_fields(body: Body, points: Floats) -> Floats:
+    """Return mu_0 H (n, 3, 3) in T of a body without its parts per T of uniform polarization.
+
+    The last index is the direction of the polarization. Points (n, 3) in m, inside or outside, and
+    directions are along the magnet's axes.
+    """
+    turn = body.shape_orientation.as_matrix()
+    local = body.in_shape(points)
+    own = np.stack([piece_field((body.shape, *WHOLE), axis, local) for axis in np.eye(3)], axis=2)
+    return np.asarray(turn @ own @ turn.T)
+
+
+def piece_field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
+    """Return mu_0 H (n, 3) in T of a piece at points (n, 3) in m, both in its own axes.
 
     Raises
     ------
     CheckFailedError
         If magpylib returns no finite field at some of the points.
     """
-    shape, u, v = piece
-    if np.isinf(shape.length):
-        length = LONG * max(np.abs(points).max(), _reach(shape))
-        short, long = (_field((replace(shape, length=factor * length), u, v), polarization, points)
-                       for factor in (1, 2))
-        return (4 * long - short) / 3 * [1, 1, 0]
-    source = _source(shape, u, v, polarization)
-    # All points are outside. A test for points inside a mesh is slow, and wrong for slender bodies.
-    mesh = isinstance(source, import_extra("magpylib").magnet.TriangularMesh)
-    where = {"in_out": "outside"} if mesh else {}
+    if not np.any(polarization):
+        return np.zeros((len(points), 3))
+    if np.isinf(piece[0].length):
+        return plane_field(*piece, polarization, points)
+    compute = _computation(piece, polarization)
 
     def field(at: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(source.getB(at, squeeze=False, **where)[0, 0, 0])
+            return np.vstack([compute(chunk)
+                              for chunk in np.array_split(at, len(at) // AT_ONCE + 1)])
 
     found = field(points)
     lost = ~np.isfinite(found).all(axis=1)
@@ -172,25 +191,56 @@ def _field(piece: Piece, polarization: Floats, points: Floats) -> Floats:
     return found
 
 
-def _reach(shape: Shape) -> float:
-    """Return a length in m that is characteristic of the body's cross-section."""
-    if isinstance(shape, SectorBody):
-        return shape.outer - shape.inner
-    return max(shape.depth, shape.outer_width)
-
-
-def _source(shape: Shape, u: Fractions, v: Fractions, polarization: Floats) -> Any:
-    """Return the magpylib source of a piece, in the piece's own axes."""
+def _computation(piece: Piece, polarization: Floats) -> Callable[[Floats], Floats]:
+    """Return the function that computes the field of a piece of finite length."""
+    shape, u, v = piece
     magnet = import_extra("magpylib").magnet
     if isinstance(shape, SectorBody):
         radii, angles = shape.part(u, v)
-        return magnet.CylinderSegment(
+        return _of_source(magnet.CylinderSegment(
             dimension=(*radii, shape.length, *np.degrees(angles)), polarization=polarization,
-            position=(-shape.middle, 0, 0))
-    if shape.inner_width == shape.outer_width and (u, v) == WHOLE:
+            position=(-shape.middle, 0, 0)))
+    if isinstance(shape, CylinderBody):
+        return _of_source(magnet.Cylinder(dimension=(2 * shape.radius, shape.length),
+                                          polarization=polarization))
+    if isinstance(shape, PrismBody) and shape.is_cuboid and (
+            u, v) == WHOLE:
         turn = Rotation.from_euler("z", shape.turn)
-        return magnet.Cuboid(dimension=(shape.depth, shape.inner_width, shape.length),
-                             polarization=turn.inv().apply(polarization), orientation=turn)
-    corners = shape.part(u, v)
-    hull = [(x, y, z) for x, y in corners for z in (-shape.length / 2, shape.length / 2)]
-    return magnet.TriangularMesh.from_ConvexHull(points=hull, polarization=polarization)
+        return _of_source(magnet.Cuboid(
+            dimension=(shape.depth, shape.inner_width, shape.length),
+            polarization=turn.inv().apply(polarization), orientation=turn))
+    triangles = _surface(shape.part(u, v), shape.length)
+    core = import_extra("magpylib.core")
+
+    def charged(points: Floats) -> Floats:
+        total = np.zeros((len(points), 3))
+        for triangle in triangles:
+            total += core.triangle_Bfield(
+                points, np.broadcast_to(triangle, (len(points), 3, 3)),
+                np.broadcast_to(polarization, (len(points), 3)))
+        return total
+
+    return charged
+
+
+def _of_source(source: Any) -> Callable[[Floats], Floats]:
+    """Return the function that gives mu_0 H of a magpylib source."""
+    return lambda points: MU_0 * np.asarray(source.getH(points, squeeze=False)[0, 0, 0])
+
+
+def _surface(corners: Floats, length: float) -> Floats:
+    """Return the triangles (n, 3, 3) in m of a prism's surface, their normals outward."""
+    half = length / 2
+
+    def at(corner: complex, z: float) -> tuple[float, float, float]:
+        return corner.real, corner.imag, z
+
+    outline = tuple(complex(x, y) for x, y in corners)
+    found = []
+    for a, b, c in triangulated(outline):
+        found += [[at(a, half), at(b, half), at(c, half)], [at(a, -half), at(c, -half),
+                                                            at(b, -half)]]
+    for a, b in zip(outline, outline[1:] + outline[:1], strict=True):
+        found += [[at(a, -half), at(b, -half), at(b, half)], [at(a, -half), at(b, half),
+                                                              at(a, half)]]
+    return np.array(found)

@@ -19,21 +19,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.bodies import (
-    Body,
-    FroehlichLaw,
-    IronLaw,
-    SectorBody,
-    Shape,
-    TableLaw,
-    TrueMagnet,
-    Tube,
-)
+from halbach_fe.synthetic.iron import FroehlichLaw, IronLaw, Pole, TableLaw, Tube
 from halbach_fe.synthetic.optional_packages import import_extra
+from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
+from halbach_fe.synthetic.true_magnet import Body, TrueMagnet
 
 RESIDUAL = 1e-11
 """Residual, relative to the first, at which Newton's method stops.
@@ -114,7 +108,7 @@ def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Fl
     rule = ngs.IntegrationRule(kind, 2 * (potential.space.globalorder - 1))
     responding = mesh.Materials("|".join(["iron", *(
         f"block{number}" for number, body in enumerate(magnet.all_bodies)
-        if not body.along == body.across == 1.0)]))
+        if not body.is_vacuum)]))
     where = mesh.MapToAllElements({kind: rule}, responding)
     places = np.array(ngs.CF((ngs.x, ngs.y, ngs.z)[:size])(where))
     jacobian = np.array(ngs.specialcf.JacobianMatrix(size, size)(where)).reshape(-1, size, size)
@@ -153,18 +147,25 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     """Return a mesh with the regions ``block0``, ``block1``, ..., ``iron`` and ``air``.
 
     Its outer boundary is named ``far`` and encloses all ``points`` (n, 3) in m.
+
+    Raises
+    ------
+    CheckFailedError
+        If Netgen cannot mesh the bodies.
     """
     ngs, occ = import_extra("ngsolve"), import_extra("netgen.occ")
     flat = magnet.dimension == 2
-    size = elements.size or _thickness(magnet.bodies[0].shape) / (6 if flat else 3)
+    sizes = [elements.size or body.shape.thickness / (6 if flat else 3)
+             for body in magnet.all_bodies]
     parts = []
     for number, body in enumerate(magnet.all_bodies):
         parts.append(_solid(body, flat))
         _name(parts[-1], f"block{number}", flat)
-    for iron in magnet.all_iron:
-        parts.append(_tube(iron, flat))
+    for solid in magnet.all_iron.bodies if magnet.all_iron else ():
+        parts.append(_iron(solid, flat))
+        sizes.append(min(sizes))
         _name(parts[-1], "iron", flat)
-    for part in parts:
+    for part, size in zip(parts, sizes, strict=True):
         (part.faces if flat else part).maxh = size
     extent = max(abs(value) for part in parts for corner in part.bounding_box
                  for value in (corner.x, corner.y, corner.z))
@@ -180,7 +181,10 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     _name(air, "air", flat)
     geometry = occ.OCCGeometry(occ.Glue([*parts, air]), dim=magnet.dimension)
     rules = import_extra("netgen.meshing").MeshingParameters(maxh=far / 4, grading=elements.grading)
-    mesh = ngs.Mesh(geometry.GenerateMesh(mp=rules))
+    try:
+        mesh = ngs.Mesh(geometry.GenerateMesh(mp=rules))
+    except Exception as error:  # of a type that netgen does not export
+        raise CheckFailedError(f"Netgen cannot mesh the bodies of the magnet: {error}") from None
     mesh.Curve(3)
     return mesh
 
@@ -193,18 +197,26 @@ def _name(shape: Any, name: str, flat: bool) -> None:
         shape.mat(name)
 
 
-def _thickness(shape: Shape) -> float:
-    """Return the radial extent of a block in m."""
-    return shape.outer - shape.inner if isinstance(shape, SectorBody) else shape.depth
-
-
 def _solid(body: Body, flat: bool) -> Any:
     """Return the body in its nominal place as a solid, or as a face if ``flat``."""
-    shape = body.meshed_shape or body.shape
+    shape, turn = body.meshed_shape or body.shape, body.nominal_orientation
     x, y, z = body.centre
-    face = outline_face(shape, np.array([x, y]), body.angle,
-                        0.0 if flat else z - shape.length / 2)
-    return face if flat else face.Extrude(import_extra("netgen.occ").Vec(0, 0, shape.length))
+    upright = turn.apply([0.0, 0.0, 1.0])[2] > 1 - 1e-12
+    angle = body.angle + body.seat[2] if upright else 0.0
+    face = outline_face(shape, np.array([x, y]), angle, 0.0 if flat else z - shape.length / 2)
+    if flat:
+        return face
+    occ = import_extra("netgen.occ")
+    solid = face.Extrude(occ.Vec(0, 0, shape.length))
+    return solid if upright else _rotated(solid, turn, body.centre)
+
+
+def _rotated(solid: Any, turn: Rotation, centre: tuple[float, float, float]) -> Any:
+    """Return a solid rotated about a point in m."""
+    occ = import_extra("netgen.occ")
+    vector = turn.as_rotvec()
+    return solid.Rotate(occ.Axis(occ.Pnt(*centre), occ.Dir(*vector)),
+                        float(np.degrees(np.linalg.norm(vector))))
 
 
 def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
@@ -218,8 +230,13 @@ def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
     def at(x: float, y: float) -> Any:
         return occ.Pnt(*(np.array([x, y]) @ turn + centre), z)
 
+    if isinstance(shape, CylinderBody):
+        eighths = [at(shape.radius * np.cos(phi), shape.radius * np.sin(phi))
+                   for phi in np.pi / 4 * np.arange(9)]
+        return occ.Face(occ.Wire([occ.ArcOfCircle(*eighths[first:first + 3])
+                                  for first in (0, 2, 4, 6)]))
     if not isinstance(shape, SectorBody):
-        corners = [at(*corner) for corner in shape.part()]
+        corners = [at(*corner) for corner in shape.corners]
         return occ.Face(occ.Wire([occ.Segment(start, end) for start, end in
                                   zip(corners, [*corners[1:], corners[0]], strict=True)]))
 
@@ -234,14 +251,20 @@ def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
         occ.ArcOfCircle(corner(inner, half), corner(inner, 0), corner(inner, -half))]))
 
 
-def _tube(iron: Tube, flat: bool) -> Any:
-    """Return an iron tube as a solid, or as a face if ``flat``."""
+def _iron(body: Tube | Pole, flat: bool) -> Any:
+    """Return a body of iron as a solid, or as a face if ``flat``."""
     occ = import_extra("netgen.occ")
+    if isinstance(body, Pole):
+        face = outline_face(PolygonBody(body.outline, np.inf), np.zeros(2), 0.0,
+                            0.0 if flat else body.middle - body.half_length)
+        return face if flat else face.Extrude(occ.Vec(0, 0, 2 * body.half_length))
     if flat:
-        return occ.Circle((0, 0), iron.outer).Face() - occ.Circle((0, 0), iron.inner).Face()
-    axis = occ.Axes((0, 0, iron.middle - iron.half_length), occ.Z)
-    return (occ.Cylinder(axis, iron.outer, 2 * iron.half_length)
-            - occ.Cylinder(axis, iron.inner, 2 * iron.half_length))
+        disc = occ.Circle((0, 0), body.outer).Face()
+        return disc - occ.Circle((0, 0), body.inner).Face() if body.inner else disc
+    axis = occ.Axes((0, 0, body.middle - body.half_length), occ.Z)
+    cylinder = occ.Cylinder(axis, body.outer, 2 * body.half_length)
+    return (cylinder - occ.Cylinder(axis, body.inner, 2 * body.half_length) if body.inner
+            else cylinder)
 
 
 # --- materials ---------------------------------------------------------------------------------

@@ -1,7 +1,9 @@
 """A synthetic measurement campaign: block table, map, held-out map, and the truth.
 
 magpylib computes the field of the blocks in vacuum, and NGSolve the field that permeability and
-iron add. halbach-fe's own model of the field is not used, so that it can be tested on the result.
+iron add; see `halbach_fe.synthetic.magpylib_field` and `halbach_fe.synthetic.reaction` for the
+cases that have methods of their own. halbach-fe's model of the field is not used, so that it can be
+tested on the result.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
@@ -23,9 +26,10 @@ from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.synthetic.bodies import TrueMagnet, magnet_of
+from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import (
@@ -36,9 +40,11 @@ from halbach_fe.synthetic.hidden_effects import (
 )
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.magpylib_field import Progress, no_progress, vacuum_field
-from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
+from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
 from halbach_fe.synthetic.optional_packages import version_of
 from halbach_fe.synthetic.positions import between
+from halbach_fe.synthetic.reaction import by_elements, reaction_field
+from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 COIL_SD = 0.001
 """Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""
@@ -117,7 +123,7 @@ def simulate_campaign(
     ------
     StudyError
         If the study does not state the noise of its readings, measures at a point inside a
-        material, or cannot have one of the effects.
+        material, or cannot have one of the effects, or if its magnet cannot be simulated.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
     """
@@ -189,7 +195,8 @@ def true_field(
     spheres = np.array([sphere.place for sphere in magnet.objects]).reshape(-1, 3)
     everywhere = np.vstack([points, spheres])
     field = (vacuum_field(magnet.all_bodies, everywhere, progress)
-             + reaction_field(magnet, everywhere, elements) + magnet.background)
+             + reaction_field(magnet, everywhere, elements, progress)
+             + _external_field(magnet, everywhere, progress))
     result = field[:len(points)]
     for sphere, own in zip(magnet.objects, field[len(points):], strict=True):
         result = result + moment_field(np.array([sphere.place]), 3 * sphere.volume * own[None],
@@ -197,11 +204,26 @@ def true_field(
     return result
 
 
+def _external_field(magnet: TrueMagnet, points: Floats, progress: Progress) -> Floats:
+    """Return B (n, 3) in T of the sources outside the magnet, to which nothing reacts."""
+    field = np.tile(magnet.background, (len(points), 1)).astype(float)
+    for neighbour in magnet.neighbours:
+        turn = Rotation.from_euler("z", neighbour.turn)
+        seen = turn.inv().apply(points - [0.0, 0.0, neighbour.shift])
+        field += neighbour.factor * turn.apply(vacuum_field(magnet.bodies, seen, progress))
+    for place, moment in magnet.dipoles:
+        field += moment_field(np.array([place]), MU_0 * np.array([moment]), points)
+    return field
+
+
 def model_of(magnet: TrueMagnet) -> dict[str, str]:
     """Return the programs that compute a magnet's field, with their versions."""
-    programs = {"vacuum": f"magpylib {version_of('magpylib')}"}
+    own = f"halbach_fe.synthetic {version_of('halbach-fe')}"
+    programs = {"vacuum": f"magpylib {version_of('magpylib')}" if magnet.dimension == 3
+                else f"closed form of {own}"}
     if not magnet.is_vacuum:
-        programs["reaction"] = f"NGSolve {version_of('ngsolve')}"
+        programs["reaction"] = (f"NGSolve {version_of('ngsolve')}" if by_elements(magnet)
+                                else f"Gauss points of {own}")
     return programs
 
 

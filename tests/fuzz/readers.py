@@ -46,6 +46,13 @@ from halbach_fe.solver.runs import newton_residuals
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.study.edit_file import edited_text
+from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
+from halbach_fe.study.free_blocks import FreeBlocks
+from halbach_fe.study.free_blocks_file import (
+    free_blocks_of_file,
+    read_free_blocks,
+    write_free_blocks,
+)
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import _with_table, parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
@@ -99,6 +106,15 @@ serial,type,ring,slot,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2,volume_m3,temperature_C
 A-001,a,1,1,500.0,1.5,-2.25,0.5,5e-4,21.5
 A-002,a,1,2,501.0,-1.5,2.0,0.5,,
 A-003,"b, new",,,499.0,0,0,0.5,5e-4,20
+"""
+FREE_CSV = b"""# by hand
+name,type,shape,ring,slot,x_m,y_m,z_m,rotation_z_deg,size_x_m,size_y_m,size_z_m,inner_radius_m,\
+outer_radius_m,angle_deg,radius_m,sides,outline_m,material,remanence_T,remanence_x_T,remanence_y_T,\
+remanence_z_T,recoil_permeability,magnetization_gradient
+a,"new, coated",cuboid,1,1,0.1,0,0,45,0.01,.02,3e-2,,,,,,,N42,,,,,1.05,0.1
+b,,sector,1,2,0,0.1,-0.0,,,,0.03,0.01,0.02,200,,,,,1.3,,,,,
+c,,polygon,1,3,-1D-1,0,0,-720,,,0.03,,,,0.01,7,,,,0.1,-2,0,,
+d,,prism,2,1,0,0,0.5,,,,0.03,,,,,,0 0; 0.01 0; 0 0.01,n42sh,1.1,,,,,
 """
 
 
@@ -228,6 +244,23 @@ def check_finite(found) -> None:
 
 def check_blocks(table: BlockTable) -> None:
     written(".csv", write_blocks, table)
+
+
+def free_hdf5() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "free.csv")
+        path.write_bytes(FREE_CSV)
+        return written(".h5", write_free_blocks, free_blocks_of_file(path))
+
+
+def check_free_blocks(table: FreeBlocks) -> None:
+    assert FreeBlocks.model_validate(table.model_dump()) == table
+    assert len(table.places) == len(table.origins_m) == len(table)
+    assert sum(table.radii_m) > 0
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "free.csv")
+        write_free_blocks(table, path)
+        assert FreeBlocks.model_validate(read_free_blocks(path)) == table
 
 
 def check_study(study: Study) -> None:
@@ -398,12 +431,12 @@ LOG = (b"  0 KSP Residual norm 1.0\n", b"KSP Residual norm nan\n", b" 3 KSP Resi
 
 
 NAMES = (
-    "study", "changed study", "steel", "map (CSV)", "map (HDF5)", "map (VTU)", "block table",
-    "import: columns", "import: opera", "import: comsol", "import: openpmd", "import as columns",
-    "import as opera", "import as comsol", "import as openpmd", "posterior", "stored response",
-    "stored matrix", "stored chains", "mesh", "regions", "GetDP: unknowns",
-    "GetDP: unknowns of edges", "GetDP: solutions", "GetDP: saved solutions", "GetDP: matrix",
-    "GetDP: vectors", "GetDP: log", "cached answer")
+    "study", "changed study", "steel", "free blocks (CSV)", "free blocks (HDF5)", "map (CSV)",
+    "map (HDF5)", "map (VTU)", "block table", "import: columns", "import: opera", "import: comsol",
+    "import: openpmd", "import as columns", "import as opera", "import as comsol",
+    "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains", "mesh",
+    "regions", "GetDP: unknowns", "GetDP: unknowns of edges", "GetDP: solutions",
+    "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log", "cached answer")
 """To collect tests by, without making the seeds."""
 
 
@@ -430,6 +463,10 @@ def readers() -> tuple[Reader, ...]:
         Reader("changed study", "study.toml", (*studies, RICH), changed_study, StudyError,
                check_changed, TOML, document),
         table,
+        Reader("free blocks (CSV)", "free.csv", (FREE_CSV,), free_blocks_of_file, StudyError,
+               check_free_blocks, tuple(name.encode() for name in FREE_COLUMNS)),
+        Reader("free blocks (HDF5)", "free.h5", (free_hdf5(),), free_blocks_of_file, StudyError,
+               check_free_blocks, (*HDF5, *(name.encode() for name in FREE_COLUMNS))),
         Reader("map (CSV)", "map.csv", (MAP_CSV, written(".csv", write_map, a_map())), read_map,
                MeasurementError, check_map, COLUMNS),
         Reader("map (HDF5)", "map.h5", (written(".h5", write_map, a_map()), compact_hdf5()),

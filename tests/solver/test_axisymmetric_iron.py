@@ -17,7 +17,6 @@ from halbach_fe.solver.iron_newton import coupled_modes, to_angles, to_modes
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction
-from halbach_fe.synthetic.bodies import FroehlichLaw
 
 IRON = {"initial": 200.0, "saturation": 1.0}
 CURVE = froehlich_kennelly(**IRON)
@@ -93,7 +92,7 @@ def test_thick_plate_mirrors_a_dipole(session):
     assert worst(found.field(points), -image) > 1  # negative control: the sign
 
 
-def by_ngsolve(bodies, source, points, size, order=3):
+def by_ngsolve(bodies, source, points, size=0.012, order=2):
     """The reaction of tubes by NGSolve, with the reduced potential and a dipole's exact field.
 
     Where iron saturates, reduced potentials do not suffer from cancellation.
@@ -124,7 +123,8 @@ def by_ngsolve(bodies, source, points, size, order=3):
 
     def polarization(potential):
         field = own - ngs.grad(potential)
-        law = ngsolve_reaction.permeability(FroehlichLaw(**IRON), field * field)
+        law = ngsolve_reaction.permeability(
+            ngsolve_reaction.FroehlichLaw(**IRON), field * field)
         return (law - 1) * field
 
     form = ngs.BilinearForm(space, condense=True)
@@ -147,14 +147,14 @@ def by_ngsolve(bodies, source, points, size, order=3):
 def test_saturating_iron_against_ngsolve(bodies, session):
     """Non-linear iron near a dipole off the axis, where all modes are coupled.
 
-    Truth by elements of order 3 and 5 mm (changed by 1e-3 with 4 mm).
+    NGSolve with elements of order 2 and 12 mm differs by 4e-3, with order 3 and 8 mm by 1.6e-3 in
+    the thick tube and 6e-4 with the end plate.
     """
     moment, place = (3e-4, 0.9e-4, 1.5e-4), (0.008, 0.0, 0.005)
     points = POINTS[:3]
-    truth = by_ngsolve(bodies, (moment, place), points, 0.007)
-    found = solve_iron(bodies, dipole(moment, place), session)
-    error = np.abs(found.field(points) - truth)
-    assert error.max() < 0.01 * np.abs(truth).max()
+    truth = by_ngsolve(bodies, (moment, place), points)
+    found = solve_iron(bodies, dipole(moment, place), session, estimate=False)
+    assert worst(found.field(points), truth) < 8e-3
     other = [replace(body, law=froehlich_kennelly(IRON["initial"], 0.9)) for body in bodies]
     wrong = solve_iron(other, dipole(moment, place), session, estimate=False)
     assert worst(wrong.field(points), truth) > 0.03  # negative control: another saturation

@@ -177,6 +177,7 @@ def test_defaults_of_columns():
     assert np.isnan(blocks.numbers("recoil_permeability", np.nan)).all()
     assert blocks.given("rotation_z_deg").tolist() == [True, False]
     assert not blocks.given("angle_deg").any()
+    assert FreeBlocks(**table(2, angle_deg=[None, None])) == FreeBlocks(**table(2))
 
 
 def test_a_study_names_the_block():

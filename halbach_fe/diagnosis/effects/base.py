@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
@@ -56,12 +57,15 @@ class Place:
         Coordinates or lengths in m, whose meaning depends on the effect.
     other : (int, int)
         Ring and slot of the second block of effects that concern two; (0, 0) for others.
+    labels : tuple of str
+        Names of these blocks, of which free blocks have their own; empty to number them.
     """
 
     ring: int = 0
     slot: int = 0
     at_m: tuple[float, ...] = ()
     other: tuple[int, int] = (0, 0)
+    labels: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def name(self) -> str:
@@ -71,6 +75,8 @@ class Place:
         if self.at_m:
             lengths = (round(length, 6) + 0.0 for length in self.at_m)  # no -0, no 1e-18
             return f"at {', '.join(f'{length:.4g}' for length in lengths)} m"
+        if self.labels:
+            return ", ".join(self.labels)
         if self.other[0]:
             return f"{ring}{slot}, r{self.other[0]:02d}s{self.other[1]:02d}"
         return ring + slot
@@ -201,15 +207,26 @@ def blocks_at(nominal: NominalFields, place: Place) -> list[int]:
 
 
 def each_block(study: Study) -> list[Place]:
-    """Return a place for every block."""
-    return [Place(ring, slot) for ring, count in enumerate(study.array.blocks_by_ring, start=1)
-            for slot in range(1, count + 1)]
+    """Return a place for every block that is not missing."""
+    return [place_of(block) for block in build_magnet(study).blocks if block.remanence]
+
+
+def place_of(block: MagnetBlock, other: MagnetBlock | None = None) -> Place:
+    """Return the place of a block, or of two blocks of an effect that concerns both."""
+    both = [block] if other is None else [block, other]
+    return Place(block.ring, block.slot, other=(other.ring, other.slot) if other else (0, 0),
+                 labels=tuple(one.name for one in both))
+
+
+def can_be_uneven(block: MagnetBlock) -> bool:
+    """Tell whether a block can have a gradient or lost corners: its outline has four edges."""
+    return len(block.outline) == 4
 
 
 def each_ring(study: Study) -> list[Place]:
     """Return a place for every ring; none in two dimensions."""
-    count = len(study.array.blocks_by_ring)
-    return [] if study.dimension == 2 else [Place(ring) for ring in range(1, count + 1)]
+    rings = {block.ring for block in build_magnet(study).blocks if block.remanence}
+    return [] if study.dimension == 2 else [Place(ring) for ring in sorted(rings)]
 
 
 def with_remanence(study: Study) -> Study:

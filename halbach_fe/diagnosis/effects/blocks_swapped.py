@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, place_of, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.array import BlockException
@@ -35,10 +36,13 @@ class BlocksSwappedEffect(Effect):
     applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
-        """Return pairs of neighbours, as examples; the search uses `shortlist`."""
-        return [Place(ring, slot, other=(ring, slot % count + 1))
-                for ring, count in enumerate(study.array.blocks_by_ring, start=1)
-                for slot in range(1, count + 1)]
+        """Return pairs of successive blocks of a ring, as examples; the search uses `shortlist`."""
+        rings: dict[int, list[MagnetBlock]] = {}
+        for block in build_magnet(study).blocks:
+            rings.setdefault(block.ring, []).append(block)
+        return [place_of(block, after) for ring in rings.values()
+                for block, after in zip(ring, ring[1:] + ring[:1], strict=True)
+                if _interchangeable(block, after) and block is not after]
 
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
@@ -62,9 +66,13 @@ class BlocksSwappedEffect(Effect):
         cross = np.einsum("ija,iajb,jib->ij", change, weights, change, optimize=True)
         gain = np.einsum("ija,ia->ij", change, score.reshape(len(blocks), size))
         evidence = gain + gain.T - (here + here.T + 2 * cross) / 2
-        first, second = np.triu_indices(len(blocks), 1)
+        kinds = {key: number for number, key in enumerate(dict.fromkeys(map(_kind, blocks)))}
+        kind = np.array([kinds[_kind(block)] for block in blocks])
+        there = np.array([block.remanence != 0 for block in blocks])
+        possible = (kind[:, None] == kind) & np.outer(there, there)
+        first, second = np.nonzero(np.triu(possible, 1))
         best = np.argsort(-evidence[first, second])[:SHORTLIST]
-        return [Place(blocks[i].ring, blocks[i].slot, other=(blocks[j].ring, blocks[j].slot))
+        return [place_of(blocks[i], blocks[j])
                 for i, j in zip(first[best], second[best], strict=True)]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
@@ -86,6 +94,16 @@ class BlocksSwappedEffect(Effect):
         return with_exceptions(study, [
             BlockException(ring=here[0], slot=here[1], mounted_from=place.other),
             BlockException(ring=place.other[0], slot=place.other[1], mounted_from=here)])
+
+
+def _kind(block: MagnetBlock) -> tuple[float, float]:
+    """Return cross-section and length, which blocks share that could have changed places."""
+    return float(f"{block.area:.6g}"), float(f"{block.z_max - block.z_min:.6g}")
+
+
+def _interchangeable(block: MagnetBlock, other: MagnetBlock) -> bool:
+    """Tell whether two blocks could have changed places: neither is missing, and they are alike."""
+    return bool(block.remanence and other.remanence) and _kind(block) == _kind(other)
 
 
 EFFECTS = (BlocksSwappedEffect(),)

@@ -5,8 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, changed, with_exceptions
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    can_be_uneven,
+    changed,
+    with_exceptions,
+)
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -21,6 +29,10 @@ class CornersDemagnetizedEffect(Effect):
     title = "demagnetized corners at the bore"
     kind = "field"
     parameters = (Parameter("loss", "1", 0.1),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        return [Place()] if all(map(can_be_uneven, build_magnet(study).blocks)) else []
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""

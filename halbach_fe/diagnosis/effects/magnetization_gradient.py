@@ -12,10 +12,12 @@ from halbach_fe.diagnosis.effects.base import (
     Parameter,
     Place,
     blocks_at,
+    can_be_uneven,
     each_block,
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -33,7 +35,10 @@ class MagnetizationGradientEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
-        return [Place(), *each_block(study)]
+        blocks = build_magnet(study).blocks
+        uneven = {(block.ring, block.slot) for block in blocks if can_be_uneven(block)}
+        each = [place for place in each_block(study) if (place.ring, place.slot) in uneven]
+        return [Place(), *each] if len(uneven) == len(blocks) else each
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""

@@ -25,8 +25,8 @@ class RadialGapEffect(Effect):
         """See `Effect.signature`."""
         total = np.zeros_like(nominal.points)
         for number, block in enumerate(nominal.blocks):
-            outwards = block.middle * [1.0, 1.0, 0.0]
-            outwards /= np.linalg.norm(outwards)
+            angle = np.radians(block.angle_deg)
+            outwards = np.array([np.cos(angle), np.sin(angle), 0.0])
             total += nominal.block_translation_derivative(number, outwards)
         return total[None]
 

@@ -11,10 +11,10 @@ from difflib import get_close_matches
 import numpy as np
 
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.synthetic.bodies import TrueMagnet
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import gross_errors, instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
+from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 EFFECTS: dict[str, HiddenEffect] = {
     effect.name: effect
@@ -100,12 +100,19 @@ def _check_place(site: Site, hidden: ChosenEffect) -> None:
     if lowest == 0 and (hidden.values[0] == 0) != (hidden.values[1] == 0):
         raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
                                  "those of a block, or both 0 for all", "one of them 0"))
+    values = dict(zip((parameter.name for parameter in hidden.effect.parameters), hidden.values,
+                      strict=True))
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
         highest = limits.get(parameter.name)
         if highest is not None and (value != int(value) or not lowest <= value <= highest):
             raise StudyError(must_be(f"{parameter.name} of --hide {hidden.effect.name}",
                                      "the study", f"a whole number from {lowest} to {highest}",
                                      f"{value:g}"))
+    for prefix in ("", "other_"):
+        place = values.get(f"{prefix}ring", 0.0), values.get(f"{prefix}slot", 0.0)
+        if all(place) and place not in site.places:
+            raise StudyError(must_be(f"ring and slot of --hide {hidden.effect.name}", "the study",
+                                     "those of a block", f"{place[0]:g} and {place[1]:g}"))
 
 
 def with_effects(

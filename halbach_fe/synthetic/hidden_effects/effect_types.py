@@ -15,15 +15,15 @@ import numpy as np
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
-from halbach_fe.synthetic.bodies import TrueMagnet, Vector
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.positions import between
+from halbach_fe.synthetic.true_magnet import TrueMagnet, Vector
 
-Need = Literal["3d", "rings", "no iron", "x", "y", "z", "circles"]
+Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "x", "y", "z", "circles"]
 """A requirement of an effect on the study.
 
-These are three dimensions, several rings, no iron in the study, an observed component x, y or z,
-and points off the axis (``circles``).
+These are three dimensions, several rings, nothing but equal rings, only blocks of four edges, no
+iron in the study, an observed component x, y or z, and points off the axis (``circles``).
 """
 
 REFERENCE_OUTER_RADIUS_M = 0.2
@@ -40,7 +40,7 @@ class Site:
     Attributes
     ----------
     dimension, rings, slots : int
-        Dimension of the study, number of rings, and number of blocks per ring.
+        Dimension of the study, number of rings, and largest number of blocks per ring.
     inner, outer, half_length : float, in m
         Radii and half length of the array; infinite length in two dimensions.
     permeability : float
@@ -51,6 +51,12 @@ class Site:
         Components of B that are observed.
     radius, z_min, z_max : float, in m
         Largest radius and limits of z of all points, the held-out ones included.
+    places : tuple of pairs of int
+        Ring and slot of every block.
+    is_uniform : bool
+        Whether the array consists of equal rings only.
+    has_four_edges : bool
+        Whether all blocks have four edges.
     """
 
     dimension: int
@@ -65,6 +71,9 @@ class Site:
     radius: float
     z_min: float
     z_max: float
+    places: tuple[tuple[int, int], ...]
+    is_uniform: bool
+    has_four_edges: bool
 
     @property
     def scale(self) -> float:
@@ -76,21 +85,30 @@ class Site:
         if need in ("x", "y", "z"):
             return need in self.components
         return {"3d": self.dimension == 3, "rings": self.rings > 1, "no iron": not self.has_iron,
+                "equal rings": self.is_uniform, "four edges": self.has_four_edges,
                 "circles": self.radius > 0}[need]
+
+    def slots_of(self, ring: float) -> list[int]:
+        """Return the slots of a ring that have a block, in their order."""
+        return sorted(slot for own, slot in self.places if own == ring)
 
 
 def site_of(study: Study, magnet: TrueMagnet) -> Site:
     """Return the site of a study, whose nominal magnet is ``magnet``."""
     array, observed = study.array, study.observation
     points = np.vstack([points_from(observed.positions), between(observed.positions)])
+    sizes = array.blocks_by_ring
+    inner, outer = array.inner_radius_m, array.outer_radius_m
+    if not array.is_uniform:
+        radii = np.concatenate([np.hypot(*body.rim[:, :2].T) for body in magnet.bodies])
+        inner, outer = float(radii.min()), float(radii.max())
     return Site(
-        study.dimension, array.rings, array.blocks_per_ring, array.inner_radius_m,
-        array.outer_radius_m,
-        max(body.centre[2] + body.shape.length / 2 for body in magnet.bodies),
-        array.recoil_permeability, study.iron_ring is not None,
+        study.dimension, len(sizes), max(sizes), inner, outer, magnet.half_length,
+        min(min(body.along, body.across) for body in magnet.bodies), magnet.iron is not None,
         ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components,
         float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].min()),
-        float(points[:, 2].max()))
+        float(points[:, 2].max()), tuple((body.ring, body.slot) for body in magnet.bodies),
+        array.is_uniform, all(body.shape.has_four_edges for body in magnet.bodies))
 
 
 @dataclass(frozen=True)
@@ -175,8 +193,9 @@ def draw_direction(generator: np.random.Generator, dimension: int = 3) -> Vector
 
 def draw_place(site: Site, generator: np.random.Generator) -> tuple[float, float]:
     """Draw the ring and slot of a block."""
-    return float(generator.integers(1, site.rings + 1)), float(
-        generator.integers(1, site.slots + 1))
+    ring = float(generator.integers(1, site.rings + 1))
+    slots = site.slots_of(ring)
+    return ring, float(slots[generator.integers(0, len(slots))])
 
 
 def draw_number(low: float, high: float, either_sign: bool = True) -> Draw:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.synthetic.bodies import Body, TrueMagnet, vector
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     HiddenEffect,
@@ -15,6 +14,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     Site,
     signed_log_uniform,
 )
+from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
 
 NOTHING: tuple[float, ...] = ()
 """Values of an effect without parameters."""
@@ -90,8 +90,9 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
         bodies += [replace(body, ring=site.rings + number,
                            centre=vector(np.add(body.centre, (0, 0, number * pitch))))
                    for body in last]
-    iron = magnet.iron and replace(magnet.iron,
-                                   half_length=magnet.iron.half_length + more * pitch / 2)
+    iron = magnet.iron and replace(magnet.iron, bodies=tuple(
+        replace(body, half_length=body.half_length + more * pitch / 2)
+        for body in magnet.iron.bodies))
     return replace(magnet, iron=iron, bodies=tuple(
         replace(body, centre=vector(np.add(body.centre, (0, 0, -more * pitch / 2))))
         for body in bodies))
@@ -112,9 +113,9 @@ EFFECTS = (
                  needs=("3d",)),
     HiddenEffect("rotated_by_one_block", "gross", (HiddenParameter("blocks"),),
                  lambda site, generator: (float(generator.choice([-1.0, 1.0])),),
-                 rotated_by_one_block),
+                 rotated_by_one_block, needs=("equal rings",)),
     HiddenEffect("wrong_ring_count", "gross", (HiddenParameter("more"),),
                  lambda site, generator: (float(generator.choice([-1.0, 1.0]))
                                           if site.rings > 1 else 1.0,),
-                 wrong_ring_count, needs=("3d",)),
+                 wrong_ring_count, needs=("3d", "equal rings")),
 )

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.study.types import COMPONENTS, Component
-from halbach_fe.synthetic.bodies import Vector, vector
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     Draw,
@@ -21,6 +20,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     draw_number,
     log_uniform,
 )
+from halbach_fe.synthetic.true_magnet import Vector, vector
 
 
 def _with(values: Vector, index: int, more: float) -> Vector:

@@ -8,18 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.synthetic.bodies import (
-    Body,
-    BodyPart,
-    FroehlichLaw,
-    MagnetCopy,
-    PrismBody,
-    SectorBody,
-    SoftSphere,
-    TrueMagnet,
-    Tube,
-    vector,
-)
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     HiddenEffect,
     HiddenParameter,
@@ -30,6 +18,16 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     draw_place,
     log_uniform,
     signed_log_uniform,
+)
+from halbach_fe.synthetic.iron import FroehlichLaw, TrueIron, Tube
+from halbach_fe.synthetic.shapes import PrismBody, SectorBody
+from halbach_fe.synthetic.true_magnet import (
+    Body,
+    BodyPart,
+    MagnetCopy,
+    SoftSphere,
+    TrueMagnet,
+    vector,
 )
 
 BLOCK = (HiddenParameter("ring"), HiddenParameter("slot"))
@@ -63,6 +61,11 @@ def _of_ring(ring: float) -> Callable[[Body], bool]:
     return lambda body: body.ring == ring
 
 
+def _is_there(body: Body) -> bool:
+    """Tell whether a block is not missing."""
+    return any(body.remanence)
+
+
 def _moved(body: Body, shift: tuple[float, ...]) -> Body:
     return replace(body, displacement=vector(np.add(body.displacement, shift)))
 
@@ -86,11 +89,13 @@ def iron_ring(
     if outer <= inner or permeability == 1:
         return magnet
     law = FroehlichLaw(permeability, saturation) if saturation else permeability
-    return replace(magnet, iron=Tube(inner, outer, site.half_length, law))
+    return replace(magnet, iron=TrueIron((Tube(inner, outer, site.half_length),), law))
 
 
 def _draw_iron(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
-    corner = site.outer / np.cos(np.pi / site.slots)  # outermost radius of trapezoids
+    corner = site.outer  # and of trapezoids, the outermost radius
+    if site.is_uniform:
+        corner = site.outer / np.cos(np.pi / site.slots)
     inner = corner + site.scale * log_uniform(generator, 0.002, 0.02)
     return (inner, inner + site.scale * log_uniform(generator, 0.003, 0.02),
             log_uniform(generator, 200, 3000), float(generator.uniform(1.6, 2.2)))
@@ -99,12 +104,12 @@ def _draw_iron(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
 def recoil_permeability(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
     """Raise the recoil permeability of all blocks in all directions, at the same remanence."""
     return _bodies(magnet, lambda body: replace(body, along=body.along + more,
-                                                across=body.across + more))
+                                                across=body.across + more), _is_there)
 
 
 def recoil_permeability_across(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
     """Raise the recoil permeability of all blocks across their easy axes only."""
-    return _bodies(magnet, lambda body: replace(body, across=body.across + more))
+    return _bodies(magnet, lambda body: replace(body, across=body.across + more), _is_there)
 
 
 def _draw_recoil(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
@@ -152,6 +157,7 @@ def azimuthal_gap(magnet: TrueMagnet, site: Site, distance: float) -> TrueMagnet
             less: SectorBody | PrismBody = replace(
                 shape, half_angle=shape.half_angle - distance / 2 / shape.middle)
         else:
+            assert isinstance(shape, PrismBody)  # as all other blocks of rings
             less = replace(shape, inner_width=shape.inner_width - distance,
                            outer_width=shape.outer_width - distance)
         return replace(body, shape=less, meshed_shape=body.meshed_shape or shape)
@@ -189,6 +195,7 @@ def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
         if isinstance(shape, SectorBody):
             less: SectorBody | PrismBody = replace(shape, inner=shape.inner + more)
         else:
+            assert isinstance(shape, PrismBody)  # as all other blocks of rings
             slope = (shape.outer_width - shape.inner_width) / shape.depth
             less = replace(shape, depth=shape.depth - more,
                            inner_width=shape.inner_width + slope * more)
@@ -345,7 +352,9 @@ def _draw_turn(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
 
 def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
     ring, slot = draw_place(site, generator)
-    return ring, slot, ring, (slot + generator.integers(1, site.slots) - 1) % site.slots + 1
+    slots = site.slots_of(ring)
+    step = generator.integers(1, len(slots)) if len(slots) > 1 else 0
+    return ring, slot, ring, float(slots[(slots.index(int(slot)) + step) % len(slots)])
 
 
 def _draw_shift(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
@@ -376,11 +385,12 @@ EFFECTS = (
     HiddenEffect("radial_gap", "field", (HiddenParameter("distance", M),),
                  draw_length(5e-5, 4e-4, False), radial_gap),
     HiddenEffect("azimuthal_gap", "field", (HiddenParameter("distance", M),),
-                 draw_length(5e-5, 4e-4, False), azimuthal_gap, of_blocks=True),
+                 draw_length(5e-5, 4e-4, False), azimuthal_gap, needs=("equal rings",),
+                 of_blocks=True),
     HiddenEffect("ring_gap", "field", (HiddenParameter("seam"), HiddenParameter("distance", M)),
                  lambda site, generator: (float(generator.integers(1, site.rings)),
                                           site.scale * log_uniform(generator, 5e-5, 5e-4)),
-                 ring_gap, needs=("3d", "rings")),
+                 ring_gap, needs=("3d", "rings", "equal rings")),
     HiddenEffect("ring_twisted", "field", (HiddenParameter("ring"), HiddenParameter("angle", RAD)),
                  lambda site, generator: (draw_place(site, generator)[0],
                                           signed_log_uniform(generator, 1e-3, 1e-2)), ring_twisted,
@@ -398,9 +408,9 @@ EFFECTS = (
                                           log_uniform(generator, 0.04, 0.3)),
                  block_demagnetized),
     HiddenEffect("corners_demagnetized", "field", (HiddenParameter("fraction"),),
-                 draw_number(0.03, 0.3, False), corners_demagnetized),
+                 draw_number(0.03, 0.3, False), corners_demagnetized, needs=("four edges",)),
     HiddenEffect("magnetization_gradient", "field", (*BLOCK, HiddenParameter("fraction")),
-                 _draw_gradient, magnetization_gradient, of_blocks=True),
+                 _draw_gradient, magnetization_gradient, needs=("four edges",), of_blocks=True),
     HiddenEffect("temperature", "field",
                  (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
                  lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
@@ -409,9 +419,9 @@ EFFECTS = (
                  lambda site, generator: (signed_log_uniform(generator, 3, 15), SMCO),
                  temperature_gradient),
     HiddenEffect("inner_radius", "field", (HiddenParameter("change", M),), draw_length(1e-4, 6e-4),
-                 inner_radius, of_blocks=True),
+                 inner_radius, needs=("equal rings",), of_blocks=True),
     HiddenEffect("length", "field", (HiddenParameter("fraction"),), draw_number(5e-4, 4e-3),
-                 magnet_length, needs=("3d",), of_blocks=True),
+                 magnet_length, needs=("3d", "equal rings"), of_blocks=True),
     HiddenEffect("background", "field", tuple(HiddenParameter(name, "T") for name in "xyz"),
                  lambda site, generator: tuple(
                      float(value) for value in log_uniform(generator, 5e-5, 5e-4)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import netgen.occ as occ
 import ngsolve as ngs
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.cells import cells_of
@@ -34,7 +38,7 @@ def aharoni(a, b, c):
             - (ab**3 + bc**3 + ac**3) / (3 * a * b * c)) / np.pi
 
 
-def three(gap=0.005, **others):
+def three(gap: float = 0.005, **others: Any) -> list[MagnetBlock]:
     """Three cubes of 12 mm, turned, a gap apart."""
     pitch = SIDE + gap
     return [cuboid((SIDE,) * 3, **others),
@@ -43,7 +47,7 @@ def three(gap=0.005, **others):
                    easy=(-0.6, 0.8, 0.0), **others)]
 
 
-def around(generator, count=40, radius=0.035):
+def around(generator: np.random.Generator, count: int = 40, radius: float = 0.035) -> Floats:
     """Points on a sphere about the three cubes, some 20 mm off them."""
     directions = generator.normal(size=(count, 3))
     return np.array([0.006, 0.006, 0.0]) + radius * directions / np.linalg.norm(
@@ -99,7 +103,9 @@ def test_single_cuboid_against_quadrature(across):
     assert np.abs(found - other).max() > 0.05 * scale
 
 
-def ngsolve_reaction(sides, chi, points):
+def ngsolve_reaction(
+    sides: tuple[float, float, float], chi: float, points: Floats
+) -> Floats:
     """Reaction of a cuboid polarized along x by 1 T, by the scalar potential of order 4."""
     half = np.array(sides) / 2
     box = occ.Box(occ.Pnt(*-half), occ.Pnt(*half)).mat("block")
@@ -156,7 +162,7 @@ def test_three_close_cubes(generator):
     assert np.abs(coarse - truth).max() > 0.02 * scale
 
 
-def random_magnet(generator, chi):
+def random_magnet(generator: np.random.Generator, chi: float) -> list[MagnetBlock]:
     """Two to four blocks of random shapes, turns and permeabilities, that do not overlap."""
     found, places = [], []
     names = list(OUTLINES)
@@ -174,7 +180,8 @@ def random_magnet(generator, chi):
     return found
 
 
-def near_points(generator, blocks, distance, count):
+def near_points(generator: np.random.Generator, blocks: list[MagnetBlock], distance: float,
+                count: int) -> Floats:
     """Points at a distance in m from the faces of blocks, and in no block."""
     found = []
     while len(found) < count:

@@ -1,0 +1,104 @@
+"""Bodies of iron: where they are, and which are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import build_magnet
+from tests.conftest import DIPOLE
+
+SIZE = DIPOLE["array"]["outer_radius_m"]
+WEDGE = [[0.2, -0.01], [0.23, -0.02], [0.25, 0.0], [0.23, 0.02], [0.2, 0.01]]
+
+
+def magnet_of(make, *bodies, **changes):
+    return build_magnet(make(iron={"relative_permeability": 1000.0, "bodies": list(bodies)},
+                             **changes))
+
+
+def tube(inner, outer, **values):
+    return {"kind": "tube", "inner_radius_m": inner, "outer_radius_m": outer} | values
+
+
+def prism(**values):
+    return {"kind": "prism", "outline_m": WEDGE} | values
+
+
+def fraction_inside(body, generator, box=0.3, count=200_000):
+    points = generator.uniform(-box, box, (count, 3))
+    inside = body.contains(points)
+    return inside.mean() * (2 * box) ** 3, points[inside]
+
+
+@pytest.mark.parametrize(("body", "volume", "limits"), [
+    (tube(0.2, 0.25), np.pi * (0.25**2 - 0.2**2) * 0.16, (-0.08, 0.08)),
+    (tube(0.2, 0.25, length_m=0.3), np.pi * (0.25**2 - 0.2**2) * 0.3, (-0.15, 0.15)),
+    (tube(0.0, 0.25, length_m=0.05, z_m=0.2), np.pi * 0.25**2 * 0.05, (0.175, 0.225)),
+    (prism(length_m=0.4, z_m=-0.05), 0.0013 * 0.4, (-0.25, 0.15))])
+def test_bodies(short_dipole, generator, body, volume, limits):
+    """Monte Carlo, 4 sigma: tube, disc, and a prism whose area is 13 cm^2 by the shoelace formula;
+    two rings of 80 mm are 160 mm long.
+    """
+    x, y = np.array(WEDGE).T
+    assert 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) == pytest.approx(0.0013)
+    (solid,) = magnet_of(short_dipole, body).iron
+    assert (solid.z_min, solid.z_max) == pytest.approx(limits)
+    found, inside = fraction_inside(solid, generator)
+    assert found == pytest.approx(volume, abs=4 * np.sqrt(volume * 0.6**3 / 200_000))
+    radius = np.hypot(inside[:, 0], inside[:, 1])
+    assert solid.inner_radius <= radius.min()
+    assert radius.max() <= solid.outer_radius
+    assert inside[:, 2].min() == pytest.approx(limits[0], abs=0.02)
+    assert inside[:, 2].max() == pytest.approx(limits[1], abs=0.02)
+
+
+def test_copies(dipole, generator):
+    """Four poles: each is the first one, turned by quarter turns; and the outline's sense of
+    rotation does not matter.
+    """
+    magnet = magnet_of(dipole, prism(copies=4))
+    assert len(magnet.iron) == 4
+    assert (magnet.iron[0].z_min, magnet.iron[0].z_max) == (-np.inf, np.inf)
+    points = generator.uniform(-0.3, 0.3, (20_000, 3))
+    inside = np.array([body.contains(points) for body in magnet.iron])
+    assert inside[0].any()
+    quarter = points[:, [1, 0, 2]] * [1, -1, 1]  # turned back by 90 degrees
+    assert np.array_equal(inside[1], magnet.iron[0].contains(quarter))
+    assert not np.array_equal(inside[3], magnet.iron[0].contains(quarter))
+    assert (inside.sum(axis=0) <= 1).all()
+    reverse = magnet_of(dipole, prism(copies=4, outline_m=WEDGE[::-1]))
+    assert np.array_equal([body.contains(points) for body in reverse.iron], inside)
+    assert not magnet.iron_is_axisymmetric
+    assert magnet.radius == pytest.approx(0.25)
+
+
+def test_several_bodies(short_dipole):
+    magnet = magnet_of(short_dipole, tube(0.2, 0.25), tube(0.05, 0.25, length_m=0.02, z_m=0.2))
+    assert magnet.iron_is_axisymmetric
+    assert (magnet.iron_half_length, magnet.radius) == pytest.approx((0.21, 0.25))
+    points = np.array([[0.22, 0, 0], [0.1, 0, 0.2], [0.01, 0, 0.2], [0.22, 0, 0.1]])
+    assert magnet.contains(points).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("body", "said"), [
+    (tube(0.1, 0.25), "overlap"), (tube(0.0, 0.12, z_m=0.03), "overlap"),
+    (tube(0.25, 0.2), "must be larger than inner_radius_m"),
+    (prism(outline_m=[[0.2, 0], [0.25, 0.05], [0.25, 0], [0.2, 0.05]]), "do not cross"),
+    (prism(outline_m=[[0.2, 0], [0.21, 0], [0.22, 0]]), "some area"),
+    (prism(outline_m=[[0.1, 0], [0.25, -0.01], [0.25, 0.01]]), "overlap"),
+    (prism(copies=0), "greater than or equal to 1"),
+    ({"kind": "sphere", "radius_m": 0.1}, "'tube'")])
+def test_refusals(short_dipole, body, said):
+    with pytest.raises(StudyError, match=said):
+        magnet_of(short_dipole, body)
+    magnet_of(short_dipole, tube(SIZE, 0.25))
+
+
+def test_one_kind_of_iron(short_dipole):
+    with pytest.raises(StudyError, match="either iron_ring or iron"):
+        magnet_of(short_dipole, tube(0.2, 0.25), iron_ring={
+            "inner_radius_m": 0.2, "outer_radius_m": 0.25, "relative_permeability": 100.0})
+    with pytest.raises(StudyError, match="exactly one of relative_permeability and curve"):
+        short_dipole(iron={"bodies": [tube(0.2, 0.25)]})
