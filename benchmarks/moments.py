@@ -208,4 +208,4 @@ def run(note: Note) -> None:
 
 
 if __name__ == "__main__":
-    common.say(json.dumps(alone(int(sys.argv[1]))))
+    sys.stdout.write(json.dumps(alone(int(sys.argv[1]))))

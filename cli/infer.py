@@ -39,6 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise StudyError(
             f"Input --samples must go with iron that has an H(B) curve; study {magnet.name} is "
             "linear, and its posterior has a closed form. Leave it out.")
+    if arguments.samples:
+        from halbach_fe.inference.mcmc import check_sampling
+
+        check_sampling(magnet)
     if arguments.dry_run:
         from halbach_fe.response.resource_estimate import estimate_infer
 

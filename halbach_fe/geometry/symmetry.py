@@ -211,10 +211,11 @@ class Frame:
 
 def frame_of(block: MagnetBlock) -> Frame:
     """Return the frame of a block."""
-    corners = _corners(block.outline)
-    middle = corners.mean(axis=0)
+    middle = _corners(block.outline).mean(axis=0)
     angle = float(np.arctan2(middle[1], middle[0]))
-    local = corners @ rotation_about_z(angle)[:2, :2]
+    # corners alone do not tell dented polygons apart, which connect the same ones in another order
+    halves = np.vstack([edge.at(np.array([0.5]))[0] for edge in block.outline])
+    local = np.vstack([_corners(block.outline), halves]) @ rotation_about_z(angle)[:2, :2]
     infinite = bool(np.isinf(block.z_max))
     length = np.inf if infinite else float(np.round(block.z_max - block.z_min, 12))
     order = np.lexsort(np.round(local, 9).T)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
+from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import (
@@ -35,11 +36,13 @@ from halbach_fe.measurement.observation import (
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
+from halbach_fe.solver.formulation_choice import choose_route, solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import predict
 from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.materials import MU_0
 
 LINEAR_ENOUGH = 0.3
 """Error that the linearization of the iron may cause in a reading, relative to its error bar; a
@@ -225,11 +228,29 @@ def _check_linearization(
     sigma: Floats,
 ) -> None:
     """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
-    folder = replace(session, folder=session.folder / "posterior")
-    true = newton_readings(magnet, observation, folder, mean[None])[0]
+    own = replace(session, folder=session.folder / "posterior")
+    if choose_route(magnet, observation.points) == "moments":
+        updated = Magnet(magnet.study, _with_magnetizations(magnet, mean))
+        true = observation.apply(solve_nominal(updated, observation.points, own))
+    else:
+        true = newton_readings(magnet, observation, own, mean[None])[0]
     worst = float((np.abs(model.offset + model.matrix @ mean - true) / sigma).max())
     if worst > LINEAR_ENOUGH:
         warnings.warn(
             "The iron is linearized about the nominal magnet, which changes a reading of the "
             f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the "
             "non-linear posterior.", HalbachWarning, stacklevel=2)
+
+
+def _with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of a magnet with magnetizations (parameters,) in A/m.
+
+    The axes of an anisotropic permeability turn with them, by fractions of a degree.
+    """
+    blocks, size = [], magnet.dimension
+    for block, magnetization in zip(magnet.blocks, values.reshape(-1, size), strict=True):
+        remanence = MU_0 * block.recoil_tensor[:, :size] @ magnetization
+        strength = float(np.linalg.norm(remanence))
+        blocks.append(block if not strength else replace(
+            block, remanence=strength, easy_axis=vector(remanence / strength)))
+    return tuple(blocks)

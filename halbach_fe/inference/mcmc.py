@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest
-from halbach_fe.core.errors import OutputError, SamplingError
+from halbach_fe.core.errors import OutputError, SamplingError, StudyError
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
@@ -146,6 +147,8 @@ def sample_posterior(
 
     Raises
     ------
+    StudyError
+        If the study cannot be sampled, see `check_sampling`.
     SamplingError
         If the mode is not found, or the chains are too short.
     GetDPError
@@ -154,6 +157,7 @@ def sample_posterior(
     if draws < MIN_DRAWS:
         raise SamplingError(f"Input draws must be at least {MIN_DRAWS} of each chain; instead "
                             f"received {draws}. About 1500 are usual.")
+    check_sampling(update.magnet)
     model = nonlinear_model(update.magnet, update.observation, session,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
@@ -184,8 +188,7 @@ def sample_posterior(
         _store(path, key, runs, model.parameters, target.solves)
         say(f"{len(runs[0].samples)} of {draws} draws")
     kept = np.array([run.samples[draws // 10:draws] for run in runs])
-    diagnostics = assess_convergence(kept)
-    require_convergence(diagnostics, model.parameters, effective)
+    diagnostics = _assessed(kept, model.parameters, update.prior.sd > 0, effective)
     flat = kept.reshape(-1, kept.shape[2])
     chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
     predicted = model(chosen, tolerance)
@@ -197,6 +200,47 @@ def sample_posterior(
         target.solves, max(agreement, model.agreement_T), diagnostics,
         Prediction(predicted.mean(axis=0), predicted.std(axis=0), lambda rows: spread[:, rows].T,
                    len(spread)))
+
+
+def check_sampling(magnet: Magnet) -> None:
+    """Refuse a magnet whose non-linear model needs a mesh that it cannot have.
+
+    Raises
+    ------
+    StudyError
+        If a 3D array does not consist of equal rings, which the mesh of the model takes them to be.
+    """
+    if magnet.dimension == 3 and not magnet.array.is_uniform:
+        raise StudyError(
+            f"Input `array` of study {magnet.name} must consist of equal rings to sample the "
+            "posterior (--samples); instead it has rings of their own or free blocks. Leave "
+            "--samples out: the posterior with linearized iron is checked against the non-linear "
+            "field.")
+
+
+def _assessed(
+    samples: Floats, names: Sequence[str], free: NDArray[np.bool_], effective: float
+) -> ConvergenceDiagnostics:
+    """Return the diagnostics of samples (chains, draws, m) that have converged.
+
+    Parameters that are not ``free`` (m,), those of missing blocks, are known exactly.
+
+    Raises
+    ------
+    SamplingError
+        If the free parameters have not converged.
+    """
+    found = assess_convergence(samples[:, :, free])
+    require_convergence(found, [name for name, one in zip(names, free, strict=True) if one],
+                        effective)
+
+    def whole(values: Floats, constant: float) -> Floats:
+        every = np.full(len(free), constant)
+        every[free] = values
+        return every
+
+    return replace(found, r_hat=whole(found.r_hat, 1.0), bulk=whole(found.bulk, found.samples),
+                   tail=whole(found.tail, found.samples), mcse=whole(found.mcse, 0.0))
 
 
 @dataclass(frozen=True)
@@ -330,7 +374,9 @@ def sampled_summary(sampled: SampledPosterior) -> dict[str, object]:
         "largest_r_hat": float(sampled.diagnostics.r_hat.max()),
         "smallest_bulk_ess": float(sampled.diagnostics.bulk.min()),
         "smallest_tail_ess": float(sampled.diagnostics.tail.min()),
-        "largest_mcse_over_sd": float((sampled.diagnostics.mcse / sampled.sd).max()),
+        "largest_mcse_over_sd": float(np.divide(
+            sampled.diagnostics.mcse, sampled.sd, np.zeros_like(sampled.sd),
+            where=sampled.diagnostics.mcse > 0).max()),
         "agreement_with_getdp_T": sampled.agreement_T,
     }
 

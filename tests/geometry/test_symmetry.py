@@ -48,8 +48,8 @@ def test_3d_reduced_agree_with_unreduced(short_dipole, session, block):
     99 % and more.
     """
     changes = {"array__block": block, "array__recoil_permeability": 1.2,
-               "array__blocks_per_ring": 6, "mesh__block_size_m": 0.05, "mesh__growth": 2.5}
-    assert choose_route(build_magnet(short_dipole(**changes)), POINTS) == "scalar_potential"
+               "array__blocks_per_ring": 6, "mesh__block_size_m": 0.05, "mesh__growth": 2.5,
+               "solver__route": "scalar_potential"}
     reduced = fields(short_dipole(**changes), session)
     plain = fields(short_dipole(solver__symmetry=False, **changes), session)
     scale = np.abs(plain).max()
@@ -87,10 +87,10 @@ def test_what_is_a_symmetry(short_dipole):
     assert count(array__exceptions=[{"ring": 1, "recoil_permeability": 1.3}]) == 3
 
 
-def test_blocks_of_other_permeability_take_a_3d_route(short_dipole):
+def test_blocks_of_other_permeability_are_separate(short_dipole):
     odd = {"ring": 1, "slot": 4, "recoil_permeability": 1.3}
     assert choose_route(build_magnet(short_dipole(array__exceptions=[odd])),
-                        POINTS) == "scalar_potential"
+                        POINTS) == "moments"
     ring = {"ring": 1, "recoil_permeability": 1.3}
     assert choose_route(build_magnet(short_dipole(array__exceptions=[ring])),
                         POINTS) == "azimuthal_modes"
@@ -159,43 +159,35 @@ def test_unique_points(generator):
     assert len(unique_points(points + 1e-9)[0]) == 50
 
 
-def test_blocks_react_as_in_a_regular_array(short_dipole, session):
-    """Gaps between blocks, which no mode can have: the nominal array is solved for on a 3D mesh,
-    single blocks by modes. The error that is stated is the one of such a mesh: measured 1.1
-    times what a finer one says, rms.
+def test_separate_blocks_react_as_on_a_mesh(short_dipole, session):
+    """Gaps between blocks, which no mode can have: moments of the nominal array and of single
+    blocks agree with a 3D mesh up to its error, measured 6 % and 11 % rms.
     """
     changes = {"array__rings": 1, "array__ring_length_m": 0.1,
                "array__block__angular_gap_deg": 2.0, "array__recoil_permeability": 1.1,
-               "mesh": {"block_size_m": 0.035, "layers_per_ring": 2, "growth": 1.8}}
-    solid = {"solver__route": "scalar_potential"}
+               "mesh": {"block_size_m": 0.027, "layers_per_ring": 3, "growth": 1.6}}
     parts = finite_element_part(build_magnet(short_dipole(**changes)), POINTS, session)
-    whole = finite_element_part(build_magnet(short_dipole(**changes | solid)), POINTS, session)
-    assert np.array_equal(parts.nominal, whole.nominal)
-    finer = finite_element_part(build_magnet(short_dipole(**changes | solid | {
-        "mesh": {"block_size_m": 0.027, "layers_per_ring": 3, "growth": 1.6}})), POINTS, session,
-        columns=False).nominal
+    whole = finite_element_part(build_magnet(short_dipole(
+        **changes, solver__route="scalar_potential")), POINTS, session)
 
     def rms(field):
         return np.sqrt(np.mean(field**2))
 
-    assert 0.3 < rms(parts.error) / rms(parts.nominal - finer) < 3
+    assert rms(parts.nominal - whole.nominal) < 0.15 * rms(whole.nominal)
     ours, theirs = (np.array([one.block(number, slice(None)) for number in range(16)])
                     for one in (parts, whole))
-    # an eleventh of the material is missing, and the mesh is coarse
     assert rms(ours - theirs) < 0.25 * rms(theirs)
     assert rms(ours - np.roll(theirs, 1, axis=0)) > 0.5 * rms(theirs)  # negative control
-    # deviations of 1 %: columns that are a little off matter less than the mesh
-    generator = np.random.default_rng(0)
-    change = 0.01 * generator.standard_normal((16, 3))
-    assert rms(np.einsum("knij,kj->ni", ours - theirs, change)) < 0.3 * rms(parts.error)
 
 
 @pytest.mark.parametrize("across", [None, 1.12])
 def test_a_turned_block_adds_up_too(short_dipole, session, across):
-    """It has a remanence along z, which is part of the nominal array; 1.7e-4 without."""
+    """It has a remanence along z, which is part of the nominal array; 1.7e-4 without. Moments have
+    a single cell for the column of a block, measured 5e-3.
+    """
     changes = {} if across is None else {"array__recoil_permeability_across": across}
     study = short_dipole(array__exceptions=[
         {"ring": 1, "slot": 5, "rotation_deg": [0.3, 0.2, 1.0]}], **changes)
     built = response_matrix(build_magnet(study),
                             observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
-    assert built.superposition_error < 1e-10
+    assert built.superposition_error < (1e-10 if across is None else 2e-2)

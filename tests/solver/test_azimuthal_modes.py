@@ -165,13 +165,13 @@ def test_routes_are_chosen_by_symmetry(short_dipole, dipole):
     trapezoids = {"shape": "trapezoid"}
     for block in (gaps, trapezoids):
         assert choose_route(build_magnet(short_dipole(array__block=block)),
-                            far) == "scalar_potential"
+                            far) == "moments"
         with pytest.raises(StudyError, match=r"solver\.route"):
             choose_route(build_magnet(
                 short_dipole(array__block=block, solver__route="azimuthal_modes")), far)
     assert choose_route(build_magnet(dipole()), circle(0.07)) == "cross_section"
     near = circle(0.1035)
-    assert choose_route(build_magnet(short_dipole()), near) == "scalar_potential"
+    assert choose_route(build_magnet(short_dipole()), near) == "moments"
 
 
 def test_few_modes_on_the_axis_many_near_the_blocks(short_dipole):

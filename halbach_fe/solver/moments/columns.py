@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.solver.moments.solve import MAX_STEPS, TOLERANCE, System
+from halbach_fe.solver.moments.solve import MAX_STEPS, System
 
 PANEL = 256
 """Number of source cells whose interactions are in memory at a time."""
 
+TOLERANCE = 1e-6
+"""Largest change of a reading per polarization, relative to the largest one, that ends the
+iteration. Columns describe deviations of a few per cent."""
+
 AT_ONCE = 40_000_000
 """Largest number of readings times unknowns at a time, 320 MB."""
+
+KEPT = 2**30
+"""Largest size in bytes of the interactions that are kept for all steps; larger ones are computed
+again in each. They are in single precision, whose error is 1e-7 of the reaction's second order."""
 
 NODES = 3
 """Nodes per direction in every cell."""
@@ -40,10 +50,12 @@ def reaction_columns(
     found = np.zeros((len(blocks), len(points), 3, 3))
     if np.any(system.susceptibility):
         deviations, extra = _deviations(system)
+        panels = _Panels(system, {})
         step = max(1, AT_ONCE // (9 * len(system.remanence)))
         for first in range(0, len(points), step):
             part = slice(first, first + step)
-            found[:, part] = _some(system, np.array(points[part], float), deviations, extra)
+            found[:, part] = _some(system, np.array(points[part], float), deviations, extra,
+                                   panels)
     return lambda number, some: found[number, some]
 
 
@@ -73,7 +85,28 @@ def _deviations(system: System) -> tuple[Any, Any]:
     return deviations, means.T @ deviations
 
 
-def _some(system: System, points: Floats, deviations: Any, extra: Any) -> Floats:
+@dataclass(frozen=True)
+class _Panels:
+    """The mean field of cells in all cells, for a part of the sources at a time."""
+
+    system: System
+    kept: dict[int, NDArray[np.float32]]
+
+    def add(self, rows: Floats, to: Floats) -> None:
+        """Add the product of rows (r, 3 n) and the matrix to rows of the same shape."""
+        count, short = len(self.system.remanence), rows.astype(np.float32)
+        for first in range(0, count, PANEL):
+            last = min(first + PANEL, count)
+            panel = self.kept.get(first)
+            if panel is None:
+                panel = self.system.interaction.panel(first, last).astype(np.float32)
+                if 36 * count**2 <= KEPT:
+                    self.kept[first] = panel
+            to[:, 3 * first:3 * last] += short @ panel
+
+
+def _some(system: System, points: Floats, deviations: Any, extra: Any,
+          panels: _Panels) -> Floats:
     """Return the columns (blocks, k, 3, 3) for some points (k, 3) in m."""
     interaction, chi = system.interaction, system.susceptibility
     count = len(chi)
@@ -89,9 +122,7 @@ def _some(system: System, points: Floats, deviations: Any, extra: Any) -> Floats
     for _ in range(MAX_STEPS):
         back = np.einsum("rni,nij->rnj", total.reshape(rows, count, 3), chi).reshape(rows, size)
         change = start - total + _times(back, extra)
-        for first in range(0, count, PANEL):
-            last = min(first + PANEL, count)
-            change[:, 3 * first:3 * last] += back @ interaction.panel(first, last)
+        panels.add(back, change)
         total = total + damping * change
         if np.abs(change).max() <= TOLERANCE * np.abs(start).max():
             break
