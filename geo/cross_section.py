@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gmsh
@@ -179,13 +180,12 @@ def regions_of(magnet: Magnet, blocks: tuple[MagnetBlock, ...]) -> Regions:
 
 
 def _block_surface(block: MagnetBlock) -> int:
-    """Add the cross-section of a block to the Gmsh model; return its tag.
+    """Add the cross-section of a block in its nominal place to the Gmsh model; return its tag.
 
-    In 2D it lies where the block is mounted, in 3D in its nominal place.
+    Displaced blocks of a ring without gaps would overlap.
     """
-    if np.isinf(block.z_max) and not block.in_magnet_frame:
-        return _surface(block.outline, block.from_frame)
-    return _surface(block.outline)
+    nominal = replace(block, displacement_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
+    return _surface(block.outline, None if nominal.in_magnet_frame else nominal.from_frame)
 
 
 def _iron_surface(body: IronSolid) -> int:

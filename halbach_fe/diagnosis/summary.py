@@ -28,7 +28,7 @@ from halbach_fe.inference.result import (
     TRAINING,
     InferenceResult,
 )
-from halbach_fe.study.edit_file import edited_text
+from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.model import Study
 
 STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
@@ -121,7 +121,7 @@ def write_study(text: str, study: Study, diagnosis: Diagnosis, folder: Path) -> 
     StudyError
         If no valid study has the fitted amplitudes.
     """
-    write_text(folder / STUDY_FILE, edited_text(text, _steps(study, diagnosis)))
+    write_edited(folder / STUDY_FILE, text, _steps(study, diagnosis))
 
 
 def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:

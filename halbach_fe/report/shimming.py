@@ -24,7 +24,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.response.multipoles import plain, text_table
-from halbach_fe.study.edit_file import edited_text
+from halbach_fe.study.edit_file import write_edited
 
 
 def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
@@ -112,7 +112,7 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
     note = f"shimmed: {len(shim.steps)} moves"
     summary["study_file"] = "study.shimmed.toml" if shimmed else None
     if shimmed:
-        write_text(folder / "study.shimmed.toml", edited_text(text, [(shimmed, note)]))
+        write_edited(folder / "study.shimmed.toml", text, [(shimmed, note)])
     write_text(folder / "shim.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     figures = {"shim_multipoles.png": (
         multipole_figure({"before": shim.before, "after": shim.after}, shim.limit),

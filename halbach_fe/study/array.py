@@ -88,9 +88,10 @@ class BlockException(StudyModel):
     magnet's axis.
 
     If several exceptions hold for a block, their displacements and rotations add up, and their
-    factors multiply; of every other key, the last value counts. The finite-element part of the
-    field, which is only the reaction of permeability and iron, treats every block as if it were in
-    its nominal place, whole and uniformly magnetized.
+    factors multiply; of every other key, the last value counts. A missing block has no permeability
+    either. The reaction of permeability and iron, which adds to the exact field of the blocks,
+    takes every block whole and uniformly magnetized; the route ``moments`` takes it where it is
+    mounted, the other routes in its nominal place.
     """
 
     ring: Annotated[int, Field(ge=1)] | None = None

@@ -3,12 +3,16 @@
 Every key whose value differs between the study in the file and the wanted study is set, with a note
 beside it that says why; a key that is removed stays as a comment. Numbers are written with all
 digits: the edited file reads back to exactly the wanted study.
+
+A table of free blocks does not change. The edited file, which may lie in another folder, refers to
+a copy of it.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from pathlib import Path
 from typing import Any
 
 import tomlkit
@@ -17,6 +21,8 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, InlineTable, Item, Table
 
 from halbach_fe.core.errors import StudyError
+from halbach_fe.core.files import write_text
+from halbach_fe.study.free_blocks_file import write_free_blocks
 from halbach_fe.study.inference import ExcludedReading
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
@@ -24,6 +30,11 @@ from halbach_fe.study.reader import parse_study
 REWRITTEN_NOTE = ("Rewritten in full: the original study file could not be changed key by key. Its "
                   "comments are in the original only.")
 """First line of a file that could not be edited in place."""
+
+FREE_BLOCKS_FILE = "free_blocks.csv"
+"""Name of the table of free blocks beside an edited file."""
+
+COPIED_NOTE = "a copy beside this file"
 
 Keys = MutableMapping[str, Any]
 
@@ -41,7 +52,8 @@ def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
     steps : iterable of (Study, str)
         The successive studies, each with a note that says why it differs from the study before.
         Where the file refers to a file of an H(B) curve, the studies hold the numbers of that
-        curve, and so does the returned text.
+        curve, and so does the returned text. If the file refers to a table of free blocks, the
+        returned text refers to `FREE_BLOCKS_FILE`, see `write_edited`.
 
     Raises
     ------
@@ -51,7 +63,7 @@ def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
     notes = []
     for study, note in steps:
         parse_study(study.model_dump(), f"changed study {study.name}")
-        before = parse_study(tomllib.loads(text))
+        before = _parsed(text, study)
         if before == study:
             continue
         notes.append(note)
@@ -59,14 +71,56 @@ def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
             document = tomlkit.parse(text)
             _change(document, before, study, note)
             text = tomlkit.dumps(document)
-            whole = parse_study(tomllib.loads(text)) == study
+            whole = _parsed(text, study) == study
         except (TOMLKitError, tomllib.TOMLDecodeError, StudyError):
             whole = False
         if not whole:
             text = _rewritten(study, [REWRITTEN_NOTE, *notes])
         elif note not in text:  # a table in several pieces has no line to put the note on
             text = f"# {note}\n{text}"
-    return text
+    return _with_copy(text)
+
+
+def write_edited(path: Path, text: str, steps: Iterable[tuple[Study, str]]) -> None:
+    """Write the text of a study file after a series of changes, see `edited_text`.
+
+    A table of free blocks is written beside it.
+    """
+    study: Study | None = None
+
+    def noted() -> Iterator[tuple[Study, str]]:
+        nonlocal study
+        for study, note in steps:
+            yield study, note
+
+    write_text(path, edited_text(text, noted()))
+    if study is not None and study.array.free_blocks is not None:
+        write_free_blocks(study.array.free_blocks, path.with_name(FREE_BLOCKS_FILE))
+
+
+def _parsed(text: str, study: Study) -> Study:
+    """Return the study of a text; a table of free blocks that it refers to is that of ``study``."""
+    document = tomllib.loads(text)
+    if _refers_to_blocks(document):
+        array = document["array"] | {"free_blocks": study.array.free_blocks}
+        document |= {"array": array}
+    return parse_study(document)
+
+
+def _refers_to_blocks(document: Mapping[str, Any]) -> bool:
+    """Tell whether a document refers to a file of free blocks."""
+    array = document.get("array")
+    free = array.get("free_blocks") if isinstance(array, Mapping) else None
+    return isinstance(free, Mapping) and "file" in free
+
+
+def _with_copy(text: str) -> str:
+    """Return the text with a reference to the copy of the table of free blocks, if it has one."""
+    document = tomlkit.parse(text)
+    if not _refers_to_blocks(document):
+        return text
+    _set(document["array"]["free_blocks"], "file", FREE_BLOCKS_FILE, COPIED_NOTE)
+    return tomlkit.dumps(document)
 
 
 def _change(table: Keys, before: BaseModel, after: BaseModel, note: str) -> None:
@@ -201,4 +255,7 @@ def _add_note(item: Item, note: str) -> None:
 def _rewritten(study: Study, notes: list[str]) -> str:
     """Return a study file with all keys of a study that are not defaults, after some comments."""
     lines = "".join(f"# {note}\n" for note in notes if note)
-    return f"{lines}\n{tomlkit.dumps(study.model_dump(mode='json', exclude_defaults=True))}"
+    keys = study.model_dump(mode="json", exclude_defaults=True)
+    if study.array.free_blocks is not None:
+        keys["array"]["free_blocks"] = {"file": FREE_BLOCKS_FILE}
+    return f"{lines}\n{tomlkit.dumps(keys)}"

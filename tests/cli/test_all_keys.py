@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import csv
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.study.free_blocks_file import write_free_blocks
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.array import Array
+from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import read_study
 from tests.conftest import changed
 
@@ -33,9 +36,9 @@ BASE: dict[str, Any] = {
     "mesh": {"block_size_m": 0.03, "growth": 3.0, "cells_per_side": 1},
     "observation": {
         "quantity": "flux_density", "components": ["x", "y"],
-        "positions": {"kind": "circles", "radius_m": 0.03, "angles": 8}},
+        "positions": {"kind": "circles", "radius_m": 0.03, "angles": 16}},
     "noise": {"regions": [{"name": "bore", "sigma_T": 1e-4}]},
-    "prior": {"mounting_sd_deg": 0.05},
+    "prior": {"mounting_sd_deg": 0.05, "direction_sd_deg": 0.3},
     "plan": {"points": 3},
     "demagnetization": {
         "intrinsic_coercivity_A_per_m": 1e6, "remanence_coefficient_per_K": -1.2e-3,
@@ -142,6 +145,9 @@ STUDIES: dict[str, dict[str, Any]] = {
     "iron-curve": changed(BASE, array__rings=1, iron={"bodies": [TUBE], "curve": {
         "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
         "saturation_polarization_T": 2.0}}),
+    "iron-curve-free": changed(free(), iron={"bodies": [TUBE], "curve": {
+        "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
+        "saturation_polarization_T": 2.0}}),
     "flat": FLAT,
     "flat-missing": with_exception(FLAT, **MISSING),
     "flat-displaced": with_exception(FLAT, displacement_m=[1e-3, 0.0, 0.0]),
@@ -153,35 +159,38 @@ STUDIES: dict[str, dict[str, Any]] = {
 }
 """Studies by the keys that they add to `BASE`."""
 
-USUAL = ["--json"]
 TARGET = ["--orders", "2..4", "--reference-radius-m", "0.03"]
-COMMANDS: dict[str, list[str]] = {
-    "solve": [],
-    "solve-dry": ["--dry-run"],
-    "verify-dry": ["--dry-run"],
-    "verify": [],
-    "infer": ["--measurements", "{map}"],
-    "infer-dry": ["--measurements", "{map}", "--dry-run"],
-    "infer-blocks": ["--measurements", "{map}", "--blocks", "{blocks}"],
-    "diagnose": ["--measurements", "{map}", "--effects",
-                 "offset_x,block_missing,block_displaced,blocks_swapped"],
-    "multipoles": [*TARGET, "--at-z-m", "0"],
-    "plan": [],
-    "prior": ["{blocks}"],
-    "tolerance": [*TARGET, "--draws", "100"],
-    "sort": ["{blocks}", *TARGET],
-    "shim": ["--measurements", "{map}", *TARGET, "--swaps", "1", "--turns", "1"],
-    "demagnetization": ["--across", "1"],
-    "export": ["--format", "blocks"],
-    "simulate-measurement": [],
+COMMANDS: dict[str, tuple[str, list[str]]] = {
+    "solve-dry": ("dry", ["--dry-run"]),
+    "verify-dry": ("dry", ["--dry-run"]),
+    "verify": ("verify", []),
+    "infer": ("infer", ["--measurements", "{map}"]),
+    "infer-dry": ("dry", ["--measurements", "{map}", "--dry-run"]),
+    "infer-blocks": ("infer", ["--measurements", "{map}", "--blocks", "{blocks}"]),
+    "shim": ("infer", ["--measurements", "{map}", *TARGET, "--swaps", "1", "--turns", "1",
+                       "--replace", "1"]),
+    "diagnose": ("diagnose", ["--measurements", "{map}", "--effects",
+                              "block_missing,block_displaced,blocks_swapped"]),
+    "multipoles": ("multipoles", TARGET),
+    "tolerance": ("multipoles", [*TARGET, "--draws", "100"]),
+    "sort": ("multipoles", ["{blocks}", *TARGET]),
+    "plan": ("plan", []),
+    "prior": ("prior", ["{blocks}"]),
+    "demagnetization": ("demagnetization", ["--across", "2"]),
+    "export": ("export", ["--format", "blocks"]),
+    "simulate-measurement": ("simulated", []),
 }
-"""Options of every command."""
+"""Folder and options of every command but `solve`, which makes the map for the others."""
 
-REFUSED: dict[tuple[str, str], str] = {}
+UNLIKE = "Make them types of their own"
+REFUSED: dict[tuple[str, str], str] = {
+    **{(name, "sort"): UNLIKE for name in (
+        "remanence", "angle", "permeability", "own-rings", "layers", "layers-missing")},
+}
 """What a command refuses, with words of its sentence, by study and command."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Case:
     """A study on disk, with a map and a table of blocks of its own magnet."""
 
@@ -192,27 +201,48 @@ class Case:
     map: Path
     blocks: Path
 
+    @property
+    def flux_density(self):
+        """B (n, 3) in T at the study's positions, as solved."""
+        return read_map(self.map)["B_T"].values
+
+    @property
+    def present(self):
+        """The blocks that are not missing."""
+        return [block for block in self.magnet.blocks if block.remanence]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick(getdp):
+    """Find GetDP once, and draw no figures: other tests look at them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
+        patch.setattr("matplotlib.figure.Figure.savefig",
+                      lambda self, file, **options: file.write(b""))
+        yield
+
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory, getdp):
+def case(tmp_path_factory):
     """Make a case, once."""
     made: dict[str, Case] = {}
 
     def of(name):
         if name not in made:
-            made[name] = _made(name, tmp_path_factory.mktemp(name))
+            made[name] = made_case(name, STUDIES[name], tmp_path_factory.mktemp(name))
         return made[name]
 
     return of
 
 
-def _made(name, folder, document=None):
+def made_case(name, document, folder):
+    """Write a study, solve it, and write the map and the table of its blocks."""
     study = folder / "study.toml"
-    study.write_text(tomlkit.dumps(_with_file(document or STUDIES[name], folder)))
-    magnet = build_magnet(read_study(study))
+    study.write_text(tomlkit.dumps(_with_file(document, folder)))
     assert main(["solve", str(study), "-o", str(folder / "solved"), "--json", "--no-cache"]) == 0
     data = read_map(folder / "solved" / "field_map.h5")
     write_map(field_map(points_of(data), data["B_T"].values), folder / "map.csv")
+    magnet = build_magnet(read_study(study))
     write_blocks(measured_blocks(magnet), folder / "blocks.csv")
     return Case(name, folder, study, magnet, folder / "map.csv", folder / "blocks.csv")
 
@@ -227,6 +257,10 @@ def _with_file(document, folder):
     return document
 
 
+STRONGER = 1.01
+"""Strength of the measured blocks relative to the nominal ones."""
+
+
 def measured_blocks(magnet: Magnet) -> BlockTable:
     """Every block that is there, at the place that it was made for, 1 % too strong."""
     meant = as_meant(magnet)
@@ -236,7 +270,7 @@ def measured_blocks(magnet: Magnet) -> BlockTable:
     sizes = np.array([block.area * (length if magnet.dimension == 2 else block.z_max - block.z_min)
                       for block in blocks])
     moments = np.array([
-        1.01 * size * rotation_about_z(-np.radians(block.angle_deg)) @ block.magnetization
+        STRONGER * size * rotation_about_z(-np.radians(block.angle_deg)) @ block.magnetization
         for block, size in zip(blocks, sizes, strict=True)])
     return BlockTable(
         tuple(f"no-{number}" for number in there), tuple(str(block.slot) for block in blocks),
@@ -246,20 +280,17 @@ def measured_blocks(magnet: Magnet) -> BlockTable:
 
 def run(case: Case, command: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, Path]:
     """Run a command; return its exit code, what it printed or said, and its folder."""
-    folder = case.folder / command
+    name, options = COMMANDS[command]
+    folder = case.folder / name
     verb = command.removesuffix("-dry").removesuffix("-blocks")
-    options = [option.format(map=case.map, blocks=case.blocks) for option in COMMANDS[command]]
-    if case.magnet.dimension == 2 and "--at-z-m" in options:
-        options = options[:options.index("--at-z-m")]
-    output = folder / "blocks.csv" if verb == "export" else folder
+    options = [option.format(map=case.map, blocks=case.blocks) for option in options]
     folder.mkdir(exist_ok=True)
-    if verb == "solve" and "--dry-run" not in options:
-        output = case.folder / "solved"
-    extra = [] if verb == "export" else ["--json"]
+    output = folder / "blocks.csv" if verb == "export" else folder
+    more = [] if verb == "export" else ["--json"]
     if verb not in ("export", "prior", "simulate-measurement"):
-        extra.append("--no-cache")
+        more.append("--no-cache")
     capsys.readouterr()
-    code = main([verb, str(case.study), *options, "-o", str(output), *extra])
+    code = main([verb, str(case.study), *options, "-o", str(output), *more])
     shown = capsys.readouterr()
     return code, shown.out if code == 0 else shown.err, folder
 
@@ -278,10 +309,12 @@ def test_all(case, capsys, name, command):
         return
     assert code == 0, said
     shown = {} if command == "export" else json.loads(said, parse_constant=_no_number)
-    for path in folder.rglob("*.json"):
+    for path in folder.glob("*.json"):
         json.loads(path.read_text(), parse_constant=_no_number)
     for path in folder.glob("*.html"):
         assert not re.search(r"(?<![\w./+])nan(?![\w/])", _words(path.read_text())), path
+    if command in CHECKS:
+        CHECKS[command](here, folder, shown)
 
 
 def _no_number(name):
@@ -289,5 +322,122 @@ def _no_number(name):
 
 
 def _words(page):
-    """A page without its embedded files and scripts."""
-    return re.sub(r"data:[^\"']*|<script.*?</script>|<svg.*?</svg>", "", page, flags=re.S)
+    """A page without its embedded files, scripts and drawings."""
+    return re.sub(r"data:[^\"']*|<script.*?</script>|<svg.*?</svg>", "", page, flags=re.DOTALL)
+
+
+def _predicted(case, folder):
+    """Solved readings, the prior's prediction of them, and the error bars of the solver, in T."""
+    rows = np.genfromtxt(folder / "prediction.csv", delimiter=",", names=True, dtype=None,
+                         encoding=None)
+    np.testing.assert_allclose(rows["measured_T"], case.flux_density[:, :2].ravel(), atol=1e-15)
+    return rows["measured_T"], rows["prior_mean_T"], rows["solver_error_T"]
+
+
+def _infers_from_nominal(case, folder, shown):
+    """The nominal field of the inference is that of `solve`."""
+    solved, prior, error = _predicted(case, folder)
+    assert (np.abs(prior - solved) <= 1.5 * error + 1e-7 * np.abs(solved).max()).all()
+    contraction = shown["contraction_by_block"]
+    assert [value is None for value in contraction] == [
+        not block.remanence for block in case.magnet.blocks]
+
+
+def _infers_from_blocks(case, folder, shown):
+    """Blocks that are 1 % stronger make a field that is 1 % stronger.
+
+    With permeability the moment of a block that stands alone is not its magnetization times its
+    volume, but smaller by the demagnetizing factor times 5 to 10 %.
+    """
+    solved, prior, error = _predicted(case, folder)
+    bare = case.magnet.is_vacuum or all(
+        block.isotropic and block.recoil_permeability == 1 for block in case.magnet.blocks)
+    if bare and not case.magnet.is_nonlinear:
+        assert (np.abs(prior - STRONGER * solved)
+                <= 1.5 * error + 1e-7 * np.abs(solved).max()).all()
+    assert shown["measured_blocks"] == len(np.loadtxt(
+        case.blocks, delimiter=",", skiprows=1, dtype=str, comments="#", ndmin=2))
+
+
+def _finds_nothing(case, folder, shown):
+    """The map of the study's own magnet lacks no effect."""
+    assert shown["effects"] == []
+    assert shown["verdict"] == "nothing"
+
+
+def _same_main(case, folder, shown):
+    """The main multipole of a cross-section is that of the solved circle.
+
+    16 angles add the order 15, which falls to (3/5)^14 = 8e-4 of what it is at the blocks.
+    """
+    if case.magnet.dimension == 2:
+        angle = 2 * np.pi * np.arange(16) / 16
+        radial = case.flux_density[:, 0] * np.cos(angle) + case.flux_density[:, 1] * np.sin(angle)
+        main = abs(2 * np.mean(radial * np.exp(1j * angle)))
+        tables = shown["tables"][0]["prior"] if "tables" in shown else shown["closed_form"]
+        assert tables["main_T"] == pytest.approx(main, rel=5e-3)
+
+
+def _sorts_present_blocks(case, folder, shown):
+    """Every slot gets a block, but not that of a missing one."""
+    table = read_blocks(folder / "blocks.sorted.csv")
+    placed = [place for place in table.places if place[0]]
+    assert sorted(placed) == sorted((block.ring, block.slot) for block in case.present)
+
+
+def _moves_present_blocks(case, folder, shown):
+    """No block is put into the place of a missing one, or comes from there."""
+    missing = {(block.ring, block.slot) for block in case.magnet.blocks if not block.remanence}
+    places = {tuple(place) for move in shown["moves"] for block in move["blocks"]
+              for place in (block["from"], block["to"]) if isinstance(place, list)}
+    assert not missing & places
+
+
+def _maps_present_blocks(case, folder, shown):
+    """The map of the demagnetization has a row for every block that is there."""
+    with (folder / "demagnetization.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert [row["block"] for row in rows] == [block.name for block in case.present]
+
+
+def _exports_the_same_magnet(case, folder, shown):
+    """A study of the exported blocks has the same field of the blocks in vacuum."""
+    points = points_of(read_map(case.map))
+    study = case.magnet.study
+    again = build_magnet(study.with_(array=Array(free_blocks=read_free_blocks(
+        folder / "blocks.csv"))))
+    expected = field_of(case.magnet.blocks, points)
+    np.testing.assert_allclose(field_of(again.blocks, points), expected,
+                               atol=1e-9 * np.abs(expected).max())
+
+
+CHECKS = {
+    "infer": _infers_from_nominal, "infer-blocks": _infers_from_blocks, "diagnose": _finds_nothing,
+    "multipoles": _same_main, "tolerance": _same_main, "sort": _sorts_present_blocks,
+    "shim": _moves_present_blocks, "demagnetization": _maps_present_blocks,
+    "export": _exports_the_same_magnet,
+}
+
+
+@pytest.mark.parametrize("name", [name for name in STUDIES if name not in ("base", "flat")])
+def test_every_key_changes_the_field(case, name):
+    """By more than the closed-form field's rounding: no key is passed over by `solve`."""
+    base = case("flat" if name.startswith("flat") else "base").flux_density
+    change = np.abs(case(name).flux_density - base)[:, :2].max()
+    assert change > 1e-6 * np.abs(base).max()
+
+
+def test_the_checks_notice_another_magnet(case, capsys):
+    """The map of a magnet without exceptions is not that of a magnet with one."""
+    other = case("flat-missing")
+    wrong = replace(other, map=case("flat").map)
+    for command in ("infer", "diagnose", "multipoles"):
+        code, said, folder = run(wrong, command, capsys)
+        assert code == 0
+        with pytest.raises(AssertionError):
+            CHECKS[command](wrong, folder, json.loads(said))
+    for check in (_exports_the_same_magnet, _maps_present_blocks):
+        command = next(name for name, own in CHECKS.items() if own is check)
+        _, _, folder = run(other, command, capsys)
+        with pytest.raises(AssertionError):
+            check(case("flat"), folder, {})

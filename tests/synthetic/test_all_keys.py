@@ -17,13 +17,14 @@ from halbach_fe.study.iron import IronPrism, IronTube
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
+from halbach_fe.synthetic.shapes import SectorBody
 from halbach_fe.synthetic.simulate import true_field
 from tests.conftest import DIPOLE, changed, circle
 
 POINTS = np.vstack([circle(0.04, 5, z, 0.2 + z) for z in (-0.11, 0.004, 0.06)])
 
-ROUNDING = 2e-10
-"""Error in T of magpylib's sectors of some 0.1 m and 1 T; measured up to 7e-11 T."""
+ROUNDING = 2e-9
+"""Error in T of magpylib's sectors of some 0.1 m and 1 T; measured up to 6e-10 T, mostly 7e-11 T."""
 
 RING = {"blocks_per_ring": 8, "inner_radius_m": 0.1, "outer_radius_m": 0.13,
         "ring_length_m": 0.04, "remanence_T": 1.1, "block": {"shape": "cuboid", "width_m": 0.025}}
@@ -44,7 +45,8 @@ def both(study, points=POINTS):
 def agree(study, points=POINTS):
     theirs, ours = both(study, points)
     scale = np.abs(theirs).max()
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=max(1e-9 * scale, ROUNDING))
+    curved = any(isinstance(body.shape, SectorBody) for body in magnet_of(study).bodies)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * scale + curved * ROUNDING)
     return ours
 
 
@@ -103,6 +105,7 @@ def test_a_missing_block_has_no_material():
 
 
 RINGS = {
+    "count": ({}, {"count": 2}),
     "layer": ({}, {"layer": 2, "inner_radius_m": 0.2, "outer_radius_m": 0.23}),
     "z_m": ({}, {"z_m": 0.09}), "multipole_order": ({}, {"multipole_order": 2}),
     "blocks_per_ring": ({}, {"blocks_per_ring": 6}), "inner_radius_m": ({}, {"inner_radius_m": 0.11}),
@@ -233,7 +236,7 @@ def test_every_column_of_free_blocks(key):
 
 IRON = {"relative_permeability": 500.0}
 TUBE = {"kind": "tube", "inner_radius_m": 0.2, "outer_radius_m": 0.22}
-POLE = {"kind": "prism", "outline_m": [[0.2, -0.02], [0.23, -0.02], [0.23, 0.03]], "copies": 1}
+POLE = {"kind": "prism", "outline_m": [[0.2, -0.04], [0.24, -0.04], [0.24, 0.05]], "copies": 1}
 
 
 def solids(body, dimension=3, **material):
@@ -249,7 +252,7 @@ def test_every_key_of_a_body_of_iron(key, dimension, generator):
     base = POLE if key in ("outline_m", "copies") else TUBE
     change = {"kind": POLE, "inner_radius_m": {"inner_radius_m": 0.21}, "outer_radius_m": {
         "outer_radius_m": 0.21}, "length_m": {"length_m": 0.1}, "z_m": {"z_m": 0.03},
-        "outline_m": {"outline_m": [[0.2, 0.02], [0.23, -0.02], [0.21, -0.02]]},
+        "outline_m": {"outline_m": [[0.2, 0.04], [0.23, -0.03], [0.21, -0.03]]},
         "copies": {"copies": 3}}[key]
     body = change if key == "kind" else base | change
     points = generator.uniform(-0.25, 0.25, (20_000, 3)) * [1, 1, 0.4]

@@ -28,6 +28,10 @@ KEPT = 2**30
 """Largest size in bytes of the interactions that are kept for all steps; larger ones are computed
 again in each. They are in single precision, whose error is 1e-7 of the reaction's second order."""
 
+REACH = 1.2
+"""Distance of cells, in units of the sum of their radii, up to which the field of one makes the
+polarization of the other vary."""
+
 NODES = 3
 """Nodes per direction in every cell."""
 
@@ -62,16 +66,18 @@ def reaction_columns(
 def _deviations(system: System) -> tuple[Any, Any]:
     """Return what the field of near cells makes of polarizations beyond uniform ones.
 
+    Both results are transposed, because they multiply rows from the right.
+
     Returns
     -------
-    deviations : sparse array, shape (3 n q, 3 n)
+    deviations : sparse array, shape (3 n, 3 n q)
         Deviation of the polarization at the nodes from its mean, per polarization of the cells.
     extra : sparse array, shape (3 n, 3 n)
         Mean field of these deviations over near cells.
     """
     cells = system.interaction.cells
     count, nodes = cells.weights.shape
-    close, field = system.interaction.near_node_matrices()
+    close, field = system.interaction.near_node_matrices(REACH)
     targets, shape = close.targets, (3 * nodes * count, 3 * count)
 
     def sparse(blocks: Floats) -> Any:
@@ -82,7 +88,7 @@ def _deviations(system: System) -> tuple[Any, Any]:
     means = sparse(field * share[..., None, None])
     field -= np.einsum("pq,pqij->pij", cells.weights[targets], field)[:, None]
     deviations = sparse(system.susceptibility[targets, None] @ field)
-    return deviations, means.T @ deviations
+    return deviations.T, (means.T @ deviations).T
 
 
 @dataclass(frozen=True)
@@ -112,12 +118,12 @@ def _some(system: System, points: Floats, deviations: Any, extra: Any,
     count = len(chi)
     rows, size = 3 * len(points), 3 * count
     uniform, start = np.empty((rows, size)), np.empty((rows, size))
-    step = max(1, AT_ONCE // (4 * 3 * deviations.shape[0]))
+    step = max(1, AT_ONCE // (4 * 3 * deviations.shape[1]))
     for first in range(0, len(points), step):
         by_node = interaction.readings(points[first:first + step])
         part = slice(3 * first, 3 * first + 3 * len(by_node))
         uniform[part] = by_node.sum(axis=3).reshape(-1, size)
-        start[part] = uniform[part] + _times(by_node.reshape(-1, deviations.shape[0]), deviations)
+        start[part] = uniform[part] + _times(by_node.reshape(-1, deviations.shape[1]), deviations)
     damping, total = 2 / (2 + system.largest_susceptibility), start
     for _ in range(MAX_STEPS):
         back = np.einsum("rni,nij->rnj", total.reshape(rows, count, 3), chi).reshape(rows, size)
@@ -132,6 +138,6 @@ def _some(system: System, points: Floats, deviations: Any, extra: Any,
     return found.reshape(system.blocks, len(points), 3, 3)
 
 
-def _times(rows: Floats, matrix: Any) -> Floats:
-    """Return the product of dense rows and a sparse matrix."""
-    return np.asarray((matrix.T @ rows.T).T)
+def _times(rows: Floats, transposed: Any) -> Floats:
+    """Return the product of dense rows and a sparse matrix, which is given transposed."""
+    return np.asarray((transposed @ rows.T).T)

@@ -306,12 +306,16 @@ class Interaction:
         local, weights = gauss_nodes(cells.vertices, cells.half, 2)
         return cells.centre[:, None] + local @ np.swapaxes(cells.axes, 1, 2), weights
 
-    def near_node_matrices(self) -> tuple[Neighbours, Floats]:
+    def near_node_matrices(self, reach: float) -> tuple[Neighbours, Floats]:
         """Return near pairs of cells, and field matrices of the sources at the nodes.
 
-        The matrices are (n, q, 3, 3).
+        The matrices are (n, q, 3, 3). The pairs are those whose distance is at most ``reach`` times
+        the sum of their radii.
         """
         close = self._pairs[1]
+        targets = close.targets
+        chosen = near.touching(targets, close.sources, self.cells.centre, self.cells.radius, reach)
+        close = Neighbours.of(targets[chosen], close.sources[chosen], len(self.cells))
         targets = close.targets
         found = np.empty((len(targets), self.cells.weights.shape[1], 6))
         in_threads(lambda first, last: near.node_matrices(
