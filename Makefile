@@ -9,11 +9,16 @@
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke
 # make study-mri           the same of an MRI array of cubes
+# make study-emphatic      a stepped dipole of three bores and two layers, from its drawing
+# make study-mri4all       an MRI magnet of 990 cubes, from the table of its design
+# make study-mri-large     an MRI magnet of 4 032 cubes in three layers
+# make study-mandhala      two rings of square bars
+# make study-hybrid-quadrupole  steel poles and free blocks, in cross-section
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # make benchmark-scaling   time and memory by blocks, readings, unknowns of the mesh and workers
 # Both set up everything they need first (tools/setup.sh).
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -47,6 +52,18 @@ study-quadrupole study-mri: study-%: setup
 	.venv/bin/halbach-fe diagnose studies/$*/study.toml --measurements studies/$*/campaign/map.csv \
 	    --blocks studies/$*/campaign/blocks.csv --held-out studies/$*/campaign/held-out.csv \
 	    -o results/$*/diagnosis
+
+# What the language of magnets can describe; the campaigns are simulated on the spot, with two blocks
+# exchanged and a weaker one.
+study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole: study-%: setup-test
+	.venv/bin/halbach-fe solve studies/$*/study.toml -o results/$*/field
+	.venv/bin/halbach-fe verify studies/$*/study.toml -o results/$*/verified
+	test -e results/$*/campaign/map.csv || .venv/bin/halbach-fe simulate-measurement \
+	    studies/$*/study.toml --seed 1 -o results/$*/campaign
+	.venv/bin/halbach-fe infer studies/$*/study.toml -o results/$*/inferred \
+	    --measurements results/$*/campaign/map.csv --held-out results/$*/campaign/held-out.csv
+	.venv/bin/halbach-fe diagnose studies/$*/study.toml -o results/$*/diagnosis \
+	    --measurements results/$*/campaign/map.csv --held-out results/$*/campaign/held-out.csv
 
 study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity

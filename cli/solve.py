@@ -23,6 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Solve the field, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.response.solution import solve, study_observation, write_solution
+    from halbach_fe.solver.formulation_choice import choose_route
     from halbach_fe.solver.runs import newton_history
     from halbach_fe.study.reader import read_study
 
@@ -46,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         "method": magnet.study.solver.method,
         "points, readings": f"{len(solution.points)}, {len(solution.readings)}",
         "solved in": f"{summary['seconds']} s"})
-    if magnet.is_nonlinear:
+    if magnet.is_nonlinear and choose_route(magnet, solution.points) != "moments":
         summary["newton_residuals"] = newton_history(arguments.output)
     if arguments.json:
         common.print_json(summary)

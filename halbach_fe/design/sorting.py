@@ -179,7 +179,8 @@ def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) ->
     carried = np.einsum("ksi,sij->ksj", columns, turns)
     mean = np.einsum("ksj,bj->kbs", carried, vectors)
     labels = {label: number for number, label in enumerate(types_of(magnet))}
-    of_slot = {slot: labels[label] for label, slots in types_of(magnet).items() for slot in slots}
+    type_of = {number: labels[label] for label, members in types_of(magnet).items()
+               for number in members}
     # The order hardly changes the main multipole: scale it with the blocks' median strength.
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))
                                       / np.median(_magnitudes(model.nominal, size)[there]))
@@ -190,7 +191,7 @@ def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) ->
     return _SlotResponses(
         model, vectors, roots, turns, mean, np.moveaxis(units(mean), 0, 2), units(model.offset),
         np.array([labels[label] for label in table.type]),
-        np.array([of_slot[block.slot] for block in blocks]))
+        np.array([type_of[number] for number in there.tolist()]))
 
 
 def present(magnet: Magnet) -> Ints:
@@ -211,8 +212,8 @@ def _magnitudes(vectors: Floats, dimension: int) -> Floats:
 
 def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
     """Raise a MeasurementError if the table has too few blocks of a type."""
-    for label, slots in types_of(magnet).items():
-        needed = sum(magnet.blocks[number].slot in slots for number in present(magnet))
+    for label, members in types_of(magnet).items():
+        needed = sum(bool(magnet.blocks[number].remanence) for number in members)
         measured = table.type.count(label)
         if measured < needed:
             raise MeasurementError(must_be(

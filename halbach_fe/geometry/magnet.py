@@ -66,7 +66,7 @@ class Magnet(ShownInNotebook):
     ...               "remanence_T": 1.3, "block": {"shape": "sector"}},
     ...     "observation": {"quantity": "flux_density", "positions": {
     ...         "kind": "points", "points_m": [[0, 0, 0]]}}}))
-    >>> len(magnet.blocks), magnet.radius, magnet.parameter_names[:2]
+    >>> len(magnet.blocks), round(magnet.radius, 6), magnet.parameter_names[:2]
     (8, 0.08, ('r01s01.Mx', 'r01s01.My'))
     """
 

@@ -153,8 +153,8 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     known.
     """
     blocks, size = magnet.blocks, magnet.dimension
-    slots = types_of(magnet)
-    _check_types(magnet, table, slots)
+    members_of = types_of(magnet)
+    _check_types(magnet, table)
     _check_complete(magnet, table, used)
     index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
@@ -164,9 +164,9 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     _check_near(table, deviations)
     deviations, frames = deviations[:, :size], frames[:, :size, :size]
     placed = bool(table.ring.any())
-    needed = {blocks[number].slot for number in used} if not placed else set()
-    members = {label: deviations[np.array(table.type) == label] for label, own in slots.items()
-               if label in table.type or needed.intersection(own)}
+    members = {label: deviations[np.array(table.type) == label]
+               for label, numbers in members_of.items()
+               if label in table.type or (not placed and not used.isdisjoint(numbers))}
     intensities: dict[str, float | None] = dict.fromkeys(members)
     mean, own = np.zeros((len(blocks), size)), np.zeros((len(blocks), size, size))
     shared = [np.zeros((len(blocks), size, 0))]
@@ -176,14 +176,14 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
         roots = table.sigma[rows, None, None] * conversion[rows]
         own[index[rows]] = (roots @ roots.transpose(0, 2, 1))[:, :size, :size]
     else:
-        _check_alike(magnet, slots,
+        _check_alike(magnet,
                      lambda block: rotation_about_z(np.radians(block.angle_deg)),
                      "Give ring and slot of every measured block.")
-        slot_of = np.array([block.slot for block in blocks])
         for label, samples in members.items():
             _check_samples(table, label, samples)
             covariance, intensities[label] = predictive_covariance(samples)
-            frame = np.where(np.isin(slot_of, slots[label])[:, None, None], frames, 0.0)
+            frame = np.zeros_like(frames)
+            frame[list(members_of[label])] = frames[list(members_of[label])]
             mean += frame @ (np.eye(size)[0] + samples.mean(axis=0))
             own += frame @ covariance @ frame.transpose(0, 2, 1)
             shared.append(frame @ np.linalg.cholesky(covariance / len(samples)))  # of the mean
@@ -224,9 +224,9 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
         If the study's blocks of a type differ from each other.
     """
     magnet = as_meant(magnet)
-    blocks, slots, size = magnet.blocks, types_of(magnet), magnet.dimension
-    _check_types(magnet, table, slots)
-    _check_alike(magnet, slots, shape_axes, "Make them types of their own.")
+    blocks, size = magnet.blocks, magnet.dimension
+    _check_types(magnet, table)
+    _check_alike(magnet, shape_axes, "Make them types of their own.")
     index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
@@ -271,20 +271,36 @@ def _tested(
 
 
 def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
-    """Return the slots of every type of block, by the label of the type."""
-    return magnet.study.prior.types or {
-        str(slot): (slot,) for slot in sorted({block.slot for block in magnet.blocks})}
+    """Return the numbers of the blocks of every type, from 0, by the label of the type.
+
+    The study's ``prior.types`` names slots. Without it, a free block has the type of its table,
+    and every other slot is a type of its own.
+    """
+    blocks, table = magnet.blocks, magnet.array.free_blocks
+    label_of = {slot: label for label, slots in magnet.study.prior.types.items() for slot in slots}
+    labels = [label_of.get(block.slot, str(block.slot)) for block in blocks]
+    if table is not None and table.type and not label_of:
+        first = len(blocks) - len(table)
+        labels[first:] = [own or label for own, label in zip(
+            table.type, labels[first:], strict=True)]
+    listed = [slot for slots in magnet.study.prior.types.values() for slot in slots]
+    rank = {slot: place for place, slot in enumerate(listed)}
+    order = sorted(range(len(blocks)), key=lambda number: (
+        rank.get(blocks[number].slot, blocks[number].slot), number))
+    found: dict[str, list[int]] = {label: [] for label in magnet.study.prior.types}
+    for number in order:
+        found.setdefault(labels[number], []).append(number)
+    return {label: tuple(members) for label, members in found.items()}
 
 
 def first_of_types(magnet: Magnet) -> dict[str, int]:
     """Return the number of the first block of every type, from 0, by the label of the type.
 
-    It is in the first slot of the type that has blocks; types without blocks are left out.
+    It is in the first slot of the type; types without blocks are left out.
     """
-    of_slot = {block.slot: number for number, block in reversed(list(enumerate(magnet.blocks)))
-               if block.remanence}
-    return {label: next(of_slot[slot] for slot in slots if slot in of_slot)
-            for label, slots in types_of(magnet).items() if any(slot in of_slot for slot in slots)}
+    present = {label: [number for number in members if magnet.blocks[number].remanence]
+               for label, members in types_of(magnet).items()}
+    return {label: members[0] for label, members in present.items() if members}
 
 
 def shape_axes(block: MagnetBlock) -> Floats:
@@ -361,10 +377,10 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
     return np.asarray(table.moment / factor[:, None])
 
 
-def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, ...]]) -> None:
+def _check_types(magnet: Magnet, table: BlockTable) -> None:
     """Raise a MeasurementError if a type or place is not in the study."""
     places = {(block.ring, block.slot) for block in magnet.blocks if block.remanence}
-    first = first_of_types(magnet)
+    first, types = first_of_types(magnet), types_of(magnet)
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
         if label not in first:
             raise MeasurementError(must_be(
@@ -377,10 +393,11 @@ def _check_types(magnet: Magnet, table: BlockTable, slots: dict[str, tuple[int, 
                 f"one of the magnet's {len(magnet.blocks_by_ring)} rings of "
                 f"{', '.join(map(str, sorted(set(magnet.blocks_by_ring))))} blocks",
                 f"ring {ring}, slot {slot}"))
-        if slot and slot not in slots[label]:
+        if slot and magnet.number_of(ring, slot) not in types[label]:
+            slots = dict.fromkeys(magnet.blocks[number].slot for number in types[label])
             raise MeasurementError(must_be(
                 f"type of block {serial}", table.source, f"that of its slot {slot}",
-                f"'{label}', which belongs to slot {', '.join(map(str, slots[label]))}"))
+                f"'{label}', which belongs to slot {', '.join(map(str, slots))}"))
 
 
 def _check_complete(magnet: Magnet, table: BlockTable, used: Set[int]) -> None:
@@ -440,23 +457,23 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
 
 
 def _check_alike(
-    magnet: Magnet, slots: dict[str, tuple[int, ...]], axes: Callable[[MagnetBlock], Floats],
-    hint: str
+    magnet: Magnet, axes: Callable[[MagnetBlock], Floats], hint: str
 ) -> None:
     """Raise a StudyError if the study's blocks of a type differ, seen from their own axes.
 
     ``axes`` returns the axes of a block as columns (3, 3). A moment must mean the same deviation
     from the nominal magnetization for all blocks of a type.
     """
-    blocks = [block for block in magnet.blocks if block.remanence]
+    blocks = magnet.blocks
     finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block
               for block in blocks]
     tensors = demagnetizing_tensors(finite)
     seen = np.array([
-        np.linalg.solve(_frame(block), _of_block(block, tensor) @ axes(block))
-        / block.volume for block, tensor in zip(finite, tensors, strict=True)])
-    for label, own in slots.items():
-        members = [number for number, block in enumerate(blocks) if block.slot in own]
+        np.linalg.solve(_frame(block), _of_block(block, tensor) @ axes(block)) / block.volume
+        if block.remanence else np.zeros((3, 3))
+        for block, tensor in zip(finite, tensors, strict=True)])
+    for label, own in types_of(magnet).items():
+        members = [number for number in own if blocks[number].remanence]
         first = members[0] if members else -1
         for number in members[1:]:
             if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():

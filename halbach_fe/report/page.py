@@ -8,6 +8,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -74,8 +75,8 @@ def write_page(
         Variables of the template.
     """
     versions = [f"{name} {metadata.version(name)}" for name in PROGRAMS]
-    text = None if study is None else tomlkit.dumps(
-        study.model_dump(mode="json", exclude_unset=True, exclude_none=True))
+    text = None if study is None else tomlkit.dumps(_without_empty_cells(
+        study.model_dump(mode="json", exclude_unset=True, exclude_none=True)))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -83,6 +84,15 @@ def write_page(
     write_text(path, environment.get_template(template).render(
         pictures=pictures, study=study, study_text=text, provenance={**(provenance or {}),
             "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
+
+
+def _without_empty_cells(value: Any) -> Any:
+    """Return keys and values with "" for the empty cells of tables, which TOML does not have."""
+    if isinstance(value, dict):
+        return {key: _without_empty_cells(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_without_empty_cells(one) for one in value]
+    return "" if value is None else value
 
 
 def stacked_axes(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -397,12 +398,19 @@ def _estimate(
                        sum(run.seconds for run in runs) / at_once)
     return Estimate(
         study=magnet.name, blocks=len(blocks), readings=readings, parameters=parameters, jobs=jobs,
-        route=problems[0].route if problems else EXACT_FIELD_ONLY,
+        route=_route(magnet, points, problems),
         problems=tuple(replace(problem, seconds=problem.seconds / speed) for problem in problems),
         own_memory_GiB=own, memory_GiB=own + side_by_side,
         disk_GiB=sum(problem.processes * problem.disk_GiB for problem in problems)
         + 8 * (matrix + information) / GIB,
         seconds=seconds / speed, available_GiB=available_memory())
+
+
+def _route(magnet: Magnet, points: Floats, problems: Sequence[Problem]) -> str:
+    """Return the route of most points: that of the first run of GetDP, if there is any."""
+    if problems:
+        return problems[0].route
+    return EXACT_FIELD_ONLY if magnet.is_vacuum else choose_route(magnet, points)
 
 
 def _places(magnet: Magnet, points: Floats) -> float:

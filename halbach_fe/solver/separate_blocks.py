@@ -50,8 +50,8 @@ class SeparateReaction:
     Attributes
     ----------
     blocks : tuple of Moments
-        Polarization of the blocks, in cells of the study's size and in fewer; none if all
-        permeabilities are 1.
+        Polarization of the blocks, in cells of the study's size and of another, for the error bar;
+        none if all permeabilities are 1.
     iron : IronReaction or None
     """
 
@@ -62,7 +62,9 @@ class SeparateReaction:
         """Return the reaction and its error bar, both (n, 3) in T, at points (n, 3) in m."""
         field, error = np.zeros((len(points), 3)), np.zeros((len(points), 3))
         if self.blocks:
-            field, error = _with_error(*self.blocks, points)
+            from halbach_fe.solver.moments.solve import field_with_errors
+
+            field, error = field_with_errors(self.blocks[0], self.blocks[1], points)
         if self.iron is not None:
             field, error = field + self.iron.field(points), error + self.iron.error(points)
         return field, error
@@ -156,22 +158,12 @@ def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
                  for body in magnet.iron)
 
 
-def _with_error(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:
-    """Return the field of polarized blocks and its error bar, both (n, 3) in T."""
-    from halbach_fe.solver.moments.solve import ERROR_SHARE, FLOOR
-
-    field = fine.reaction(points)
-    change = np.linalg.norm(field - coarse.reaction(points), axis=1, keepdims=True)
-    size = np.linalg.norm(field, axis=1, keepdims=True)
-    return field, np.broadcast_to(ERROR_SHARE * change + FLOOR * size, field.shape)
-
-
 def _remembered(function: Field) -> Field:
     """Return a function that does not compute the field at the same points again."""
     known: dict[bytes, Floats] = {}
 
     def field(points: Floats) -> Floats:
-        key = hashlib.sha256(np.ascontiguousarray(points)).digest()
+        key = hashlib.sha256(points.tobytes()).digest()
         if key not in known:
             known[key] = function(points)
         return known[key]
@@ -190,13 +182,12 @@ def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
 
 
 def _systems(blocks: Sequence[MagnetBlock], cells_per_side: int | None) -> tuple[System, ...]:
-    """Return the blocks in cells of the study's size and in fewer; none in vacuum."""
+    """Return the blocks in cells of two sizes, see `refinement`; none in vacuum."""
     if not _permeable(blocks):
         return ()
-    from halbach_fe.solver.moments.solve import CELLS_PER_SIDE, System  # imports numba
+    from halbach_fe.solver.moments.solve import refinement  # imports numba
 
-    cells = cells_per_side or CELLS_PER_SIDE
-    return tuple(System.of(blocks, number) for number in (cells, max(1, cells - 1)))
+    return refinement(blocks, cells_per_side)
 
 
 def _present(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:

@@ -11,7 +11,7 @@ a copy of it.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +86,11 @@ def write_edited(path: Path, text: str, steps: Iterable[tuple[Study, str]]) -> N
 
     A table of free blocks is written beside it.
     """
-    study: Study | None = None
-
-    def noted() -> Iterator[tuple[Study, str]]:
-        nonlocal study
-        for study, note in steps:
-            yield study, note
-
-    write_text(path, edited_text(text, noted()))
-    if study is not None and study.array.free_blocks is not None:
-        write_free_blocks(study.array.free_blocks, path.with_name(FREE_BLOCKS_FILE))
+    studies = list(steps)
+    write_text(path, edited_text(text, studies))
+    table = studies[-1][0].array.free_blocks if studies else None
+    if table is not None:
+        write_free_blocks(table, path.with_name(FREE_BLOCKS_FILE))
 
 
 def _parsed(text: str, study: Study) -> Study:

@@ -9,10 +9,13 @@ points, at which its material answers ``P = (mu_r - 1) mu_0 H``. H has two parts
   of a linear system, with one equation per block, again by closed forms nearby and by dipoles
   farther away.
 
-The first answer, of first order in mu_r - 1, is thus resolved within the block, and the answer to
-the answers, of second order, is uniform in it. `halbach_fe.solver.moments` is another method: it
-divides blocks into cells, integrates their interactions over both cells with kernels of its own,
-and solves for every cell.
+The first answer, of first order in mu_r - 1, is thus resolved within the block. The answer to the
+answers, of second order, is that to the mean of each block, and the mean answer to its deviations
+from the mean: by reciprocity, the mean field that deviations in one block have in another is that
+of the uniformly polarized other block, weighted with the deviations.
+
+`halbach_fe.solver.moments` is another method: it divides blocks into cells, integrates their
+interactions over both cells with kernels of its own, and solves for every cell.
 """
 
 from __future__ import annotations
@@ -43,14 +46,15 @@ NEAR = 1.5
 """Distance of two blocks, relative to the sum of the radii of spheres around them, up to which
 closed forms are used. Beyond it the eight dipoles of a cube are good to 1e-3 of its field."""
 
-NODES = {100: 5, 400: 4, 1500: 3}
+NODES = {100: 6, 400: 4, 1500: 3}
 """Gauss points along a side of a block, by the largest number of blocks; 2 for more blocks."""
 
 LONE_NODES = 6
 """Gauss points along a side of a block that is measured alone."""
 
 PRECISION = 1e-8
-"""Relative residual of the linear system; the method's own error is 1e-3 of the reaction."""
+"""Relative residual of the linear system. The method's own error was measured to be 3e-3 of the
+reaction at 0.6 times the size of a block from its face, for permeabilities of 1.06 and 1.15."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,10 @@ class _Block:
     volumes: Floats
     answer: Floats
 
+    def mean(self, values: Floats) -> Floats:
+        """Return the mean over the block of values at its nodes, (n, ...)."""
+        return np.tensordot(self.volumes / self.volumes.sum(), values, axes=1)
+
 
 def separate_reaction(
     magnet: TrueMagnet, points: Floats, progress: Progress = no_progress
@@ -89,17 +97,23 @@ def separate_reaction(
     blocks = [_block(sources[number], count) for number in answering]
     near = _neighbours(sources)
     first, tensors = _of_remanences(sources, blocks, answering, near, progress)
-    means = _solve_means(blocks, answering, near, first, tensors)
-    far = _far_of_means(blocks, answering, near, means)
+    extra = np.zeros((len(blocks), 3))
+    for _ in range(2):  # without and with the deviations of the answers from their means
+        means = _solve_means(blocks, answering, near, first, extra, tensors)
+        far = _far_of_means(blocks, answering, near, means) + extra
+        answers = [(first[row] + far[row] + sum(
+            tensor @ means[column] for column, tensor in tensors[row].items()))
+            @ block.answer.T for row, block in enumerate(blocks)]
+        extra = _of_deviations(blocks, tensors, answers)
+        answers = [own + _within(block, own) @ block.answer.T
+                   for block, own in zip(blocks, answers, strict=True)]
     places, moments, uniform = [], [], []
-    for row, block in enumerate(blocks):
-        field = first[row] + far[row]
-        for column, tensor in tensors[row].items():
-            field = field + tensor @ means[column]
+    for block, own in zip(blocks, answers, strict=True):
+        mean = block.mean(own)
         places.append(block.nodes)
-        moments.append((field @ block.answer.T - means[row]) * block.volumes[:, None])
-        own = block.body.orientation.inv().apply(means[row])
-        uniform.append(replace(block.body, remanence=vector(own), parts=()))
+        moments.append((own - mean) * block.volumes[:, None])
+        uniform.append(replace(block.body, parts=(), remanence=vector(
+            block.body.orientation.inv().apply(mean))))
     return vacuum_field(uniform, points) + moment_field(
         np.vstack(places), np.vstack(moments), points)
 
@@ -111,9 +125,13 @@ def lone_moment_matrix(shape: Shape, permeability: Floats) -> Floats:
     """
     nodes, volumes = shape.nodes(LONE_NODES)
     fields = np.stack([piece_field((shape, *WHOLE), axis, nodes) for axis in np.eye(3)], axis=2)
-    mean = np.einsum("n,nij->ij", volumes / volumes.sum(), fields)
-    response = (permeability - np.eye(3)) @ mean
-    return np.asarray(shape.volume / MU_0 * np.linalg.inv(np.eye(3) - response))
+    share, chi = volumes / volumes.sum(), permeability - np.eye(3)
+    mean = np.tensordot(share, fields, axes=1)
+    solved = np.linalg.inv(np.eye(3) - chi @ mean)  # polarization and mean answer, per remanence
+    answers = chi @ fields @ solved
+    deviations = answers - np.tensordot(share, answers, axes=1)
+    extra = np.einsum("n,nji,njk->ik", share, fields, deviations)
+    return np.asarray(shape.volume / MU_0 * solved @ (np.eye(3) + chi @ extra))
 
 
 def _block(body: Body, count: int) -> _Block:
@@ -182,16 +200,16 @@ def _of_remanences(
 
 def _solve_means(
     blocks: Sequence[_Block], answering: Sequence[int], near: Sequence[Ints],
-    first: Sequence[Floats], tensors: Sequence[dict[int, Floats]],
+    first: Sequence[Floats], extra: Floats, tensors: Sequence[dict[int, Floats]],
 ) -> Floats:
-    """Return the mean answer (blocks, 3) in T of every block."""
-    def mean(row: int, values: Floats) -> Floats:
-        share = blocks[row].volumes / blocks[row].volumes.sum()
-        return np.tensordot(share, values, axes=1)
+    """Return the mean answer (blocks, 3) in T of every block.
 
-    coupling = [{column: blocks[row].answer @ mean(row, tensor)
-                 for column, tensor in tensors[row].items()} for row in range(len(blocks))]
-    right = np.array([block.answer @ mean(row, first[row]) for row, block in enumerate(blocks)])
+    ``extra`` (blocks, 3) in T is added to the field ``first`` at the nodes.
+    """
+    coupling = [{column: block.answer @ block.mean(tensor) for column, tensor in own.items()}
+                for block, own in zip(blocks, tensors, strict=True)]
+    right = np.array([block.answer @ (block.mean(field) + more)
+                      for block, field, more in zip(blocks, first, extra, strict=True)])
 
     def apply(flat: Floats) -> Floats:
         means = flat.reshape(-1, 3)
@@ -209,6 +227,42 @@ def _solve_means(
     if failed:
         raise CheckFailedError("The answers of separate blocks to one another do not converge.")
     return np.asarray(solution.reshape(-1, 3))
+
+
+def _of_deviations(
+    blocks: Sequence[_Block], tensors: Sequence[dict[int, Floats]], answers: Sequence[Floats]
+) -> Floats:
+    """Return the mean field (blocks, 3) in T, in every block, of what deviates from means nearby.
+
+    The field is that of the deviations of ``answers`` (n, 3) in T, in the block and its neighbours,
+    from their means.
+    """
+    field = np.zeros((len(blocks), 3))
+    for block, own, values in zip(blocks, tensors, answers, strict=True):
+        deviations = (values - block.mean(values)) * block.volumes[:, None]
+        for column, tensor in own.items():
+            field[column] += np.einsum("nji,nj->i", tensor, deviations) / (
+                blocks[column].volumes.sum())
+    return field
+
+
+def _within(block: _Block, answers: Floats) -> Floats:
+    """Return how the field (n, 3) in T of a block's own deviations deviates from its mean in it.
+
+    The answer at each node fills a sphere of the node's share of the block's volume. Outside the
+    sphere its field is that of a dipole; inside, mu_0 H is -1/3 of the polarization. The mean is
+    left to `_of_deviations`, which is exact.
+    """
+    deviations = answers - block.mean(answers)
+    offset = block.nodes[:, None] - block.nodes
+    distance = np.linalg.norm(offset, axis=2)
+    inside = distance < np.cbrt(3 * block.volumes / (4 * np.pi))
+    distance[inside] = np.inf
+    moments = deviations * block.volumes[:, None] / (4 * np.pi)
+    along = 3 * np.einsum("ijk,jk->ij", offset, moments) / distance**5
+    field = (np.einsum("ij,ijk->ik", along, offset) - distance**-3 @ moments
+             - inside @ deviations / 3)
+    return np.asarray(field - block.mean(field))
 
 
 def _far_of_means(

@@ -41,7 +41,7 @@ def blocks(study, seed, spare=0):
         tables.append(coil_table(study, nominal, single, COIL_SD, generator)[0])
         # a block without a place is measured as in the first slot of its type
         moments.append(as_mounted(build_magnet(study), tables[-1], np.array([
-            types_of(build_magnet(study))[label][0] - 1 for label in tables[-1].type])))
+            types_of(build_magnet(study))[label][0] for label in tables[-1].type])))
     rows = np.arange(count + spare)
     sigma, volume, temperature = (
         np.concatenate([getattr(one, name) for one in tables])[rows]

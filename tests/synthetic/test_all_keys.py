@@ -24,7 +24,8 @@ from tests.conftest import DIPOLE, changed, circle
 POINTS = np.vstack([circle(0.04, 5, z, 0.2 + z) for z in (-0.11, 0.004, 0.06)])
 
 ROUNDING = 2e-9
-"""Error in T of magpylib's sectors of some 0.1 m and 1 T; measured up to 6e-10 T, mostly 7e-11 T."""
+"""Error in T of magpylib's sectors of some 0.1 m and 1 T; measured up to 6e-10 T, and mostly
+7e-11 T."""
 
 RING = {"blocks_per_ring": 8, "inner_radius_m": 0.1, "outer_radius_m": 0.13,
         "ring_length_m": 0.04, "remanence_T": 1.1, "block": {"shape": "cuboid", "width_m": 0.025}}
@@ -108,14 +109,17 @@ RINGS = {
     "count": ({}, {"count": 2}),
     "layer": ({}, {"layer": 2, "inner_radius_m": 0.2, "outer_radius_m": 0.23}),
     "z_m": ({}, {"z_m": 0.09}), "multipole_order": ({}, {"multipole_order": 2}),
-    "blocks_per_ring": ({}, {"blocks_per_ring": 6}), "inner_radius_m": ({}, {"inner_radius_m": 0.11}),
-    "outer_radius_m": ({}, {"outer_radius_m": 0.12}), "ring_length_m": ({}, {"ring_length_m": 0.05}),
+    "blocks_per_ring": ({}, {"blocks_per_ring": 6}),
+    "inner_radius_m": ({}, {"inner_radius_m": 0.11}),
+    "outer_radius_m": ({}, {"outer_radius_m": 0.12}),
+    "ring_length_m": ({}, {"ring_length_m": 0.05}),
     "ring_gap_m": ({"ring_gap_m": 0.007}, {}),
     "first_block_angle_deg": ({}, {"first_block_angle_deg": 10.0}),
     "first_magnetization_angle_deg": ({}, {"first_magnetization_angle_deg": 10.0}),
     "recoil_permeability": ({}, {"recoil_permeability": 1.2}),
     "recoil_permeability_across": ({}, {"recoil_permeability_across": 1.2}),
-    "remanence_T": ({}, {"remanence_T": 0.9}), "block_moment_A_m2": ({}, {"block_moment_A_m2": 8.0}),
+    "remanence_T": ({}, {"remanence_T": 0.9}),
+    "block_moment_A_m2": ({}, {"block_moment_A_m2": 8.0}),
     "block": ({}, {"block": {"shape": "trapezoid", "side_gap_m": 0.002}}),
     "material": ({}, {"material": "N42SH"}),
 }
@@ -186,7 +190,8 @@ FREE = {
     "size_x_m": (PLAIN, {"size_x_m": 0.02}), "size_y_m": (PLAIN, {"size_y_m": 0.03}),
     "size_z_m": (PLAIN, {"size_z_m": 0.03}),
     "inner_radius_m": (SECTOR, {"inner_radius_m": 0.04}),
-    "outer_radius_m": (SECTOR, {"outer_radius_m": 0.06}), "angle_deg": (SECTOR, {"angle_deg": 50.0}),
+    "outer_radius_m": (SECTOR, {"outer_radius_m": 0.06}),
+    "angle_deg": (SECTOR, {"angle_deg": 50.0}),
     "inner_width_m": (TRAPEZOID, {"inner_width_m": 0.015}),
     "outer_width_m": (TRAPEZOID, {"outer_width_m": 0.03}),
     "radius_m": (POLYGON, {"radius_m": 0.018}), "sides": (POLYGON, {"sides": 6}),

@@ -20,11 +20,12 @@ OPENING = 0.6
 """Largest sum of the radii of two clusters, relative to their distance, that allows expansions."""
 
 DEGREE = 6
-"""Degree of the expansions between cells. With `OPENING` the reaction of 96 cubes differs by 5e-6
-from the exact sum."""
+"""Degree of the expansions between cells. The reaction of 96 cubes differs by less than 1e-5 of it
+from that by exact sums."""
 
 READING_DEGREE = 12
-"""Degree of the expansions at points, where a difference is not multiplied by chi."""
+"""Degree of the expansions at points, where an error is not multiplied by chi. In the bore of 96
+cubes the error was 3e-4 of the reaction, and 6e-4 with degree 8."""
 
 TOUCHING, CLOSE = 1.0, 1.4
 """Distances of two cells, in units of the sum of their radii, below which they count as touching or

@@ -215,9 +215,9 @@ def solve_moments(
 
 def refinement(blocks: Sequence[MagnetBlock],
                cells_per_side: int | None = None) -> tuple[System, System]:
-    """Return blocks in cells, at least two along the sides of a cube, and in half as many."""
-    fine = max(2, cells_per_side or CELLS_PER_SIDE)
-    return System.of(blocks, fine), System.of(blocks, fine // 2)
+    """Return blocks in cells, and in half as many along each side; a single cell, also in two."""
+    cells = cells_per_side or CELLS_PER_SIDE
+    return System.of(blocks, cells), System.of(blocks, cells // 2 if cells > 1 else 2)
 
 
 def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:
