@@ -215,8 +215,11 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def bore_radius(self) -> float:
-        """Radius in m of the largest cylinder about the z axis that the blocks leave free."""
-        return bore_radius(self.blocks)
+        """Radius in m of the largest cylinder about the z axis that the blocks leave free.
+
+        For equal rings it is their inner radius, which corners of turned cuboids may pass.
+        """
+        return self.array.inner_radius_m if self.array.is_uniform else bore_radius(self.blocks)
 
     @property
     def iron_half_length(self) -> float:

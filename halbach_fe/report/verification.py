@@ -76,10 +76,11 @@ def error_basis(found: Verification) -> str:
     if found.differences[-1].what == EXACT:
         return "The error is the difference from the exact field of the blocks in vacuum."
     limit = {FLATTEST: " at most", STEEPEST: " at least"}.get(found.order, "")
-    text = ("The estimated error is the total change that all further refinements would make, plus "
-            "the change that a boundary farther away makes. It assumes that the changes by "
-            "successive refinements decrease by the same factor as the last two do (order "
-            f"{found.order:.1f}{limit} in the element size).")
+    boundary = (", plus the change that a boundary farther away makes"
+                if found.route != "moments" else "")
+    text = ("The estimated error is the total change that all further refinements would make"
+            f"{boundary}. It assumes that the changes by successive refinements decrease by the "
+            f"same factor as the last two do (order {found.order:.1f}{limit} in the element size).")
     if len(found.differences) > 3:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
                  "concerned. The difference between the two formulations is the solver's error bar "

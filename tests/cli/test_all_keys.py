@@ -185,14 +185,17 @@ COMMANDS: dict[str, tuple[str, list[str]]] = {
 """Folder and options of every command but `solve`, which makes the map for the others."""
 
 WHOLE = ("missing", "displaced", "missing-permeable", "layers-missing", "free-turned",
-         "free-missing", "free-types", "iron-curve-free", "flat-missing", "flat-layers")
+         "free-missing", "free-types", "flat-missing", "flat-layers")
 """Studies for every command, which among them have every kind of magnet."""
 
 BRIEF = ("infer-dry", "infer-blocks", "diagnose", "multipoles", "demagnetization", "export")
 """Commands for every study: each has a way of its own from the keys to a field."""
 
+SLOW = ("iron-curve", "iron-curve-free")
+"""Studies whose fields take seconds; they go through a single command."""
+
 PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
-         if name in WHOLE or command in BRIEF]
+         if name in WHOLE or command == "infer-blocks" or (command in BRIEF and name not in SLOW)]
 
 UNLIKE = "Make them types of their own"
 REFUSED: dict[tuple[str, str], str] = {

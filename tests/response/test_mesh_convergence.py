@@ -61,8 +61,20 @@ def test_several_circles_and_regions(dipole, session):
     assert 0 < found.fourier < found.pointwise
 
 
-def test_other_geometries_get_the_dual_route(short_dipole, session):
-    study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04)
+def test_separate_blocks_are_verified_by_their_cells(short_dipole, session):
+    """There is no boundary to move, and fewer cells change the field more than more cells do."""
+    study = short_dipole(array__block={"shape": "trapezoid", "side_gap_m": 0.002})
+    found = verify(build_magnet(study), session)
+    assert found.route == "moments"
+    assert len(found.differences) == 2
+    coarser, finer = (difference.pointwise for difference in found.differences)
+    assert 0 < finer < coarser < 1e-3
+    assert finer < found.error_pointwise < 1e-3
+
+
+def test_a_3d_mesh_gets_the_dual_route(short_dipole, session):
+    study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04,
+                         solver__route="scalar_potential")
     found = verify(build_magnet(study), session)
     assert found.route == "scalar_potential"
     assert found.differences[-1].what == "dual route, edge_elements"

@@ -371,7 +371,7 @@ def arrays(draw):
 def test_fields_of_random_magnets(array):
     """In vacuum, to 1e-9 of the main field or magpylib's rounding; the remanence is some 1 T.
 
-    Negative control: the last block turned by a hundredth of a degree, on its own.
+    Negative control: the first block turned by a tenth of a degree.
     """
     try:
         study = study_of(array)
@@ -380,7 +380,8 @@ def test_fields_of_random_magnets(array):
         return
     agree(study)
     turned = study_of(array | {"exceptions": [*array["exceptions"], {
-        "ring": 1, "slot": 1, "rotation_deg": (0.0, 0.0, 0.01), "magnetization_factor": 1.0}]})
-    theirs, _ = both(study)
+        "ring": 1, "slot": 1, "rotation_deg": (0.0, 0.0, 0.1)}]})
+    theirs = field_of(build_magnet(study).blocks, POINTS)
     if np.any(magnet_of(study).bodies[0].remanence):
-        assert np.abs(both(turned)[1] - theirs).max() > 10 * ROUNDING
+        other = vacuum_field(magnet_of(turned).bodies, POINTS)  # it may touch its neighbours
+        assert np.abs(other - theirs).max() > 10 * ROUNDING
