@@ -390,7 +390,7 @@ def _check_types(magnet: Magnet, table: BlockTable) -> None:
         if ring and (ring, slot) not in places:
             raise MeasurementError(must_be(
                 f"place of block {serial}", table.source,
-                f"one of the magnet's {len(magnet.blocks_by_ring)} rings of "
+                f"within {len(magnet.blocks_by_ring)} rings of "
                 f"{', '.join(map(str, sorted(set(magnet.blocks_by_ring))))} blocks",
                 f"ring {ring}, slot {slot}"))
         if slot and magnet.number_of(ring, slot) not in types[label]:

@@ -27,8 +27,8 @@ PRECISION = 1e-12
 VACUUM = tuple(np.eye(3).ravel().tolist())
 """The permeability of vacuum, row by row."""
 
-MOST_SOLVES = 24
-"""Largest number of different blocks for which NGSolve solves, some seconds each. Of more different
+MOST_SOLVES = 4
+"""Largest number of different blocks for which NGSolve solves, some 10 s each. Of more different
 ones, `lone_moment_matrix` gives the moments to some 1e-4."""
 
 

@@ -13,9 +13,6 @@ from halbach_fe.synthetic.separate_reaction import separate_reaction
 from halbach_fe.synthetic.shapes import PrismBody
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
-MOST_CUBOIDS = 64
-"""Largest number of cuboids in rings that are meshed without need, in three dimensions."""
-
 MOST_IN_IRON = 400
 """Largest number of separate blocks that are meshed together with iron, in three dimensions. Each
 has some 1000 elements of order 3, which is some 3 GB for all."""
@@ -45,8 +42,8 @@ def by_elements(magnet: TrueMagnet) -> bool:
     """Tell whether NGSolve computes the reaction, or `separate_reaction` does.
 
     NGSolve meshes cross-sections, rings of sectors and trapezoids, and all magnets with iron.
-    Cuboids and free blocks in three dimensions, whose narrow gaps would need small elements, are
-    meshed only if they are few or in iron.
+    Cuboids and free blocks in three dimensions, whose gaps need many elements, are meshed only with
+    iron.
 
     Raises
     ------
@@ -54,14 +51,12 @@ def by_elements(magnet: TrueMagnet) -> bool:
         If the magnet has iron and more separate blocks than can be meshed with it.
     """
     bodies = magnet.all_bodies
-    free = [body for body in bodies if body.name]
-    separate = len(free) + sum(
-        1 for body in bodies
-        if not body.name and isinstance(body.shape, PrismBody) and body.shape.is_cuboid)
+    separate = sum(bool(body.name) or (isinstance(body.shape, PrismBody) and body.shape.is_cuboid)
+                   for body in bodies)
     if magnet.dimension == 2 or not separate:
         return True
     if magnet.iron is None:
-        return not free and separate <= MOST_CUBOIDS
+        return False
     if separate > MOST_IN_IRON:
         raise StudyError(must_be(
             "`array` with iron", "the study", f"of at most {MOST_IN_IRON} cuboids and free blocks "

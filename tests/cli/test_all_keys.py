@@ -192,10 +192,13 @@ BRIEF = ("infer-dry", "infer-blocks", "diagnose", "multipoles", "demagnetization
 """Commands for every study: each has a way of its own from the keys to a field."""
 
 SLOW = ("iron-curve", "iron-curve-free")
-"""Studies whose fields take seconds; they go through a single command."""
+"""Studies whose fields take seconds; they go through a single command. A diagnosis, of many fields,
+takes minutes with iron of any kind."""
 
 PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
-         if name in WHOLE or command == "infer-blocks" or (command in BRIEF and name not in SLOW)]
+         if name in WHOLE or command == "infer-blocks"
+         or (command in BRIEF and name not in SLOW
+             and not (command == "diagnose" and name.startswith("iron")))]
 
 UNLIKE = "Make them types of their own"
 REFUSED: dict[tuple[str, str], str] = {

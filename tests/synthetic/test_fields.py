@@ -78,14 +78,14 @@ def test_nominal_magnet_is_the_studys(short_dipole, shape):
 
 def test_points_in_material(short_dipole, shape, generator):
     study = of_shape(short_dipole, shape,
-                     iron_ring={"inner_radius_m": 0.19, "outer_radius_m": 0.2,
+                     iron_ring={"inner_radius_m": 0.192, "outer_radius_m": 0.2,
                                 "relative_permeability": 100.0})
     points = generator.uniform(-0.21, 0.21, (4000, 3)) * [1, 1, 0.5]
     expected = np.zeros(len(points), bool)
     for block in build_magnet(study).blocks:
         expected |= block.contains(points)
     radius = np.hypot(points[:, 0], points[:, 1])
-    expected |= (radius > 0.19) & (radius < 0.2) & (np.abs(points[:, 2]) < 0.08)
+    expected |= (radius > 0.192) & (radius < 0.2) & (np.abs(points[:, 2]) < 0.08)
     np.testing.assert_array_equal(magnet_of(study).holds(points), expected)
     assert 100 < expected.sum() < 3000
 

@@ -119,13 +119,13 @@ def test_moments_are_in_the_axes_of_the_place():
 
 
 def test_methods():
-    """NGSolve for sections, sectors and iron; Gauss points for many cuboids and free blocks."""
+    """NGSolve for sections, sectors and iron; Gauss points for cuboids and free blocks."""
     iron = {"bodies": [{"kind": "tube", "inner_radius_m": 0.3, "outer_radius_m": 0.32}],
             "relative_permeability": 100.0}
     many = CUBES | {"blocks_per_ring": 36, "rings": 12, "block": {"shape": "cuboid",
                                                                  "width_m": 0.01}}
     sectors = many | {"block": {"shape": "sector"}}
-    assert reaction.by_elements(magnet_of(study_of(CUBES)))
+    assert not reaction.by_elements(magnet_of(study_of(CUBES)))
     assert reaction.by_elements(magnet_of(study_of(sectors)))
     assert not reaction.by_elements(magnet_of(study_of(many)))
     assert not reaction.by_elements(magnet_of(study_of(FREE)))
