@@ -4,8 +4,7 @@ A sector or a trapezoid can be turned by 180 degrees about its radial axis. A cu
 by 180 degrees about each of its axes, and by 90 degrees about an axis across which the two sides
 are equal. A block fits a slot if it has the slot's shape, and its nominal magnetization points in
 the direction that the design requires there, after the block is moved to the slot (in the
-orientation of its shape there) and turned by one of these rotations. Nothing fits the slot of a
-missing block, which stays empty.
+orientation of its shape there) and turned by one of these rotations.
 
 The "own axes" of a block are the axes of its shape: radial (or along the design magnetization),
 transverse and along z.
@@ -60,8 +59,7 @@ class Mounts:
     allowed : ndarray of bool, shape (turns, slots)
         Which of them leave the shape of the block in a slot unchanged.
     designed : ndarray, shape (slots, 3)
-        Directions of the design magnetization of each slot, in own axes; 0 where the block is
-        missing.
+        Directions of the design magnetization of each slot, in own axes.
     current : ndarray, shape (slots, 3)
         Directions of the nominal magnetization of the block that is in each slot now, in own axes;
         0 where the block is missing.
@@ -120,10 +118,9 @@ def mounts_of(magnet: Magnet) -> Mounts:
     found = np.array([[any(np.array_equal(turn, own) for own in turns) for turns in own_turns]
                       for turn in every])
     some = found.any(axis=1)
-    there = np.array([[block.remanence != 0] for block in built])
     return Mounts(
         tuple((block.ring, block.slot) for block in meant), frames, every[some],
-        found[some][:, shapes], there * _directions(meant, frames), _directions(built, frames),
+        found[some][:, shapes], _directions(meant, frames), _directions(built, frames),
         kinds, kinds[sources])
 
 
