@@ -372,9 +372,10 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
     try:
         yield pool
     except BaseException:  # drop the waiting calls, and end those that run
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.terminate()
+        # without waiting, Python may write to the pool's closed pipe at exit, and say so on stderr
+        pool.shutdown(wait=True, cancel_futures=True)
         raise
     pool.shutdown()
 

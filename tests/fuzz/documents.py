@@ -98,6 +98,57 @@ remanence_coefficient_per_K = -0.0012
 coercivity_coefficient_per_K = -0.006
 """
 
+FREE = b"""
+name = "free"
+dimension = 3
+mesh = { block_size_m = 0.03 }
+
+[array]
+inner_radius_m = 0.1
+outer_radius_m = 0.18
+ring_length_m = 0.08
+block = { shape = "sector", angular_gap_deg = 1.0 }
+
+[[array.ring]]
+count = 2
+blocks_per_ring = 8
+material = "N42SH"
+
+[[array.ring]]
+layer = 2
+blocks_per_ring = 12
+first_block_angle_deg = 15.0
+inner_radius_m = 0.2
+outer_radius_m = 0.22
+remanence_T = 1.1
+z_m = 0.04
+
+[array.free_blocks]
+name = ["a", "b"]
+shape = ["cuboid", "cuboid"]
+x_m = [0.0, 0.0]
+y_m = [0.0, 0.0]
+z_m = [0.4, -0.4]
+rotation_x_deg = [0.0, 90.0]
+size_x_m = [0.02, 0.01]
+size_y_m = [0.02, 0.01]
+size_z_m = [0.02, 0.02]
+remanence_T = [1.2, 1.3]
+
+[iron]
+relative_permeability = 100.0
+
+[[iron.bodies]]
+kind = "tube"
+inner_radius_m = 0.25
+outer_radius_m = 0.26
+length_m = 0.3
+
+[observation]
+quantity = "flux_density"
+positions = { kind = "points", points_m = [[0, 0, 0]] }
+"""
+
 HOSTILE = ("", " ", "a\nb", "}; Exit; Group {", "../../../etc/passwd", "/etc/passwd", "\x1b[31mred",
            "<script>alert(1)</script>", "</script><!--", "{{ 7*7 }}", "<< 7*7 >>", "<% raise %>",
            "$\\frac$", "[red]bold[/red]", "\x00", "\x7f", "\u202e", "\ud7ff", "日本語", "nan",

@@ -24,7 +24,7 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, changed, circle
 from tests.fuzz.documents import HOSTILE
-from tests.fuzz.readers import STEEL, WITH_STEEL
+from tests.fuzz.readers import FREE_CSV, STEEL, WITH_STEEL
 
 TINY = changed(DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__growth=4.0,
                open_boundary={"radius_m": 0.3}, prior={"types": {"a": [1, 2], "b": [3, 4]}},
@@ -38,8 +38,10 @@ FIELDS = {
     "prior.types": lambda text: {"prior": {"types": {text: [1, 2], "b": [3, 4]}}},
     "iron_ring.curve.name": lambda text: {"iron_ring": {
         "inner_radius_m": 0.2, "outer_radius_m": 0.24, "curve": {"kind": "steel", "name": text}}},
+    "array.material": lambda text: {"array__material": text},
+    "array.ring.material": lambda text: {"array__ring": [{"material": text}]},
 }
-"""All free text of a study, with what makes a study of it; the file of a curve has tests below."""
+"""All free text of a study, with what makes a study of it; names of files have tests below."""
 
 
 def text_fields(schema):
@@ -58,7 +60,7 @@ def test_there_is_no_other_text():
     """Whoever adds a field of text to the study decides here where it may go."""
     assert set(text_fields(Study.model_json_schema())) == {
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
-        "TableCurve.file"}
+        "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file"}
 
 
 def hostile_studies():
@@ -137,6 +139,23 @@ def test_tables_may_be_anywhere_but_are_only_read_and_never_quoted(tmp_path):
             assert "secret" not in str(refused.value)
         assert sorted(path.name for path in tmp_path.rglob("*")) == [
             "other", "steel.csv", "studies", "study.toml"]
+
+
+def test_tables_of_free_blocks_are_never_quoted(tmp_path):
+    (tmp_path / "other").mkdir()
+    study, table = tmp_path / "study.toml", tmp_path / "other" / "free.csv"
+    document = changed(TINY, dimension=3, mesh__block_size_m=0.01,
+                       array={"free_blocks": {"file": "other/free.csv"}})
+    document.pop("prior")
+    study.write_text(tomlkit.dumps(document))
+    table.write_bytes(FREE_CSV)
+    assert len(build_magnet(read_study(study)).blocks) == 4  # the control
+    for secret in (b"root:x:0:0:secret\n", FREE_CSV.replace(b"200", b"secret"),
+                   FREE_CSV.replace(b"angle_deg", b"secret_deg"), b"secret\xff"):
+        table.write_bytes(secret)
+        with pytest.raises(StudyError) as refused:
+            read_study(study)
+        assert "secret" not in str(refused.value)
 
 
 @pytest.fixture(scope="module")
