@@ -37,10 +37,6 @@ from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
-ORDER = 6
-"""Gauss points per panel of surface charge. A panel is at most half as long as a cell, so that the
-error is 1e-6 of the field."""
-
 ACROSS = 6
 """Default number of cells across the radial thickness of a block."""
 
@@ -335,7 +331,7 @@ def _field_strength(
 ) -> Floats:
     """Return H (cells, 3) in A/m at the centres of the cells."""
     points = cells.middles
-    field = field_of(blocks, points, ORDER)  # mu_0 H in vacuum
+    field = field_of(blocks, points)  # mu_0 H in vacuum
     if not magnet.is_vacuum and _by_moments(magnet):
         reacting = magnet.with_(solver__method="reaction")
         field += solve_separate(reacting, session).field_with_errors(points)[0]

@@ -57,10 +57,6 @@ MIN_READINGS = 12
 """Smallest number of readings for the search. With fewer readings some gross error would fit any
 map."""
 
-PANEL_SIZE = 0.2
-"""Size of the quadrature panels of the blocks' surfaces relative to the inner radius. The field is
-accurate to 1e-3 at a distance of one panel."""
-
 BLOCK_MAGNETIZATION_SD = 0.02
 """Standard deviation of a block's magnetization along each axis, relative to its nominal
 magnitude."""
@@ -420,10 +416,9 @@ class _Search:
         blocks = build_magnet(study).blocks
         mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
         points = _probe_points(study.instrument, self.points)
-        panel = PANEL_SIZE * build_magnet(study).bore_radius
         total = external_field(build_magnet(study), points)
-        for block, magnetization, unit in zip(blocks, mean, unit_fields(blocks, points, 4, panel),
-                                    strict=True):
+        for block, magnetization, unit in zip(blocks, mean, unit_fields(blocks, points),
+                                              strict=True):
             total += unit @ (MU_0 * block.recoil_tensor @ magnetization)
         return np.asarray(total @ sensor_matrix(study.instrument).T)
 
@@ -474,8 +469,7 @@ class _Nominal:
         if any(block.contains(points).any() for block in blocks):
             return None
         field, across, variance = (np.zeros_like(points) for _ in range(3))
-        for block, unit in zip(blocks, unit_fields(
-                blocks, points, 4, PANEL_SIZE * build_magnet(study).bore_radius), strict=True):
+        for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             x, y, _ = block.easy_axis
             field += unit @ (np.array(block.easy_axis) * block.remanence)
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)

@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 
@@ -161,68 +160,6 @@ def _is_periodic(outlines: list[Outline], tensors: Floats, step: int, pitch: flo
     turn = space[:2, :2]
     return all(_same_shape(_corners(outline) @ turn.T, _corners(other))
                for outline, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A block's own coordinate system.
-
-    Its origin is on the z axis at the block's middle height, and its x axis goes through the
-    block's middle.
-
-    Attributes
-    ----------
-    angle : float, in rad
-        Angle of the block's middle about the z axis.
-    centre : float, in m
-        Middle height of the block, along z; 0 if it is infinitely long.
-    shape : tuple
-        A key that is equal for congruent blocks.
-    even : bool
-        Whether the outline is symmetric under y -> -y in this frame.
-    """
-
-    angle: float
-    centre: float
-    shape: tuple[object, ...]
-    even: bool
-
-    def local(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return points in the frame, reflected into the part where the field is computed.
-
-        Points (n, 3) with z < 0 are reflected to z > 0, and those with y < 0 to y > 0 if the
-        outline is symmetric. The second result are the signs (n, 3) of these reflections, which
-        `unfold` needs.
-        """
-        found = (points - [0, 0, self.centre]) @ rotation_about_z(self.angle)
-        signs = np.ones_like(found)
-        for axis in ((1, 2) if self.even else (2,)):
-            signs[:, axis] = np.where(found[:, axis] < 0, -1.0, 1.0)
-        return found * signs, signs
-
-    def unfold(self, field: Floats, signs: Floats) -> Floats:
-        """Return field matrices (n, 3, 3) at the points that `local` was given.
-
-        ``field`` (n, 3, 3) are the field matrices at the points that `local` returned.
-        """
-        turn = rotation_about_z(self.angle)
-        return np.asarray(turn @ (field * signs[:, :, None] * signs[:, None, :]) @ turn.T)
-
-
-def frame_of(block: MagnetBlock) -> Frame:
-    """Return the frame of a block."""
-    middle = _corners(block.outline).mean(axis=0)
-    angle = float(np.arctan2(middle[1], middle[0]))
-    # corners alone do not tell dented polygons apart, which connect the same ones in another order
-    halves = np.vstack([edge.at(np.array([0.5]))[0] for edge in block.outline])
-    local = np.vstack([_corners(block.outline), halves]) @ rotation_about_z(angle)[:2, :2]
-    infinite = bool(np.isinf(block.z_max))
-    length = np.inf if infinite else float(np.round(block.z_max - block.z_min, 12))
-    order = np.lexsort(np.round(local, 9).T)
-    shape = (length, tuple(edge.arc for edge in block.outline),
-             *np.round(local[order], 9).ravel().tolist())
-    return Frame(angle, 0.0 if infinite else (block.z_min + block.z_max) / 2, shape,
-                 _same_shape(local * [1, -1], local))
 
 
 def _equal(tensors: Floats, others: Floats) -> bool:

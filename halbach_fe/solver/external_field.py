@@ -14,9 +14,6 @@ from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Neighbour
 from halbach_fe.study.materials import MU_0
 
-EXACT = 12
-"""Number of Gauss points per panel of a block's outline, for errors of about 1e-12 of the field."""
-
 
 def external_field(magnet: Magnet, points: Floats) -> Floats:
     """Return B (n, 3) in T of the study's external sources at points (n, 3) in m."""
@@ -29,9 +26,7 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
     return field
 
 
-def neighbour_field(
-    magnet: Magnet, neighbour: Neighbour, points: Floats, order: int = EXACT
-) -> Floats:
+def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Floats:
     """Return B of a second magnet with the study's blocks, shifted along z and turned about z.
 
     Its permeability is that of vacuum, and its remanence is scaled by ``neighbour.factor``.
@@ -41,8 +36,6 @@ def neighbour_field(
     magnet : Magnet
     neighbour : Neighbour
     points : ndarray, shape (n, 3), in m
-    order : int
-        Gauss points per panel of a block's outline.
 
     Returns
     -------
@@ -50,7 +43,7 @@ def neighbour_field(
     """
     turn = rotation_about_z(np.radians(neighbour.turn_deg))
     local_points = (points - [0.0, 0.0, neighbour.z_m]) @ turn
-    return np.asarray(neighbour.factor * field_of(magnet.blocks, local_points, order) @ turn.T)
+    return np.asarray(neighbour.factor * field_of(magnet.blocks, local_points) @ turn.T)
 
 
 def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:

@@ -459,8 +459,8 @@ def readers() -> tuple[Reader, ...]:
     foreign = Reader("", "hall.txt", (), imported(""), MeasurementError,
                      lambda found: check_map(found.data), FORMAT)
     return (
-        Reader("study", "study.toml", (*studies, RICH, FREE), read_study, StudyError, check_study, TOML,
-               document),
+        Reader("study", "study.toml", (*studies, RICH, FREE), read_study, StudyError, check_study,
+               TOML, document),
         Reader("changed study", "study.toml", (*studies, RICH, FREE), changed_study, StudyError,
                check_changed, TOML, document),
         table,

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import (
-    SymmetryImage,
-    frame_of,
-    no_symmetry,
-    symmetry_of,
-    unique_points,
-)
+from halbach_fe.geometry.symmetry import SymmetryImage, no_symmetry, symmetry_of, unique_points
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.exact_block_field import unit_field, unit_fields
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from tests.conftest import circle
 
@@ -135,19 +128,6 @@ def test_placements_compose(generator):
         expected = unit(points - moved)
         found = placement.from_source(unit(placement.to_source(points) - home))
         np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_congruent_blocks_share_integrals_without_a_trace(short_dipole, generator):
-    points = 0.09 * (2 * generator.random((40, 3)) - 1)
-    for block in ({"shape": "sector"}, {"shape": "trapezoid"},
-                  {"shape": "cuboid", "width_m": 0.02, "orientation": "magnetization"}):
-        blocks = build_magnet(short_dipole(array__block=block, array__inner_radius_m=0.13)).blocks
-        together = list(unit_fields(blocks, points))
-        for number in (0, 3, 15, 21):
-            alone = unit_field(blocks[number], points)
-            np.testing.assert_allclose(together[number], alone, atol=1e-12)
-        assert np.abs(together[0] - together[1]).max() > 1e-3
-    assert len({frame_of(block).shape for block in build_magnet(short_dipole()).blocks}) == 1
 
 
 def test_unique_points(generator):

@@ -56,7 +56,7 @@ def test_infinitely_long_tube_in_closed_form(short_dipole, session):
     tube = IronRectangle(0.2, 0.21, -12.0, 12.0, 100.0)
     blocks = [replace(block, easy_axis=(1.0, 0.0, 0.0), z_min=-np.inf, z_max=np.inf)
               for block in magnet.blocks]
-    found = solve_iron([tube], lambda points: field_of(blocks, points, order=5), session,
+    found = solve_iron([tube], lambda points: field_of(blocks, points), session,
                        resolution=Resolution(largest=5.0, modes=18), estimate=False)
     angle = np.linspace(0, 2 * np.pi, 7)
     ring = np.column_stack([0.06 * np.cos(angle), 0.06 * np.sin(angle)])

@@ -45,8 +45,7 @@ class NeighbourMagnetEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return neighbour_field(nominal.magnet, Neighbour(z_m=place.at_m[0]), nominal.points,
-                               order=4)[None]
+        return neighbour_field(nominal.magnet, Neighbour(z_m=place.at_m[0]), nominal.points)[None]
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""

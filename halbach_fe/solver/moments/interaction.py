@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -13,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.threads import in_threads, share_out
+from halbach_fe.solver.exact_block_field import matrix_of
 from halbach_fe.solver.moments import near, tree
 from halbach_fe.solver.moments.cells import Cells, gauss_nodes
 
@@ -79,19 +78,6 @@ class Neighbours:
         ends = np.searchsorted(self.starts, np.linspace(0, self.starts[-1], parts + 1)[1:-1])
         limits = [0, *ends.tolist(), len(self.starts) - 1]
         return [(a, b) for a, b in pairwise(limits) if b > a]
-
-
-def in_threads(work: Callable[[int, int], None], shares: list[tuple[int, int]]) -> None:
-    """Call compiled ``work`` with every share, in as many threads as there are cores."""
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        for done in [pool.submit(work, *share) for share in shares]:
-            done.result()
-
-
-def share_out(count: int, parts: int = 16) -> list[tuple[int, int]]:
-    """Return ranges of about the same size."""
-    limits = np.unique(np.linspace(0, count, parts + 1).astype(int)).tolist()
-    return list(pairwise(limits))
 
 
 @dataclass(frozen=True)
@@ -350,11 +336,6 @@ class Interaction:
             close.starts, close.sources, first, last, *self.arrays, self.cells.cuts, points,
             polarization, found), close.shares(32))
         return found
-
-
-def matrix_of(six: Floats) -> Floats:
-    """Return symmetric matrices (n, 3, 3) of their components (n, 6)."""
-    return six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
 def six_of(matrix: Floats) -> Floats:

@@ -6,9 +6,8 @@ import magpylib
 import numpy as np
 import pytest
 
-from halbach_fe.solver.exact_block_field import unit_field
-from halbach_fe.solver.moments.interaction import matrix_of
-from halbach_fe.solver.moments.kernel import fields_at
+from halbach_fe.solver.exact_block_field import matrix_of, unit_field
+from halbach_fe.solver.prism_kernel import fields_at
 from tests.solver.moments.bodies import OUTLINES, block, cuboid_matrix
 
 ROUNDING = 1e-13

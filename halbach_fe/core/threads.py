@@ -1,0 +1,26 @@
+"""Threads for compiled work that releases Python's lock."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+
+
+def in_threads(work: Callable[[int, int], object], shares: list[tuple[int, int]]) -> None:
+    """Call compiled ``work`` with every share, in as many threads as there are cores."""
+    if len(shares) == 1:
+        work(*shares[0])
+        return
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for done in [pool.submit(work, *share) for share in shares]:
+            done.result()
+
+
+def share_out(count: int, parts: int = 16) -> list[tuple[int, int]]:
+    """Return ranges of about the same size."""
+    limits = np.unique(np.linspace(0, count, parts + 1).astype(int)).tolist()
+    return list(pairwise(limits))

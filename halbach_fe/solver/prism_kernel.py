@@ -1,0 +1,395 @@
+"""Field of uniformly polarized prisms by their surface charge, compiled by numba.
+
+A prism stands on an outline in the (x, y) plane of its frame, between two values of z. Its field is
+the sum of line integrals over the polygon that the docstring of
+`halbach_fe.solver.exact_block_field` derives. On a straight edge they are elementary. Let d be the
+signed distance of the edge from the point along its outward normal, s the position along the edge
+relative to the point, u = z - z' and R^2 = s^2 + d^2 + u^2. Then
+
+* ``int ds/R = ln(s + R)``,
+* ``int u d ds/((s^2 + d^2) R) = atan(s u/(d R))``,
+* ``int u s ds/((s^2 + d^2) R) = ln((R - u)/(R + u))/2``,
+
+and the solid angle of an end face is the sum over its edges of ``atan(s/d) - atan(s u/(d R))``.
+The differences between the ends of an edge and between the end faces are formed inside the
+logarithms, so that nothing cancels and nothing is singular on the prolongations of edges. On a
+face the result is the mean of the limits from both sides; on an edge, where the field is
+infinite, it is large and finite.
+
+The six independent components of the symmetric field matrix are in the order xx, yy, zz, xy, xz,
+yz: mu_0 H in T for a polarization of 1 T.
+
+This module imports numba, which takes a second; functions that need it import it themselves.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import atan2, cos, inf, log, pi, sin, sqrt
+from typing import Any
+
+import numba
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+
+compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+"""Decorator of all compiled functions. Threads run them side by side, since they release the GIL;
+numba's own threads must not be entered from several Python threads."""
+
+reordered: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+"""The same for sums whose terms may be added in any order, several at a time."""
+
+_TINY = 1e-26
+"""Added to squared distances relative to the square of a prism's size, where a logarithm would be
+infinite otherwise. It is the square of 1e-13 of the size, which is below rounding."""
+
+Six = tuple[float, float, float, float, float, float]
+
+
+@compiled
+def _angle(s1: float, r1: float, s2: float, r2: float, u: float, d: float) -> float:
+    """Return ``[atan(s u/(d R))]`` between two ends of an edge, for d > 0."""
+    return atan2(u * d * (s2 * r1 - s1 * r2), d * d * r1 * r2 + s1 * s2 * u * u)
+
+
+@compiled
+def _straight_edge(
+    ax: float, ay: float, a2: float, aup: float, alow: float,
+    bx: float, by: float, b2: float, bup: float, blow: float,
+    up: float, low: float, up2: float, low2: float, side: float, tiny: float, zero: float,
+) -> Six:
+    """Return 4 pi times the contribution of an edge from a to b to the field matrix.
+
+    Ends are relative to the point; ``a2`` is the square of the distance of a in the plane, ``aup``
+    and ``alow`` are the distances R of the edge's ends in the upper and lower face, at heights
+    ``up`` and ``low`` below the point, and ``side`` is their `_side`. The faces of an infinite
+    prism are infinitely far. Only sums over closed outlines have the symmetric matrix that is
+    returned for every edge.
+    """
+    length = sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+    if length < zero:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    tx, ty = (bx - ax) / length, (by - ay) / length
+    nx, ny = ty, -tx
+    d = ax * nx + ay * ny
+    s1, s2 = ax * tx + ay * ty, bx * tx + by * ty
+    distance = abs(d)
+    if low == inf:
+        tangential = log((a2 + tiny) / (b2 + tiny))
+        normal = -2 * atan2(d * (s2 - s1), d * d + s1 * s2) if distance > zero else 0.0
+        fx, fy = nx * normal + tx * tangential, ny * normal + ty * tangential
+        return fx * nx, fy * ny, 0.0, 0.5 * (fx * ny + fy * nx), 0.0, 0.0
+    # int ds/R at the upper minus that at the lower face
+    if s1 >= 0:
+        along = log((s2 + bup) * (s1 + alow) / ((s1 + aup) * (s2 + blow)))
+    elif s2 <= 0:
+        along = log((aup - s1) * (blow - s2) / ((bup - s2) * (alow - s1)))
+    else:
+        along = log((s2 + bup) * (aup - s1) * (d * d + low2 + tiny)
+                    / ((s2 + blow) * (alow - s1) * (d * d + up2 + tiny)))
+    # int u s ds/((s^2 + d^2) R), likewise
+    if up > 0:
+        tangential = log((blow + low) * (aup + up) / ((bup + up) * (alow + low)))
+    elif low < 0:
+        tangential = log((bup - up) * (alow - low) / ((blow - low) * (aup - up)))
+    else:
+        tangential = log((bup - up) * (blow + low) * (a2 + tiny)
+                         / ((aup - up) * (alow + low) * (b2 + tiny)))
+    normal = subtended = 0.0
+    if distance > zero:
+        angle = _angle(s1, aup, s2, bup, up, distance) - _angle(
+            s1, alow, s2, blow, low, distance)
+        if d < 0:
+            angle = -angle
+        normal = angle
+        subtended = -angle
+        if side != 0:
+            whole = atan2(distance * (s2 - s1), d * d + s1 * s2)
+            subtended += side * (whole if d > 0 else -whole)
+    fx, fy = nx * normal + tx * tangential, ny * normal + ty * tangential
+    return fx * nx, fy * ny, subtended, 0.5 * (fx * ny + fy * nx), along * nx, along * ny
+
+
+@compiled
+def _sign(u: float) -> float:
+    """Return the sign of u, 0 for u = 0."""
+    return 1.0 if u > 0 else (-1.0 if u < 0 else 0.0)
+
+
+@compiled
+def _side(up: float, low: float) -> float:
+    """Return the sign of ``up`` minus that of ``low``: -2 between the end faces, 0 outside."""
+    return _sign(up) - _sign(low)
+
+
+@compiled
+def polygon_field(
+    vertices: Floats, half: float, x: float, y: float, z: float
+) -> Six:
+    """Return the field matrix of a prism on a polygon, between z = -half and z = half.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (m, 2), in m
+        Counter-clockwise. Edges of length zero are ignored.
+    half : float, in m
+    x, y, z : float, in m
+        The point, in the prism's frame.
+    """
+    up, low = z - half, z + half
+    up2, low2 = up * up, low * low
+    side = _side(up, low)
+    size2 = half * half
+    for i in range(len(vertices)):
+        size2 = max(size2, vertices[i, 0] ** 2 + vertices[i, 1] ** 2)
+    tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
+    xx = yy = zz = xy = xz = yz = 0.0
+    last = len(vertices) - 1
+    bx, by = vertices[last, 0] - x, vertices[last, 1] - y
+    b2 = bx * bx + by * by
+    bup, blow = sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny)
+    for i in range(len(vertices)):
+        ax, ay, a2, aup, alow = bx, by, b2, bup, blow
+        bx, by = vertices[i, 0] - x, vertices[i, 1] - y
+        b2 = bx * bx + by * by
+        bup, blow = sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny)
+        g = _straight_edge(ax, ay, a2, aup, alow, bx, by, b2, bup, blow, up, low, up2, low2,
+                           side, tiny, zero)
+        xx += g[0]
+        yy += g[1]
+        zz += g[2]
+        xy += g[3]
+        xz += g[4]
+        yz += g[5]
+    factor = 1 / (4 * pi)
+    return (xx * factor, yy * factor, zz * factor, xy * factor, xz * factor, yz * factor)
+
+
+ARC_LEVELS = 28
+"""Sizes of the parts of an arc, down to 1e-8 of its length; nearer points are less accurate."""
+
+
+@lru_cache(maxsize=64)
+def arc_table(sweep: float, order: int = 12) -> tuple[Floats, Floats]:
+    """Return Gauss nodes of the parts of an arc, as turns from the middle of a part, and weights.
+
+    A part is not longer than its distance from the point, so that 12 nodes leave an error of 1e-15
+    of its integral.
+
+    Returns
+    -------
+    turns : ndarray, shape (`ARC_LEVELS`, order, 2)
+        Cosine and sine of the angles for parts of 1, 1/2, 1/4 ... of the arc.
+    weights : ndarray, shape (order,)
+        They add up to 1.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    angle = sweep / 2 * nodes / 2.0 ** np.arange(ARC_LEVELS)[:, None]
+    return np.stack([np.cos(angle), np.sin(angle)], axis=2), weights / 2
+
+
+@compiled
+def _arc(radius: float, first: float, sweep: float, turns: Floats, weights: Floats,
+         x: float, y: float, up: float, low: float, side: float) -> Six:
+    """Return 4 pi times the contribution of an arc about the z axis, by Gauss quadrature.
+
+    The arc is halved, and its halves are, until no panel is longer than the distance from its
+    middle to the point; see `arc_table`, which makes ``turns`` and ``weights``.
+    """
+    levels, order, flat = turns.shape[0], turns.shape[1], low == inf
+    beyond = up if up > 0 else (-low if low < 0 else 0.0)
+    beyond2, up2, low2 = beyond * beyond, up * up, low * low
+    xx = yy = zz = xy = xz = yz = 0.0
+    place, level = 1, 0  # of a panel in the tree of halves: panel k has the halves 2k and 2k + 1
+    while place:
+        share = 1.0 / (1 << level)
+        middle = first + sweep * share * (place - (1 << level) + 0.5)
+        cosine, sine = cos(middle), sin(middle)
+        length = radius * abs(sweep) * share
+        distance2 = (x - radius * cosine) ** 2 + (y - radius * sine) ** 2 + beyond2
+        if distance2 < length * length and level < levels - 1:
+            place, level = 2 * place, level + 1
+            continue
+        scale = radius * sweep * share
+        for k in range(order):
+            c = cosine * turns[level, k, 0] - sine * turns[level, k, 1]
+            s = sine * turns[level, k, 0] + cosine * turns[level, k, 1]
+            nx, ny = weights[k] * scale * c, weights[k] * scale * s
+            px, py = x - radius * c, y - radius * s  # from the source to the point
+            rho2 = px * px + py * py
+            if flat:
+                xx += px * nx * 2 / rho2
+                yy += py * ny * 2 / rho2
+                xy += (px * ny + py * nx) / rho2
+                continue
+            rup, rlow = sqrt(rho2 + up2), sqrt(rho2 + low2)
+            # (1 - abs(u)/R)/rho^2 without cancellation
+            solid = (_sign(up) / (rup * (rup + abs(up)))
+                     - _sign(low) / (rlow * (rlow + abs(low))))
+            # between the end faces low/rlow and -up/rup have the same sign
+            bracket = solid if side == 0 else (low / rlow - up / rup) / rho2
+            inverse = 1 / rup - 1 / rlow
+            xx += px * nx * bracket
+            yy += py * ny * bracket
+            xy += 0.5 * (px * ny + py * nx) * bracket
+            xz += inverse * nx
+            yz += inverse * ny
+            zz -= (px * nx + py * ny) * solid
+        while place & 1:  # the next panel is the right half of the last one that has not had its
+            place, level = place >> 1, level - 1
+        place += 1 if place else 0
+    return xx, yy, zz, xy, xz, yz
+
+
+@compiled
+def outline_fields(
+    edges: Floats, arcs: Floats, turns: Floats, weights: Floats, z_min: float, z_max: float,
+    points: Floats, first: int, last: int, out: Floats,
+) -> None:
+    """Write the field matrices of a prism on an outline of straight edges and arcs.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (m, 4), in m
+        Start and end (x, y) of the straight edges. Outlines run counter-clockwise.
+    arcs : ndarray, shape (k, 3)
+        Radius in m, angle of the start and signed sweep in rad of the arcs about the z axis.
+    turns : ndarray, shape (k, levels, order, 2)
+        `arc_table` of every arc.
+    weights : ndarray, shape (order,)
+        Gauss weights on [0, 1].
+    z_min, z_max : float, in m
+        Infinite for the field of a cross-section.
+    points : ndarray, shape (n, 3), in m
+    first, last : int
+        The points to do.
+    out : ndarray, shape (n, 6)
+    """
+    size2 = 0.0 if z_max == inf else 0.25 * (z_max - z_min) ** 2
+    for i in range(len(edges)):
+        size2 = max(size2, (edges[i, 2] - edges[i, 0]) ** 2 + (edges[i, 3] - edges[i, 1]) ** 2)
+    tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
+    factor = 1 / (4 * pi)
+    for n in range(first, last):
+        x, y = points[n, 0], points[n, 1]
+        up, low = points[n, 2] - z_max, points[n, 2] - z_min
+        up2, low2, side = up * up, low * low, _side(up, low)
+        xx = yy = zz = xy = xz = yz = 0.0
+        for i in range(len(edges)):
+            ax, ay, bx, by = edges[i, 0] - x, edges[i, 1] - y, edges[i, 2] - x, edges[i, 3] - y
+            a2, b2 = ax * ax + ay * ay, bx * bx + by * by
+            g = _straight_edge(
+                ax, ay, a2, sqrt(a2 + up2 + tiny), sqrt(a2 + low2 + tiny),
+                bx, by, b2, sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny),
+                up, low, up2, low2, side, tiny, zero)
+            xx += g[0]
+            yy += g[1]
+            zz += g[2]
+            xy += g[3]
+            xz += g[4]
+            yz += g[5]
+        for i in range(len(arcs)):
+            g = _arc(arcs[i, 0], arcs[i, 1], arcs[i, 2], turns[i], weights, x, y, up, low, side)
+            xx += g[0]
+            yy += g[1]
+            zz += g[2]
+            xy += g[3]
+            xz += g[4]
+            yz += g[5]
+        out[n, 0], out[n, 1], out[n, 2] = xx * factor, yy * factor, zz * factor
+        out[n, 3], out[n, 4], out[n, 5] = xy * factor, xz * factor, yz * factor
+
+
+Eight = tuple[float, float, float, float, float, float, float, float]
+
+
+@compiled
+def _corner_angles(u0: float, u1: float, v0: float, v1: float, w0: float, w1: float,
+                   r: Eight, zero: float) -> float:
+    """Return the sum of +-atan(v w/(u R)) over the corners, whose distances R are r (u, v, w).
+
+    Two angles at a time are added as the argument of a product of complex numbers; both are smaller
+    than pi/2. Terms with u = 0 vanish, which is the mean of the limits on a face.
+    """
+    total = 0.0
+    if abs(u0) > zero:
+        both = _angle_between(u0, v1, w0, w1, r[2], r[3]) - _angle_between(
+            u0, v0, w0, w1, r[0], r[1])
+        total -= both if u0 > 0 else -both
+    if abs(u1) > zero:
+        both = _angle_between(u1, v1, w0, w1, r[6], r[7]) - _angle_between(
+            u1, v0, w0, w1, r[4], r[5])
+        total += both if u1 > 0 else -both
+    return total
+
+
+@compiled
+def _angle_between(u: float, v: float, w0: float, w1: float, r0: float, r1: float) -> float:
+    """Return atan(v w/(abs(u) R)) at the end 1 of an edge along w minus that at its end 0."""
+    return atan2(abs(u) * v * (w1 * r0 - w0 * r1), u * u * r0 * r1 + v * v * w0 * w1)
+
+
+@compiled
+def _edge(u0: float, u1: float, r0: float, r1: float, square: float) -> float:
+    """Return the exponential of ``int ds/R`` along an edge from u0 to u1.
+
+    ``square`` is the square of the distance of the edge's line.
+    """
+    if u0 >= 0:
+        return (u1 + r1) / (u0 + r0)
+    if u1 <= 0:
+        return (r0 - u0) / (r1 - u1)
+    return (u1 + r1) * (r0 - u0) / square
+
+
+@compiled
+def _inside(u: float, size: float, zero: float) -> float:
+    """Return 1 between -size and size, 0 outside, and 1/2 at the ends."""
+    distance = abs(u) - size
+    return 0.5 if abs(distance) <= zero else (1.0 if distance < 0 else 0.0)
+
+
+@compiled
+def cuboid_field(a: float, b: float, c: float, x: float, y: float, z: float) -> Six:
+    """Return the field matrix of a cuboid with half sides a, b and c in m, in its own axes.
+
+    It is that of `polygon_field` in fewer operations: sums over the corners, of which the third
+    diagonal component follows from the trace, -1 inside and 0 outside. See Z. J. Yang et al.,
+    Supercond. Sci. Technol. 3 (1990) 591.
+    """
+    size = max(a, max(b, c))
+    tiny, zero = _TINY * size * size, 1e-12 * size
+    u0, u1, v0, v1, w0, w1 = x - a, x + a, y - b, y + b, z - c, z + c
+    p0, p1, q0, q1, t0, t1 = u0 * u0, u1 * u1, v0 * v0, v1 * v1, w0 * w0 + tiny, w1 * w1 + tiny
+    r = (sqrt(p0 + q0 + t0), sqrt(p0 + q0 + t1), sqrt(p0 + q1 + t0), sqrt(p0 + q1 + t1),
+         sqrt(p1 + q0 + t0), sqrt(p1 + q0 + t1), sqrt(p1 + q1 + t0), sqrt(p1 + q1 + t1))
+    xx = -_corner_angles(u0, u1, v0, v1, w0, w1, r, zero)
+    yy = -_corner_angles(v0, v1, u0, u1, w0, w1,
+                         (r[0], r[1], r[4], r[5], r[2], r[3], r[6], r[7]), zero)
+    trace = -4 * pi * _inside(x, a, zero) * _inside(y, b, zero) * _inside(z, c, zero)
+    xy = log(_edge(w0, w1, r[0], r[1], p0 + q0 + tiny) * _edge(w0, w1, r[6], r[7], p1 + q1 + tiny)
+             / (_edge(w0, w1, r[2], r[3], p0 + q1 + tiny)
+                * _edge(w0, w1, r[4], r[5], p1 + q0 + tiny)))
+    xz = log(_edge(v0, v1, r[0], r[2], p0 + t0) * _edge(v0, v1, r[5], r[7], p1 + t1)
+             / (_edge(v0, v1, r[1], r[3], p0 + t1) * _edge(v0, v1, r[4], r[6], p1 + t0)))
+    yz = log(_edge(u0, u1, r[0], r[4], q0 + t0) * _edge(u0, u1, r[3], r[7], q1 + t1)
+             / (_edge(u0, u1, r[1], r[5], q0 + t1) * _edge(u0, u1, r[2], r[6], q1 + t0)))
+    factor = 1 / (4 * pi)
+    return (xx * factor, yy * factor, (trace - xx - yy) * factor,
+            xy * factor, xz * factor, yz * factor)
+
+
+@compiled
+def prism_field(vertices: Floats, half: float, cuboid: bool, x: float, y: float, z: float) -> Six:
+    """Return `cuboid_field` of a rectangle centred on the axis, else `polygon_field`."""
+    if cuboid:
+        return cuboid_field(vertices[2, 0], vertices[2, 1], half, x, y, z)
+    return polygon_field(vertices, half, x, y, z)
+
+
+@compiled
+def fields_at(vertices: Floats, half: float, cuboid: bool, points: Floats, out: Floats) -> None:
+    """Write the field matrix (n, 6) of a prism at points (n, 3) of its frame into ``out``."""
+    for i in range(len(points)):
+        out[i] = prism_field(vertices, half, cuboid, points[i, 0], points[i, 1], points[i, 2])
