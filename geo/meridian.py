@@ -11,18 +11,15 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import gmsh
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geo.grid import add_grid
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import regions as tags
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.regions import BlockRegion, Regions
-
-LINE, QUADRANGLE = 1, 3
-"""Gmsh's element types of edges and quadrangles."""
 
 _GROWTH = 1.35
 """Ratio of the sizes of neighbouring elements towards the outer boundary."""
@@ -41,7 +38,7 @@ def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
     """
     r, z = _radii(magnet, size), _heights(magnet, size)
     with gmsh_session(magnet.name):
-        _build(magnet, r, z)
+        add_grid(r, z, _materials(magnet, r, z))
         write_mesh(mesh_path)
     return Regions(
         study=magnet.name, dimension=2, air=tags.AIR_TAG,
@@ -141,39 +138,10 @@ def _growing(start: float, size: float, stop: float) -> list[float]:
     return result
 
 
-def _build(magnet: Magnet, r: Floats, z: Floats) -> None:
-    """Build the tensor grid of rectangles in Gmsh as discrete entities, one per region."""
-    columns, rows = len(r), len(z)
-    points = np.zeros((columns * rows, 3))
-    points[:, 0] = np.repeat(r, rows)
-    points[:, 1] = np.tile(z, columns)
-    i, j = (index.ravel() for index in np.meshgrid(
-        np.arange(columns - 1), np.arange(rows - 1), indexing="ij"))
-    corner = i * rows + j
-    cells = np.column_stack([corner, corner + rows, corner + rows + 1, corner + 1])
-    material = _materials(magnet, (r[i] + r[i + 1]) / 2, (z[j] + z[j + 1]) / 2)
-
-    up, out = np.arange(rows - 1), np.arange(columns - 1) * rows
-    axis = np.column_stack([up, up + 1])
-    rim = [axis + (columns - 1) * rows] + [
-        np.column_stack([out, out + rows]) + level for level in (0, rows - 1)]
-    model = gmsh.model
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
-    for tag in np.unique(material).tolist():
-        if tag != 1:
-            model.addDiscreteEntity(2, tag)
-        model.mesh.addElementsByType(tag, QUADRANGLE, [], (cells[material == tag] + 1).ravel())
-        model.addPhysicalGroup(2, [tag], tag)
-    for tag, lines in ((tags.AXIS_TAG, axis), (tags.OUTER_BOUNDARY_TAG, np.vstack(rim))):
-        model.addDiscreteEntity(1, tag)
-        model.mesh.addElementsByType(tag, LINE, [], (lines + 1).ravel())
-        model.addPhysicalGroup(1, [tag], tag)
-
-
-def _materials(magnet: Magnet, r: Floats, z: Floats) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the physical tags (n,) of the materials at points r, z (n,) in m."""
-    result = np.full(len(r), tags.AIR_TAG)
+def _materials(magnet: Magnet, r: Floats, z: Floats) -> Ints:
+    """Return the physical tags (len(r) - 1, len(z) - 1) of the rectangles between grid lines."""
+    r, z = np.meshgrid((r[1:] + r[:-1]) / 2, (z[1:] + z[:-1]) / 2, indexing="ij")
+    result = np.full(r.shape, tags.AIR_TAG)
     for inner, outer, low, high, tag in _rectangles(magnet):
         result[(r > inner) & (r < outer) & (z > low) & (z < high)] = tag
     return result

@@ -21,12 +21,10 @@ from halbach_fe.solver.formulation_choice import (
 )
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
+from halbach_fe.study.solver import CELLS_PER_SIDE
 
 REFINEMENT = 1.5
 """Factor between the element sizes, and between the distances of the boundary, of two solves."""
-
-CELLS_PER_SIDE = 2
-"""Default of `halbach_fe.study.solver.MeshSettings.cells_per_side`."""
 
 DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
 """The dual formulation of each formulation that has one."""

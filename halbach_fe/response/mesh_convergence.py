@@ -17,19 +17,13 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import fourier_analysis
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
-from halbach_fe.response.discretization_error import (
-    CELLS_PER_SIDE,
-    DUAL,
-    REFINEMENT,
-    dual,
-    farther,
-    refined,
-)
+from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, farther, refined
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import FourierCoefficients
+from halbach_fe.study.solver import CELLS_PER_SIDE
 
 HARMONICS = 8
 """Number of harmonics that are compared if the study does not state a number."""

@@ -8,6 +8,9 @@ from pydantic import Field
 
 from halbach_fe.study.types import MAX_LENGTH_M, MIN_LENGTH_M, Length, StudyModel
 
+CELLS_PER_SIDE = 2
+"""Default number of cells of the method of moments along the sides of a cube."""
+
 
 class MeshSettings(StudyModel):
     """Sizes of the finite elements.

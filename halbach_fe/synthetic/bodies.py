@@ -17,9 +17,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.block_exceptions import mounted
 from halbach_fe.synthetic.free_bodies import free_bodies
-from halbach_fe.synthetic.iron import FroehlichLaw as FroehlichLaw
 from halbach_fe.synthetic.iron import iron_of_study
-from halbach_fe.synthetic.iron import law_of as law_of
 from halbach_fe.synthetic.shapes import PrismBody, SectorBody
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, VacuumNeighbour, vector
 

@@ -8,7 +8,8 @@ import ngsolve as ngs
 import numpy as np
 
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.bodies import FroehlichLaw, TrueMagnet
+from halbach_fe.synthetic.bodies import TrueMagnet
+from halbach_fe.synthetic.iron import FroehlichLaw
 from halbach_fe.synthetic.ngsolve_reaction import half_field, newton, permeability
 from tests.oracles.ngsolve_model import Dipole, even_field
 

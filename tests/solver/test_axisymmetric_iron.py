@@ -17,6 +17,7 @@ from halbach_fe.solver.iron_newton import coupled_modes, to_angles, to_modes
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction
+from halbach_fe.synthetic.iron import FroehlichLaw
 
 IRON = {"initial": 200.0, "saturation": 1.0}
 CURVE = froehlich_kennelly(**IRON)
@@ -124,7 +125,7 @@ def by_ngsolve(bodies, source, points, size=0.012, order=2):
     def polarization(potential):
         field = own - ngs.grad(potential)
         law = ngsolve_reaction.permeability(
-            ngsolve_reaction.FroehlichLaw(**IRON), field * field)
+            FroehlichLaw(**IRON), field * field)
         return (law - 1) * field
 
     form = ngs.BilinearForm(space, condense=True)

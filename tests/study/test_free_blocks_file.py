@@ -216,7 +216,7 @@ def test_refusals_of_writing(tmp_path):
 
 def test_100_000_blocks(tmp_path):
     """Reading and validation take 3 s of processor time, measured on two slow, busy cores; twice
-    that is allowed. A loop over the rows in the validation took 12 s.
+    that is allowed.
     """
     count = 100_000
     number = np.arange(count)

@@ -32,9 +32,7 @@ from halbach_fe.core.errors import HalbachError
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction
-
-CELLS_PER_SIDE = 2
-"""Default number of cells along the sides of a cube."""
+from halbach_fe.study.solver import CELLS_PER_SIDE
 
 TOLERANCE = 1e-8
 """Largest change of a polarization, relative to the largest remanence, that ends the iteration.
