@@ -58,13 +58,16 @@ def unit_field(block: MagnetBlock, points: Floats) -> Floats:
     ndarray, shape (n, 3, 3)
         ``[i, c, k]``: component c of B in T at point i for a remanence of 1 T along k.
     """
+    field = matrix_of(_local_field(block, points))
+    return field if block.in_magnet_frame else block.axes @ field @ block.axes.T
+
+
+def _local_field(block: MagnetBlock, points: Floats) -> Floats:
+    """Return the field matrices (n, 6) of a block along its own axes, at points of the magnet."""
     points = np.ascontiguousarray(
         points if block.in_magnet_frame else block.to_frame(points), float)
-    six = np.zeros((len(points), 6))
-    for factor, part in block.parts:
-        six += factor * _outline_field(part, points)
-    field = matrix_of(six)
-    return field if block.in_magnet_frame else block.axes @ field @ block.axes.T
+    weighted = [factor * _outline_field(part, points) for factor, part in block.parts]
+    return weighted[0] if len(weighted) == 1 else np.sum(weighted, axis=0)
 
 
 def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
@@ -103,8 +106,12 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     At points inside a block the result lacks the block's own remanence, see `unit_field`.
     """
     total = np.zeros((len(points), 3))
-    for block, field in zip(blocks, unit_fields(blocks, points), strict=True):
-        total += field @ (np.array(block.easy_axis) * block.remanence)
+    for block in blocks:
+        axes = np.eye(3) if block.in_magnet_frame else block.axes
+        x, y, z = axes.T @ np.array(block.easy_axis) * block.remanence
+        # per component of the polarization, the components of the field
+        sums = np.array([[x, 0, 0], [0, y, 0], [0, 0, z], [y, x, 0], [z, 0, x], [0, z, y]])
+        total += _local_field(block, points) @ (sums @ axes.T)
     return total
 
 

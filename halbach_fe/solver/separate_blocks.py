@@ -34,6 +34,9 @@ largest remanence. The blocks answer with some 5 % of it."""
 
 MAX_TURNS = 30
 
+MANY_BLOCKS = 64
+"""Number of blocks from which their field on the iron is summed by expansions."""
+
 TANGENT_ANGLES = 64
 """Angles at which the fields of single blocks on the iron are given, for the 24 modes of
 `IronReaction.tangent`."""
@@ -91,7 +94,7 @@ def solve_separate(magnet: Magnet, session: Session) -> SeparateReaction:
     if not magnet.iron:
         return SeparateReaction(tuple(system.solve() for system in systems), None)
     bodies = iron_rectangles(magnet)
-    remanent = _remembered(partial(field_of, blocks))
+    remanent = _remembered(_field_in_vacuum(blocks))
     if not systems:
         return SeparateReaction((), solve_iron(bodies, remanent, session, magnet.name))
     iron = solve_iron(bodies, remanent, session, magnet.name, estimate=False)
@@ -156,6 +159,25 @@ def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
     law = magnet.curve or magnet.iron_permeability
     return tuple(IronRectangle(body.inner_radius, body.outer_radius, body.z_min, body.z_max, law)
                  for body in magnet.iron)
+
+
+def _field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
+    """Return a function of points (n, 3) in m that computes mu_0 H of the blocks in vacuum, in T.
+
+    Many blocks are summed by expansions, which at the many points of iron takes a small part of the
+    time. Their error, measured 2e-4 rms of the largest field, is small beside that of the iron's
+    solution.
+    """
+    if len(blocks) < MANY_BLOCKS or any(
+            edge.arc for block in blocks for edge in block.outline) or any(
+            block.gradient or block.corner_loss for block in blocks):
+        return partial(field_of, blocks)
+    from halbach_fe.solver.moments.solve import System  # imports numba
+
+    system = System.of(blocks, 1)
+    nodes = system.interaction.cells.nodes
+    polarization = np.broadcast_to(system.remanence[:, None], nodes.shape)
+    return lambda points: system.interaction.field_at(points, polarization)
 
 
 def _remembered(function: Field) -> Field:
