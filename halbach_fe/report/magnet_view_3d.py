@@ -187,7 +187,8 @@ def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None =
     blocks, values = _merge_rings(magnet, values)
     figure = go.Figure([_blocks_trace(magnet, blocks, values),
                         *_arrow_traces(magnet, blocks, values)])
-    figure.add_traces([_iron_trace(body, _prism_height(magnet)) for body in magnet.iron])
+    for number, body in enumerate(magnet.iron):  # one entry of the legend for all of them
+        figure.add_trace(_iron_trace(body, _prism_height(magnet)).update(showlegend=not number))
     if points is not None:
         figure.add_trace(_points_trace(points))
     figure.update_layout(
@@ -358,7 +359,7 @@ def _iron_trace(body: IronSolid, height: float) -> go.Surface:
         z = np.array([low, low, high, high])[:, None] + 0 * corners[:, 0]
     return go.Surface(
         x=x, y=y, z=z, opacity=0.25, showscale=False, colorscale=[[0, IRON], [1, IRON]],
-        name="iron", showlegend=True, hoverinfo="name")
+        name="iron", legendgroup="iron", showlegend=True, hoverinfo="name")
 
 
 def _points_trace(points: ViewPoints) -> go.Scatter3d:
