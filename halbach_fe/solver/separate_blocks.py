@@ -164,20 +164,21 @@ def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
 def _field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     """Return a function of points (n, 3) in m that computes mu_0 H of the blocks in vacuum, in T.
 
-    Many blocks are summed by expansions, which at the many points of iron takes a small part of the
-    time. Their error, measured 2e-4 rms of the largest field, is small beside that of the iron's
-    solution.
+    Many blocks are summed by expansions, at the many points of iron in a small part of the time.
+    Their error was measured to be 3e-5 of the largest field 5 mm off cubes of 12 mm, 3e-6 rms.
     """
     if len(blocks) < MANY_BLOCKS or any(
             edge.arc for block in blocks for edge in block.outline) or any(
             block.gradient or block.corner_loss for block in blocks):
         return partial(field_of, blocks)
-    from halbach_fe.solver.moments.solve import System  # imports numba
+    from halbach_fe.solver.moments.interaction import Interaction  # import numba
+    from halbach_fe.solver.moments.solve import System
 
-    system = System.of(blocks, 1)
-    nodes = system.interaction.cells.nodes
-    polarization = np.broadcast_to(system.remanence[:, None], nodes.shape)
-    return lambda points: system.interaction.field_at(points, polarization)
+    system = System.of(blocks, cells_per_side=1, divisions=4)
+    cells = system.interaction.cells
+    interaction = Interaction(cells, opening=0.4, reading_degree=8)
+    polarization = np.broadcast_to(system.remanence[:, None], cells.nodes.shape)
+    return lambda points: interaction.field_at(points, polarization)
 
 
 def _remembered(function: Field) -> Field:
