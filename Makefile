@@ -53,8 +53,8 @@ study-quadrupole study-mri: study-%: setup
 	    --blocks studies/$*/campaign/blocks.csv --held-out studies/$*/campaign/held-out.csv \
 	    -o results/$*/diagnosis
 
-# What the language of magnets can describe; the campaigns are simulated on the spot, with two blocks
-# exchanged and a weaker one.
+# What the language of magnets can describe; the campaigns are simulated on the spot, with nothing
+# hidden, so that the diagnosis should find nothing.
 study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole: study-%: setup-test
 	.venv/bin/halbach-fe solve studies/$*/study.toml -o results/$*/field
 	.venv/bin/halbach-fe verify studies/$*/study.toml -o results/$*/verified
