@@ -388,7 +388,8 @@ SOLUTIONS_AT_ONCE = 32
 PRINTED_TOLERANCE = 1e-7
 """Tolerance relative to the largest printed value. Both programs evaluate the same polynomials.
 Where GetDP locates a point in a curved element by iteration, differences of 4e-10 T were
-measured on coarse meshes. Another numbering of the unknowns makes a relative difference of order 1."""
+measured on coarse meshes. Another numbering of the unknowns makes a relative difference of order
+1."""
 
 
 def apply_operator(operator: sparse.csr_array, solutions: NDArray[np.floating]) -> Floats:
