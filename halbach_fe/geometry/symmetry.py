@@ -1,6 +1,6 @@
 """Symmetry of the array: blocks that are rotated or reflected copies of a source block.
 
-The field of a source block, solved or integrated once, serves all its copies. F(x) is the matrix
+The field of a source block, solved once, serves all its copies. F(x) is the matrix
 that maps the magnetization of a block to B at x. Magnetization and B are axial vectors. The field
 matrix of a block rotated by R is therefore ``F'(x) = R F(R^-1 x) R^T``, and of a block reflected
 by S in a plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels.

@@ -180,7 +180,6 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
     def rows() -> Iterator[Floats]:
-        # as many rows at once as memory allows, because rows share integrals
         for part in row_slices(len(observation), dimension * len(blocks), len(observation)):
             matrix, total[part], magnitude[part] = _rows(magnet, observation, parts, part)
             yield matrix

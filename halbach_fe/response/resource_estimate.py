@@ -28,7 +28,6 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
@@ -123,18 +122,15 @@ READING_BYTES, READING_SECONDS = 1200, 6e-5
 """Memory in bytes and time in s per reading for labels, tables and figures, measured with a million
 readings."""
 
-CHUNK_BYTES, CHUNK_PLACES, PLACE_BYTES, PLACES_AT_ONCE = 230e6, 40_000, 180, 4_000_000
-"""Memory for the exact field of the blocks at the distinct places that `_places` counts: bytes of
-the temporary arrays, number of places that fills them, bytes per place of the stored fields, and
-largest number of places whose fields are stored. Measured with 96 000 and 576 000 places."""
+POINT_BYTES = 340
+"""Memory in bytes per point for the exact field of a block: its matrix in the frames of the block
+and of the magnet, and the product between them."""
 
-OWN_SECONDS, ELEMENT_SECONDS, PLACE_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 2.5e-5, 1e-9
+OWN_SECONDS, ELEMENT_SECONDS, PAIR_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 5e-7, 1e-9
 """Time in s of this program: to start and to write the report; per element of every GetDP process;
-per place of the exact field; and per entry of H, times the number of parameters or readings,
-whichever is smaller."""
-
-COUNTED_PLACES = 500_000
-"""Largest number of places that are counted, which takes half a second."""
+per block and point of the exact field; and per entry of H, times the number of parameters or
+readings, whichever is smaller. Two threads took 2e-7 to 5e-7 s per block and point, in a plane and
+for sectors in space."""
 
 MESH_BYTES = {"cross_section": 104, "meridian": 70, "extruded": 104}
 """Bytes per element of a mesh file, by the kind of mesh."""
@@ -372,12 +368,11 @@ def _estimate(
     blocks, speed, problems = magnet.blocks, machine_speed(), problems_of(magnet, session)
     elements = max((problem.elements for problem in problems), default=0)
     matrix = readings * parameters
-    places = 0.0 if magnet.study.solver.method == "direct" else _places(magnet, points)
+    exact = 0 if magnet.study.solver.method == "direct" else len(points)
     fields = parameters * len(points) * 3 if problems else 0
     information = parameters * min(readings, parameters)
     # the fields of the blocks are freed before the posterior is computed
-    building = (8 * fields + CHUNK_BYTES * min(1.0, places / CHUNK_PLACES)
-                + PLACE_BYTES * min(places, PLACES_AT_ONCE))
+    building = 8 * fields + POINT_BYTES * exact
     updating = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
                     + INFORMATION_COPIES * information)
     own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(building, updating)
@@ -386,7 +381,8 @@ def _estimate(
     side_by_side = 0.0
     seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(
         problem.elements * problem.processes for problem in problems)
-    seconds += PLACE_SECONDS * places + MATRIX_SECONDS * matrix * min(readings, parameters)
+    seconds += PAIR_SECONDS * len(blocks) * exact
+    seconds += MATRIX_SECONDS * matrix * min(readings, parameters)
     seconds += READING_SECONDS * readings if parameters else 0
     for purpose in dict.fromkeys(problem.what for problem in problems):
         runs = [run for problem in problems if problem.what == purpose
@@ -411,25 +407,6 @@ def _route(magnet: Magnet, points: Floats, problems: Sequence[Problem]) -> str:
     if problems:
         return problems[0].route
     return EXACT_FIELD_ONLY if magnet.is_vacuum else choose_route(magnet, points)
-
-
-def _places(magnet: Magnet, points: Floats) -> float:
-    """Return the number of distinct positions of points (n, 3) in m relative to the blocks.
-
-    Several blocks see points on circles from the same relative position and share the integrals of
-    their fields (`halbach_fe.solver.exact_block_field.unit_fields`). Positions are counted for the
-    blocks of a single ring and a sample of the points, and scaled up.
-    """
-    ring = magnet.blocks[:magnet.blocks_by_ring[0]]
-    sample = points[:COUNTED_PLACES // len(ring) + 1]
-    middles = np.radians([block.angle_deg for block in ring])
-    turn = np.arctan2(sample[:, 1], sample[:, 0])[:, None] - middles
-    turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
-    r = np.hypot(sample[:, 0], sample[:, 1])[:, None]
-    z = np.broadcast_to(sample[:, 2:], turn.shape)
-    different, _ = unique_points(np.column_stack(
-        [x.ravel() for x in (r * np.cos(turn), r * np.sin(turn), z)]).round(9))
-    return len(magnet.blocks) / len(ring) * len(different) * len(points) / len(sample)
 
 
 def machine_speed() -> float:

@@ -96,7 +96,7 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
 
 
 def matrix_of(six: Floats) -> Floats:
-    """Return symmetric matrices (..., 3, 3) from their components xx, yy, zz, xy, xz, yz."""
+    """Return symmetric matrices (..., 3, 3) of components (..., 6) xx, yy, zz, xy, xz, yz."""
     return six[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 
 
@@ -131,8 +131,8 @@ def gradient_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
 def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
     """Yield the contribution of every block to `gradient_of`, (n, 3, 3) in T/m.
 
-    The radial and azimuthal derivatives are central differences, for which points on circles share
-    integrals. The derivatives along z follow from curl B = 0 and div B = 0.
+    The radial and azimuthal derivatives are central differences. Those along z follow from
+    curl B = 0 and div B = 0.
     """
     angle = np.arctan2(points[:, 1], points[:, 0])
     zero = np.zeros(len(points))

@@ -1,7 +1,7 @@
 """Field of uniformly polarized prisms by their surface charge, compiled by numba.
 
 A prism stands on an outline in the (x, y) plane of its frame, between two values of z. Its field is
-the sum of line integrals over the polygon that the docstring of
+the sum of line integrals over the outline that the docstring of
 `halbach_fe.solver.exact_block_field` derives. On a straight edge they are elementary. Let d be the
 signed distance of the edge from the point along its outward normal, s the position along the edge
 relative to the point, u = z - z' and R^2 = s^2 + d^2 + u^2. Then
@@ -62,8 +62,8 @@ def _straight_edge(
     """Return 4 pi times the contribution of an edge from a to b to the field matrix.
 
     Ends are relative to the point; ``a2`` is the square of the distance of a in the plane, ``aup``
-    and ``alow`` are the distances R of the edge's ends in the upper and lower face, at heights
-    ``up`` and ``low`` below the point, and ``side`` is their `_side`. The faces of an infinite
+    and ``alow`` are the point's distances R from a in the planes of the upper and lower face, above
+    which it is by ``up`` and ``low``, and ``side`` is their `_side`. The faces of an infinite
     prism are infinitely far. Only sums over closed outlines have the symmetric matrix that is
     returned for every edge.
     """
@@ -123,6 +123,23 @@ def _side(up: float, low: float) -> float:
     return _sign(up) - _sign(low)
 
 
+_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@compiled
+def _sum(a: Six, b: Six) -> Six:
+    """Return the sum of two field matrices."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@compiled
+def _scaled(a: Six) -> Six:
+    """Return a field matrix divided by 4 pi."""
+    factor = 1 / (4 * pi)
+    return (a[0] * factor, a[1] * factor, a[2] * factor,
+            a[3] * factor, a[4] * factor, a[5] * factor)
+
+
 @compiled
 def polygon_field(
     vertices: Floats, half: float, x: float, y: float, z: float
@@ -144,7 +161,7 @@ def polygon_field(
     for i in range(len(vertices)):
         size2 = max(size2, vertices[i, 0] ** 2 + vertices[i, 1] ** 2)
     tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
-    xx = yy = zz = xy = xz = yz = 0.0
+    total = _NOTHING
     last = len(vertices) - 1
     bx, by = vertices[last, 0] - x, vertices[last, 1] - y
     b2 = bx * bx + by * by
@@ -154,37 +171,32 @@ def polygon_field(
         bx, by = vertices[i, 0] - x, vertices[i, 1] - y
         b2 = bx * bx + by * by
         bup, blow = sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny)
-        g = _straight_edge(ax, ay, a2, aup, alow, bx, by, b2, bup, blow, up, low, up2, low2,
-                           side, tiny, zero)
-        xx += g[0]
-        yy += g[1]
-        zz += g[2]
-        xy += g[3]
-        xz += g[4]
-        yz += g[5]
-    factor = 1 / (4 * pi)
-    return (xx * factor, yy * factor, zz * factor, xy * factor, xz * factor, yz * factor)
+        total = _sum(total, _straight_edge(
+            ax, ay, a2, aup, alow, bx, by, b2, bup, blow, up, low, up2, low2, side, tiny, zero))
+    return _scaled(total)
 
 
-ARC_LEVELS = 28
-"""Sizes of the parts of an arc, down to 1e-8 of its length; nearer points are less accurate."""
+ARC_LEVELS, ARC_NODES = 28, 12
+"""Number of sizes of an arc's parts, each half the one before, and Gauss nodes of every part.
+
+The smallest part is 1e-8 of the arc; at points that are nearer the field is less accurate."""
 
 
 @lru_cache(maxsize=64)
-def arc_table(sweep: float, order: int = 12) -> tuple[Floats, Floats]:
+def arc_table(sweep: float) -> tuple[Floats, Floats]:
     """Return Gauss nodes of the parts of an arc, as turns from the middle of a part, and weights.
 
-    A part is not longer than its distance from the point, so that 12 nodes leave an error of 1e-15
-    of its integral.
+    A part is not longer than its distance from the point, so that `ARC_NODES` nodes leave an error
+    of 1e-15 of its integral.
 
     Returns
     -------
-    turns : ndarray, shape (`ARC_LEVELS`, order, 2)
+    turns : ndarray, shape (`ARC_LEVELS`, `ARC_NODES`, 2)
         Cosine and sine of the angles for parts of 1, 1/2, 1/4 ... of the arc.
-    weights : ndarray, shape (order,)
+    weights : ndarray, shape (`ARC_NODES`,)
         They add up to 1.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes, weights = np.polynomial.legendre.leggauss(ARC_NODES)
     angle = sweep / 2 * nodes / 2.0 ** np.arange(ARC_LEVELS)[:, None]
     return np.stack([np.cos(angle), np.sin(angle)], axis=2), weights / 2
 
@@ -270,35 +282,22 @@ def outline_fields(
     for i in range(len(edges)):
         size2 = max(size2, (edges[i, 2] - edges[i, 0]) ** 2 + (edges[i, 3] - edges[i, 1]) ** 2)
     tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
-    factor = 1 / (4 * pi)
     for n in range(first, last):
         x, y = points[n, 0], points[n, 1]
         up, low = points[n, 2] - z_max, points[n, 2] - z_min
         up2, low2, side = up * up, low * low, _side(up, low)
-        xx = yy = zz = xy = xz = yz = 0.0
+        total = _NOTHING
         for i in range(len(edges)):
             ax, ay, bx, by = edges[i, 0] - x, edges[i, 1] - y, edges[i, 2] - x, edges[i, 3] - y
             a2, b2 = ax * ax + ay * ay, bx * bx + by * by
-            g = _straight_edge(
+            total = _sum(total, _straight_edge(
                 ax, ay, a2, sqrt(a2 + up2 + tiny), sqrt(a2 + low2 + tiny),
                 bx, by, b2, sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny),
-                up, low, up2, low2, side, tiny, zero)
-            xx += g[0]
-            yy += g[1]
-            zz += g[2]
-            xy += g[3]
-            xz += g[4]
-            yz += g[5]
+                up, low, up2, low2, side, tiny, zero))
         for i in range(len(arcs)):
-            g = _arc(arcs[i, 0], arcs[i, 1], arcs[i, 2], turns[i], weights, x, y, up, low, side)
-            xx += g[0]
-            yy += g[1]
-            zz += g[2]
-            xy += g[3]
-            xz += g[4]
-            yz += g[5]
-        out[n, 0], out[n, 1], out[n, 2] = xx * factor, yy * factor, zz * factor
-        out[n, 3], out[n, 4], out[n, 5] = xy * factor, xz * factor, yz * factor
+            total = _sum(total, _arc(arcs[i, 0], arcs[i, 1], arcs[i, 2], turns[i], weights,
+                                     x, y, up, low, side))
+        out[n] = _scaled(total)
 
 
 Eight = tuple[float, float, float, float, float, float, float, float]

@@ -196,6 +196,8 @@ SLOW = ("iron-ring", "iron-curve", "iron-curve-free", "iron-prisms")
 """Studies whose fields take seconds; they go through a single command. A diagnosis, of many fields,
 takes minutes with iron of any kind."""
 
+# a simulated measurement of layers in a plane takes a minute of fine finite elements, for keys that
+# "layers-missing" tries in space
 PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
          if (name in WHOLE and (name, command) != ("flat-layers", "simulate-measurement"))
          or command == "infer-blocks"

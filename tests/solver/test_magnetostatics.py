@@ -84,7 +84,7 @@ def in_bore(count=200):
 def test_3d_ring_against_magpylib_and_exact_field(short_dipole, session):
     """Lowest-order edge elements on a coarse mesh: some per cent, and the right sign and axes.
 
-    Measured, rms, 0.044 to 0.047 of the largest field on meshes that differ by rounding, and 0.11
+    Measured, rms, 0.044 to 0.047 of the largest field on meshes that differ by rounding, and 0.10
     for 19 of 20 values; the largest, 0.22 to 0.32, is chance. A fine mesh is for
     `method = "reaction"`.
     """

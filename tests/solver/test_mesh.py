@@ -39,7 +39,8 @@ def volumes(path, dimension):
 def test_shipped_studies_mesh_to_their_volumes(tmp_path, name, larger):
     """Chords cut some per cent off sectors; cuboids and trapezoids are met exactly.
 
-    Elements may be ``larger`` by a factor: no solve meshes the cubes of the MRI magnet.
+    The air is coarser than a solve has it, and elements of blocks may be ``larger`` by a factor: no
+    solve meshes the cubes of the MRI magnet.
     """
     study = read_study(ROOT / f"studies/{name}/study.toml")
     study = study.with_(mesh__block_size_m=larger * study.mesh.block_size_m, mesh__growth=2.0)

@@ -28,7 +28,7 @@ def test_many_blocks_are_summed_by_expansions(generator):
         return np.sqrt(np.mean(field**2)) / np.abs(exact).max()
 
     assert 0 < rms(_field_in_vacuum(blocks)(points) - exact) < 3e-5
-    # few blocks are exact, and so are arcs
+    # few blocks are exact
     assert rms(_field_in_vacuum(blocks[:MANY_BLOCKS - 1])(points)
                - field_of(blocks[:MANY_BLOCKS - 1], points)) == 0
     # negative control: one block of them turned the other way

@@ -393,7 +393,7 @@ def test_fields_of_random_magnets(array):
 
 PEER_ERROR = 6e-3
 """Of the reaction: twice what Gauss points of `separate_reaction` were measured to be off by, at
-most; most magnets agree to some 1e-4."""
+most."""
 
 
 @settings(max_examples=4)
