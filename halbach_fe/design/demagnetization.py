@@ -334,7 +334,7 @@ def _field_strength(
     field = field_of(blocks, points)  # mu_0 H in vacuum
     if not magnet.is_vacuum and _by_moments(magnet):
         reacting = magnet.with_(solver__method="reaction")
-        field += solve_separate(reacting, session).field_with_errors(points)[0]
+        field += solve_separate(reacting, session, estimate=False).field(points)
     elif not magnet.is_vacuum:
         _check_equal_rings(magnet)
         reacting = magnet.with_(solver__method="reaction")

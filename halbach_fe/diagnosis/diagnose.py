@@ -43,7 +43,6 @@ from halbach_fe.diagnosis.search import (
     Signatures,
     apply_effects,
     identify_effects,
-    memoized_solver,
     score_hypotheses,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
@@ -89,9 +88,8 @@ def diagnose(
         Another map, which is predicted but not used for the inference.
     say : callable, optional
         Called with a line of text on each step, to report progress.
-    solver : callable, optional
-        Solver for the fields of nominal magnets, see `memoized_solver`. Several diagnoses may share
-        one, so that equal magnets are solved once.
+    solver : NominalSolver, optional
+        Several diagnoses may share one, so that equal magnets are solved once.
 
     Returns
     -------
@@ -110,7 +108,7 @@ def diagnose(
         unplaced = np.zeros_like(blocks.ring)  # the table's rings are not those of this magnet
         blocks = replace(blocks, ring=unplaced, slot=unplaced)
     signatures: Signatures = {}
-    solver = solver or memoized_solver(replace(_subsession(session, "signatures"), progress=None))
+    solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
     times = np.concatenate([map_time(each) for each in (data, validation_map) if each is not None])
     first: tuple[InferenceResult, Search] | None = None
     identified, position_noise, converged = start, None, True

@@ -56,6 +56,18 @@ def loo_residuals(marginal: Marginal, residual: Floats) -> Floats:
     return np.asarray(marginal.remove(residual[:, None])[:, 0] / np.sqrt(np.maximum(own, 1e-12)))
 
 
+def _solve_less_product(half: Floats, right: Floats) -> Floats:
+    """Return the solution x (n,) of (1 - half half') x = right, for ``half`` of shape (n, k).
+
+    The system has the smaller one of both dimensions: (1 - h h')^-1 = 1 + h (1 - h' h)^-1 h'.
+    """
+    rows, columns = half.shape
+    if rows <= columns:
+        return np.asarray(np.linalg.lstsq(np.eye(rows) - half @ half.T, right, rcond=1e-10)[0])
+    inner = np.eye(columns) - half.T @ half
+    return np.asarray(right + half @ np.linalg.lstsq(inner, half.T @ right, rcond=1e-10)[0])
+
+
 def residual_groups(
     marginal: Marginal, residual: Floats, memberships: dict[str, list[str]]
 ) -> list[ResidualGroup]:
@@ -78,13 +90,9 @@ def residual_groups(
         of = np.array(names)
         for name in dict.fromkeys(names):
             rows = np.flatnonzero(of == name)
-            # the group given all others has precision P, the block 1 - half half' of S^-1, and
-            # chi2 = (S^-1 r)' P^-1 (S^-1 r)
-            part = half[rows]
-            inner = np.eye(part.shape[1]) - part.T @ part
+            # the group given all others has precision P, the block 1 - half half' of S^-1
             score = kept[rows]
-            solved = score + part @ np.linalg.lstsq(inner, part.T @ score, rcond=1e-10)[0]
-            chi2 = float(score @ solved)
+            chi2 = float(score @ _solve_less_product(half[rows], score))  # (S^-1 r)' P^-1 (S^-1 r)
             found.append((kind, name, len(rows), chi2 / len(rows),
                           float(stats.chi2.sf(chi2, len(rows)))))
     adjusted = false_discovery_control([group[-1] for group in found]) if found else []

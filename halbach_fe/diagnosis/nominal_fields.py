@@ -39,6 +39,9 @@ class NominalFields:
     solve : callable
         Function of a study that returns the field (n, 3) in T of its nominal magnet at the points,
         by finite elements.
+    solve_iron : callable, optional
+        Function of a study that returns the change (n, 3) in T that its iron makes to the field of
+        blocks in vacuum, or None if `solve` takes no longer.
     measured_magnetizations : ndarray, shape (blocks, D), in A/m, or None
         Magnetizations that are expected from measurements of the single blocks, in D dimensions;
         None to use the nominal ones.
@@ -48,6 +51,7 @@ class NominalFields:
     points: Floats
     time: Floats
     solve: Callable[[Study], Floats]
+    solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
 
     @cached_property
@@ -99,6 +103,11 @@ class NominalFields:
     def finite_element_field(self) -> Floats:
         """B of the nominal magnet by finite elements, (n, 3) in T."""
         return self.solve(self.study)
+
+    def change_by_iron(self, study: Study) -> Floats:
+        """Return the change (n, 3) in T of B that the iron of another study makes to this one."""
+        quick = self.solve_iron(study)
+        return self.solve(study) - self.finite_element_field if quick is None else quick
 
     def measured_block_field(self, number: int) -> Floats:
         """Return B (n, 3) in T of block ``number`` with its measured magnetization.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -20,20 +21,45 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
 
 Say = Callable[[str], None]
 """A callable that reports progress; its argument is a line of text."""
-NominalSolver = Callable[[Study, Floats], Floats]
-"""A callable from a study and points (n, 3) in m to the field (n, 3) in T of its nominal magnet."""
 Signatures = dict[tuple[str, Place], Floats]
 """Whitened signatures by effect name and place: training readings (rows, k) per unit of each of the
 effect's k parameters."""
+
+
+@dataclass(frozen=True)
+class NominalSolver:
+    """Solves for the fields of nominal magnets, each of them once."""
+
+    session: Session
+    _solved: dict[tuple[str, str, bytes], Any] = field(default_factory=dict, repr=False)
+
+    def field(self, study: Study, points: Floats) -> Floats:
+        """Return `solve_nominal` of the magnet of a study at points (n, 3) in m."""
+        found: Floats = self._once("field", solve_nominal, study, points)
+        return found
+
+    def iron_change(self, study: Study, points: Floats) -> Floats | None:
+        """Return `iron_change` of the magnet of a study at points (n, 3) in m."""
+        found: Floats | None = self._once("iron", iron_change, study, points)
+        return found
+
+    def _once(
+        self, name: str, solve: Callable[[Magnet, Floats, Session], Any], study: Study,
+        points: Floats
+    ) -> Any:
+        key = name, study.model_dump_json(include=FIELD_KEYS), points.tobytes()
+        if key not in self._solved:
+            self._solved[key] = solve(build_magnet(study), points, self.session)
+        return self._solved[key]
 
 
 @dataclass(frozen=True)
@@ -99,7 +125,7 @@ def score_hypotheses(
         Prior mean of the magnetizations of the study without effects.
     times : ndarray, shape (n,)
         Time of each point of the map, from 0 at the first to 1 at the last.
-    solver : callable
+    solver : NominalSolver
     effects : sequence of Effect
     identified : sequence of IdentifiedEffect
         The effects in the model of ``update``.
@@ -126,7 +152,8 @@ def score_hypotheses(
 
     def nominal_fields_of(other: Study) -> NominalFields:
         points = probe_points(other.instrument, update.observation.map_points)
-        return NominalFields(other, points, times, lambda changed: solver(changed, points),
+        return NominalFields(other, points, times, lambda changed: solver.field(changed, points),
+                             solve_iron=lambda changed: solver.iron_change(changed, points),
                              measured_magnetizations=prior_mean.reshape(-1, other.dimension))
 
     nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
@@ -209,21 +236,6 @@ def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, nominal: Nomina
     changed = nominal.solve(effect.apply(nominal.study, place, values))
     change = changed - nominal.finite_element_field
     return np.concatenate([(change - np.tensordot(amounts[1:], refined, 1))[None], refined])
-
-
-def memoized_solver(session: Session) -> NominalSolver:
-    """Return a finite-element solver of nominal magnets that solves each magnet once.
-
-    The returned callable takes a study and points (n, 3) in m and returns the field (n, 3) in T.
-    """
-    solved: dict[tuple[str, bytes], Floats] = {}
-
-    def solve(study: Study, points: Floats) -> Floats:
-        key = study.model_dump_json(include=FIELD_KEYS), points.tobytes()
-        if key not in solved:
-            solved[key] = solve_nominal(build_magnet(study), points, session)
-        return solved[key]
-    return solve
 
 
 def identify_effects(

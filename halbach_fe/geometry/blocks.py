@@ -195,6 +195,8 @@ class MagnetBlock:
 
 def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
     """Return the matrix (3, 3) of a rotation vector in rad."""
+    if not any(vector):  # most blocks of most magnets, which may have thousands
+        return np.eye(3)
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 

@@ -12,7 +12,6 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.free_blocks import counter_clockwise
 from halbach_fe.geometry.outline import Outline, closed_outline, outline_contains, plane_rotation
 from halbach_fe.study.iron import Iron, IronRing
-from halbach_fe.study.model import Study
 
 
 @dataclass(frozen=True)
@@ -79,15 +78,14 @@ def iron_solids(
     return tuple(solids)
 
 
-def check_iron_ring(study: Study, array_outer_radius: float) -> None:
+def check_iron_ring(ring: IronRing, array_outer_radius: float) -> None:
     """Refuse an iron ring that does not lie outside the blocks.
 
     Raises
     ------
     StudyError
     """
-    ring = study.iron_ring
-    if ring is not None and ring.inner_radius_m < array_outer_radius * (1 - 1e-9):
+    if ring.inner_radius_m < array_outer_radius * (1 - 1e-9):
         raise StudyError(
             f"Input `iron_ring.inner_radius_m` of study must be at least {array_outer_radius:.6g}, "
             f"where the blocks end; instead received {ring.inner_radius_m:g}. Enlarge the ring.")

@@ -281,7 +281,8 @@ def build_magnet(study: Study) -> Magnet:
     'r01s01'
     """
     magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
-    check_iron_ring(study, magnet.array_outer_radius)
+    if study.iron_ring is not None:
+        check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
     return magnet
 

@@ -50,6 +50,10 @@ from halbach_fe.study.types import COMPONENTS
 LOADED_BYTES = 2**30
 """Size in bytes above which a matrix stays on the disk and is read in parts."""
 
+DEVIATION = 0.1
+"""Share of the difference between the columns' sum and the nominal array's field in the error bars,
+if columns only serve for deviations: blocks deviate by less than a tenth of their magnetization."""
+
 
 @dataclass(frozen=True)
 class StoredMatrix:
@@ -193,12 +197,14 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
     # if columns follow from symmetry but the mesh is not quite symmetric, they add up to slightly
     # less or more than the field of the nominal array
+    unequal = total - direct
     offset = observation.apply(external_field(magnet, observation.points))
-    if parts.linearized:
+    if parts.linearized or parts.for_deviations:
+        unequal *= DEVIATION
         field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
     built = Response(matrix, magnet.parameter_names, nominal, offset,
-                     np.hypot(error, total - direct), superposition)
+                     np.hypot(error, unequal), superposition)
     _write(path, key, built)
     return built
 

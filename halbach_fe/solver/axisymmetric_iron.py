@@ -43,14 +43,7 @@ from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_grid import IronRectangle, Resolution, check_bodies
-from halbach_fe.solver.iron_modes import (
-    Complexes,
-    Exterior,
-    IronModes,
-    assemble_modes,
-    exterior,
-    points_at,
-)
+from halbach_fe.solver.iron_modes import Complexes, Exterior, IronModes, assemble_modes, points_at
 from halbach_fe.solver.iron_newton import (
     Problem,
     Tangent,
@@ -94,7 +87,7 @@ ALIASING = 1e-2
 below this value, relative to the largest. Modes fall about geometrically, so that those which would
 be mistaken for low modes are then below the square of this value."""
 
-FEWEST_ANGLES, MOST_ANGLES = 64, 1024
+FEWEST_ANGLES, MOST_ANGLES = 64, 512
 """Limits of the number of angles at which a source is evaluated. Where blocks touch the iron, the
 modes of their field fall slowly, but these local fields do not reach the bore."""
 
@@ -147,7 +140,7 @@ class IronReaction:
         for number, potential in zip(numbers[needed].tolist(), self.reaction[needed], strict=True):
             if number not in self._continued:
                 self._continued[number] = _continue(
-                    self.problem.modes, exterior(self.problem.modes, number), potential)
+                    self.problem.modes, self.problem.modes.exterior(number), potential)
         return _evaluate(self.name, self.problem.modes, {
             number: self._continued[number] for number in numbers[needed].tolist()}, points)[0]
 
@@ -182,7 +175,7 @@ class IronReaction:
         ndarray, shape (c, n, 3), in T
         """
         state, numbers = self.problem, np.arange(modes + 1)
-        spaces = [exterior(state.modes, number) for number in numbers.tolist()]
+        spaces = [state.modes.exterior(number) for number in numbers.tolist()]
         angles = _fast(4 * modes + 2)
         differential = state.differential(state.field(self.total)[..., 0])
         # only modes up to 2 m of the permeability couple modes up to m
@@ -259,7 +252,7 @@ def _problem(modes: IronModes, bodies: tuple[IronRectangle, ...], numbers: Ints)
     """Return the discrete problem for some modes."""
     return Problem(
         modes, bodies, numbers,
-        tuple(exterior(modes, number).stiffness for number in numbers.tolist()),
+        tuple(modes.exterior(number).stiffness for number in numbers.tolist()),
         tuple(modes.gradient(number) for number in numbers.tolist()),
         _fast(ANGLES_PER_MODE * int(numbers[-1]) + 8))
 
@@ -348,13 +341,19 @@ def _continue(modes: IronModes, space: Exterior, iron: Complexes) -> Complexes:
     return result
 
 
-def _modes_at(problem: Problem, points: Floats) -> int:
-    """Return the highest mode that the iron may produce at any of the points (n, 3) in m."""
-    inner = min(body.inner_radius_m for body in problem.bodies)
+def highest_mode_at(bodies: Sequence[IronRectangle], points: Floats) -> int | None:
+    """Return the highest mode that iron produces at points (n, 3) in m; None for all modes."""
+    inner = min(body.inner_radius_m for body in bodies)
     radius = float(np.hypot(points[:, 0], points[:, 1]).max(initial=0.0))
     if radius >= 0.999 * inner:
-        return int(problem.numbers[-1])
+        return None
     return int(np.ceil(np.log(NO_AMPLITUDE) / np.log(max(radius / inner, 1e-3)))) + 1
+
+
+def _modes_at(problem: Problem, points: Floats) -> int:
+    """Return the highest mode of a problem that the iron produces at points (n, 3) in m."""
+    highest, last = highest_mode_at(problem.bodies, points), int(problem.numbers[-1])
+    return last if highest is None else min(highest, last)
 
 
 def _evaluate(

@@ -36,7 +36,7 @@ from halbach_fe.solver.magnetostatics import (
     solve_sources,
     solve_tangent,
 )
-from halbach_fe.solver.separate_blocks import applies, separate_columns, solve_separate
+from halbach_fe.solver.separate_blocks import applies, iron_alone, separate_columns, solve_separate
 from halbach_fe.solver.session import Session
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -65,7 +65,7 @@ difference of 100 % and more, are detected with certainty."""
 
 MOMENTS_TOLERANCE = 0.1
 """The same tolerance for the route ``moments``. The columns have a single cell per block, and leave
-out what blocks and iron answer to each other; the difference goes into the error bar."""
+out what blocks and iron answer to each other."""
 
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
@@ -102,6 +102,9 @@ class ElementFields:
     error : ndarray, shape (n, 3), in T, or None
         Discretization error of ``nominal`` where the solve already yields it, NaN elsewhere; None
         if it is known nowhere.
+    for_deviations : bool
+        Whether the blocks' parts only serve for deviations from ``nominal``, which is more exact
+        than their sum. Derivatives at the nominal array do so too.
     """
 
     superposition_tolerance: float
@@ -110,6 +113,7 @@ class ElementFields:
     sources: tuple[MagnetBlock, ...]
     block: Callable[[int, Ints | slice], Floats]
     error: Floats | None = None
+    for_deviations: bool = False
 
     @property
     def linearized(self) -> bool:
@@ -121,7 +125,18 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
     """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method."""
     check_points(magnet, points)
     return vacuum_part(magnet, points) + finite_element_part(
-        magnet, points, session, columns=False).nominal
+        magnet, points, session, columns=False, estimate=False).nominal
+
+
+def iron_change(magnet: Magnet, points: Floats, session: Session) -> Floats | None:
+    """Return the change (n, 3) in T that the iron makes to B of blocks in vacuum.
+
+    The result is None for routes on which the whole magnet is solved in the same time.
+    """
+    check_points(magnet, points)
+    if choose_route(magnet, points) != "moments" or not magnet.iron:
+        return None
+    return iron_alone(magnet, points, session)
 
 
 def vacuum_part(magnet: Magnet, points: Floats) -> Floats:
@@ -137,7 +152,7 @@ def vacuum_part(magnet: Magnet, points: Floats) -> Floats:
 
 
 def finite_element_part(
-    magnet: Magnet, points: Floats, session: Session, columns: bool = True
+    magnet: Magnet, points: Floats, session: Session, columns: bool = True, estimate: bool = True
 ) -> ElementFields:
     """Compute the finite-element part of B by the route that `choose_route` returns.
 
@@ -149,6 +164,8 @@ def finite_element_part(
     session : Session
     columns : bool
         Whether to solve for single blocks too, the columns of the response matrix.
+    estimate : bool
+        Whether the route of moments solves once more for error bars.
     """
     size = magnet.dimension
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
@@ -157,7 +174,7 @@ def finite_element_part(
                              lambda number, some: np.zeros((len(points[some]), 3, size)))
     route = choose_route(magnet, points)
     if route == "moments":
-        return _by_moments(magnet, points, session, columns)
+        return _by_moments(magnet, points, session, columns, estimate)
     if not columns:
         nominal = _solve_nominal(magnet, points, session, route)
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved)
@@ -186,7 +203,7 @@ def finite_element_part(
 
 
 def _by_moments(
-    magnet: Magnet, points: Floats, session: Session, columns: bool
+    magnet: Magnet, points: Floats, session: Session, columns: bool, estimate: bool
 ) -> ElementFields:
     """Return the reaction of separate blocks and rotationally symmetric iron.
 
@@ -196,14 +213,16 @@ def _by_moments(
     few = few_modes_suffice(magnet, points)
     if magnet.study.solver.route == "auto" and few.any():
         parts = [(np.flatnonzero(chosen), finite_element_part(
-            magnet.with_(solver__route=route), points[chosen], session.within(route), columns))
+            magnet.with_(solver__route=route), points[chosen], session.within(route), columns,
+            estimate))
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
         return _joined(magnet, points, parts)
     if session.counter is not None:
         zero = np.zeros((len(points), 3))
         return ElementFields(np.nan, zero, zero, magnet.blocks, _not_solved, zero)
-    solved = solve_separate(magnet, session)
-    nominal, error = solved.field_with_errors(points)
+    solved = solve_separate(magnet, session, estimate)
+    nominal, error = solved.field_with_errors(points) if estimate else (
+        solved.field(points), None)
     if not columns:
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
     block = separate_columns(magnet, points, solved.iron)
@@ -211,7 +230,8 @@ def _by_moments(
     if magnet.is_nonlinear:  # the columns are derivatives at the nominal magnet
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
-    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error)
+    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error,
+                         for_deviations=True)
 
 
 def _joined(
@@ -238,7 +258,8 @@ def _joined(
         return found
 
     return ElementFields(max(fields.superposition_tolerance for _, fields in parts), nominal, along,
-                         magnet.blocks, block, error)
+                         magnet.blocks, block, error,
+                         any(fields.for_deviations for _, fields in parts))
 
 
 def uses_symmetry(magnet: Magnet) -> bool:

@@ -9,7 +9,7 @@ give its own part, which depends on the field and is assembled here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -38,6 +38,10 @@ Complexes = NDArray[np.complex128]
 
 PROBLEM = "iron_modes.pro"
 MESH = "iron.msh"
+
+KEPT_BYTES = 2e9
+"""Factorized modes are kept up to this memory. Blocks and iron that answer to each other ask for
+the same modes again and again."""
 
 MATRIX_TOLERANCE = 1e-9
 """Largest difference between GetDP's matrix and the one from our Gauss points, relative to its
@@ -111,6 +115,7 @@ class IronModes:
     iron: Ints
     gauss: GaussPoints
     body: Ints
+    _exteriors: dict[int, Exterior] = field(default_factory=dict, repr=False, compare=False)
 
     def matrix(self, mode: int) -> sparse.csr_array:
         """Return the stiffness of a mode; unknowns that vanish have unit rows and columns."""
@@ -121,6 +126,21 @@ class IronModes:
         kept[self.on_axis] = 0
         keep = sparse.diags_array(kept)
         return sparse.csr_array(keep @ whole @ keep + sparse.diags_array(1 - kept))
+
+    @cached_property
+    def rest(self) -> Ints:
+        """The unknowns outside the iron, in an order that keeps the factors of all modes sparse."""
+        rest = np.setdiff1d(np.arange(self.plain.shape[0]), self.iron)
+        return np.asarray(rest[np.argsort(factorize(self.matrix(0)[rest][:, rest]).perm_c)])
+
+    def exterior(self, mode: int) -> Exterior:
+        """Return the space outside the iron in one mode, of which `KEPT_BYTES` are kept."""
+        found = self._exteriors.get(mode)
+        if found is None:
+            found = _condensed(self, mode)
+            if sum(space.bytes for space in self._exteriors.values()) <= KEPT_BYTES:
+                self._exteriors[mode] = found
+        return found
 
     @cached_property
     def iron_on_axis(self) -> Ints:
@@ -161,6 +181,11 @@ class Exterior:
     schur: Floats
     factor: sparse_linalg.SuperLU
 
+    @property
+    def bytes(self) -> int:
+        """Memory of the factors; SuperLU keeps a second copy once they were looked at."""
+        return 24 * self.factor.nnz + self.schur.nbytes
+
     def extend(self, iron: Complexes) -> Complexes:
         """Return the potential outside (rest, k) of potentials (iron, k) on the iron's unknowns."""
         result = np.empty((len(self.rest), iron.shape[1]), complex)
@@ -173,17 +198,14 @@ class Exterior:
         return result
 
 
-def exterior(modes: IronModes, mode: int) -> Exterior:
+def _condensed(modes: IronModes, mode: int) -> Exterior:
     """Eliminate all unknowns of a mode except those of the iron.
 
     The Schur complement is the product of the last blocks of the triangular factors, since the
     surface comes last in the order of elimination.
     """
-    matrix, iron = modes.matrix(mode), modes.iron
-    rest = np.setdiff1d(np.arange(matrix.shape[0]), iron)
-    rows = matrix[rest]
-    surface = np.flatnonzero(np.diff(rows[:, iron].tocsc().indptr))
-    rest = rest[np.argsort(factorize(rows[:, rest]).perm_c)]  # this order keeps the factors sparse
+    matrix, iron, rest = modes.matrix(mode), modes.iron, modes.rest
+    surface = np.flatnonzero(np.diff(matrix[rest][:, iron].tocsc().indptr))
     order = np.concatenate([rest, iron[surface]])
     factor = sparse_linalg.splu(sparse.csc_array(matrix[order][:, order]), permc_spec="NATURAL",
                                 diag_pivot_thresh=0.0, options={"SymmetricMode": True})

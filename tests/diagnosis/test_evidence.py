@@ -90,8 +90,10 @@ def test_left_out_residuals_are_those_of_each_reading_given_the_others(problem):
         (residual[0] - mean) / np.sqrt(variance))
 
 
-def test_groups_are_judged_given_all_other_readings(problem):
-    response, _, residual = problem
+@pytest.mark.parametrize("parameters", [3, 30], ids=["few parameters", "many parameters"])
+def test_groups_are_judged_given_all_other_readings(problem, generator, parameters):
+    _, _, residual = problem
+    response = generator.standard_normal((40, parameters))
     members = {"half": ["first"] * 15 + ["second"] * 25}
     found = residual_groups(Marginal.of(response), residual, members)
     covariance = np.eye(40) + response @ response.T

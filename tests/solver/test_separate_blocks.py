@@ -8,9 +8,14 @@ import numpy as np
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.separate_blocks import MANY_BLOCKS, _field_in_vacuum
+from halbach_fe.solver.separate_blocks import (
+    MANY_BLOCKS,
+    _field_in_vacuum,
+    iron_alone,
+    solve_separate,
+)
 from halbach_fe.study.reader import read_study
-from tests.conftest import ROOT
+from tests.conftest import ROOT, circle
 
 
 def test_many_blocks_are_summed_by_expansions(generator):
@@ -34,3 +39,23 @@ def test_many_blocks_are_summed_by_expansions(generator):
     # negative control: one block of them turned the other way
     other = (replace(blocks[0], remanence=-blocks[0].remanence), *blocks[1:])
     assert rms(_field_in_vacuum(other)(points) - exact) > 3e-5
+
+
+def test_iron_alone_is_nearly_the_change_by_iron(short_dipole, session):
+    """A tube around cuboids: exact in vacuum, some per cent off with permeable blocks."""
+    points = np.vstack([circle(0.05, 6, z) for z in (-0.1, 0.0, 0.06)])
+
+    def magnet_with(permeability, **more):
+        return build_magnet(short_dipole(
+            array__recoil_permeability=permeability, array__outer_radius_m=0.14,
+            array__block={"shape": "cuboid", "width_m": 0.03}, **more))
+
+    ring = {"iron_ring": {"inner_radius_m": 0.15, "outer_radius_m": 0.16,
+                          "relative_permeability": 1000.0}}
+    for permeability, least, most in ((1.0, 0.0, 1e-5), (1.05, 1e-3, 0.1)):
+        around = magnet_with(permeability, **ring)
+        change = solve_separate(around, session, estimate=False).field(points)
+        if permeability != 1.0:
+            change -= solve_separate(magnet_with(permeability), session, False).field(points)
+        error = np.abs(iron_alone(around, points, session) - change).max() / np.abs(change).max()
+        assert least <= error <= most

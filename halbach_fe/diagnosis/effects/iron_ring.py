@@ -57,8 +57,7 @@ class IronRingEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        with_ring = nominal.solve(self.apply(nominal.study, place, [1.0]))
-        return (with_ring - nominal.finite_element_field)[None]
+        return nominal.change_by_iron(self.apply(nominal.study, place, [1.0]))[None]
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""

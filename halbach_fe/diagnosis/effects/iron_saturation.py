@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.solver.formulation_choice import choose_route
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.model import Study
 
@@ -14,7 +15,10 @@ STEEL = "aisi_1010"
 """Steel whose H(B) curve stands for that of structural steels."""
 
 SOLID = "scalar_potential"
-"""Solver route of iron that saturates."""
+"""Solver route of iron that saturates, unless one of `BOTH` applies."""
+
+BOTH = ("cross_section", "moments")
+"""Solver routes of linear and of saturating iron."""
 
 
 class IronSaturationEffect(Effect):
@@ -34,10 +38,10 @@ class IronSaturationEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        # linear iron by the same route, so that both fields have the same mesh
-        solid = nominal.study.solver.with_(route=SOLID)
-        study = nominal.study
-        before = study if study.dimension == 2 else study.with_(solver=solid)
+        study = before = nominal.study
+        if choose_route(nominal.magnet, nominal.points) not in BOTH:
+            # linear iron by the same route, so that both fields have the same mesh
+            before = study.with_(solver__route=SOLID)
         return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

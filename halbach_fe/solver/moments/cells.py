@@ -133,8 +133,9 @@ def cells_of(blocks: Sequence[MagnetBlock], per_side: int, divisions: int = 2) -
     blocks : sequence of MagnetBlock
         Of finite length.
     per_side : int
-        Cells along each side of a cube. Other blocks have cells of about the same proportions: the
-        number along a direction is that of a cube of the same volume, times the ratio of the sides.
+        Cells along each side of a cube. Blocks that are longer in one direction have more cells
+        there: the number along a direction is that of a cube of the same volume, times the ratio of
+        the sides, and not less than ``per_side``.
     divisions : int
         Nodes per direction in every cell.
     """
@@ -162,8 +163,8 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     """Return centres, axes, vertices, half heights and cuboid flags in the block's frame."""
     height = block.z_max - block.z_min
     size = np.cbrt(block.volume) / per_side
-    quads = _corrected(quadrilaterals(block.outline, size), block)
-    layers = max(1, round(height / size))
+    quads = _corrected(quadrilaterals(block.outline, size, per_side), block)
+    layers = max(per_side, round(height / size))
     levels = block.z_min + height * (np.arange(layers) + 0.5) / layers
     _, middle = area_and_centroid(quads)
     local = quads - middle[:, None]
@@ -216,11 +217,15 @@ def _corrected(quads: Floats, block: MagnetBlock) -> Floats:
     return (quads - middle) * np.sqrt(block.area / areas.sum()) + _outline_centroid(block)
 
 
-def quadrilaterals(outline: Outline, size: float) -> Floats:
-    """Cut an outline into convex quadrilaterals (k, 4, 2) of sides of about ``size``, in m."""
+def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:
+    """Cut an outline into convex quadrilaterals (k, 4, 2) of sides of about ``size``, in m.
+
+    A four-sided outline has at least ``least`` of them along either direction; others are in
+    several pieces anyway.
+    """
     grid = _four_sided(outline)
     if grid is not None:
-        return _grid(grid, size)
+        return _grid(grid, size, least)
     polygon = _polygon(outline, size)
     pieces = _from_centroid(polygon) if _is_convex(polygon) else _merged(
         polygon, _triangles(polygon))
@@ -244,13 +249,13 @@ def _four_sided(outline: Outline) -> Outline | None:
     return None if outline[0].arc or outline[2].arc else outline
 
 
-def _grid(outline: Outline, size: float) -> Floats:
+def _grid(outline: Outline, size: float, least: int = 1) -> Floats:
     """Cut an outline of four sides along straight lines between its sides 1 and 3."""
-    width = max(1, round((outline[1].length + outline[3].length) / 2 / size))
+    width = max(least, round((outline[1].length + outline[3].length) / 2 / size))
     for edge in (outline[1], outline[3]):
         if edge.arc:
             width = max(width, int(np.ceil(abs(edge.angles[1]) / CHORD - 1e-9)))
-    depth = max(1, round((outline[0].length + outline[2].length) / 2 / size))
+    depth = max(least, round((outline[0].length + outline[2].length) / 2 / size))
     t = np.arange(width + 1) / width
     far, near = (edge.at(place)[0] * _bulge(edge, width)
                  for edge, place in ((outline[1], t), (outline[3], 1 - t)))

@@ -47,7 +47,7 @@ def test_nodes_lie_in_the_block_and_have_its_moments(name):
 def test_cuboids_and_proportions():
     cells = cells_of([cuboid((0.04, 0.01, 0.01), place=PLACE, turn=TURN)], 2)
     assert cells.cuboid.all()
-    assert len(cells) == 5 * 1 * 1
+    assert len(cells) == 5 * 2 * 2  # a cube of the same volume has sides of 15.9 mm
     assert len(cells_of([cuboid((0.01, 0.01, 0.01))], 3)) == 27
     assert not cells_of([block("trapezoid")], 1).cuboid.any()
 
