@@ -179,6 +179,17 @@ class Marginal:
         return np.asarray(columns - self.whitened @ absorbed)
 
 
+def with_fewer_columns(root: Floats) -> Floats:
+    """Return a factor (n, min(n, m)) of the covariance ``root root'``, for ``root`` (n, m).
+
+    Thousands of blocks have many times as many parameters as there are readings.
+    """
+    rows, columns = root.shape
+    if columns <= rows:
+        return root
+    return np.asarray(linalg.qr(root.T, mode="r", check_finite=False)[0][:rows].T)
+
+
 def _rows(count: int) -> list[slice]:
     """Return slices of at most `ROWS_AT_ONCE` rows."""
     return [slice(first, first + ROWS_AT_ONCE) for first in range(0, count, ROWS_AT_ONCE)]

@@ -17,6 +17,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.solver.exact_block_field import block_gradients, unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.study.materials import MU_0
@@ -63,6 +64,11 @@ class NominalFields:
     def blocks(self) -> tuple[MagnetBlock, ...]:
         """The blocks of the study's magnet."""
         return self.magnet.blocks
+
+    @cached_property
+    def intact_blocks(self) -> tuple[MagnetBlock, ...]:
+        """The blocks as they were meant, see `as_meant`."""
+        return as_meant(self.magnet).blocks
 
     @cached_property
     def unit_fields(self) -> Floats:

@@ -20,7 +20,7 @@ from scipy import stats
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.inference import ExcludedReading
@@ -102,7 +102,7 @@ def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
     if (np.diff(observation.analysis.indptr) != 1).any():
         return ()
     own = np.array(update.parts) != HELD_OUT_MAP
-    root = update.response.matrix[own] @ update.prior.root
+    root = with_fewer_columns(update.response.matrix[own] @ update.prior.root)
     residual = (update.readings - update.prediction_prior.mean)[own]
     noise, training = update.errors.subset(own), ~update.held_out[own]
     labels = [label for label, is_own in zip(observation.labels, own, strict=True) if is_own]

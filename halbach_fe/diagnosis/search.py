@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.effects.base import Effect, Place
-from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
 from halbach_fe.diagnosis.model_selection import (
     Candidate,
     SelectedEffect,
@@ -20,6 +20,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.screening import most_likely
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
@@ -143,8 +144,8 @@ def score_hypotheses(
         return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
 
     response = noise.whiten(update.response.matrix[rows])
-    marginal = Marginal.of(np.hstack([response @ update.prior.root,
-                                      whitened(_solver_error(update))]))
+    marginal = Marginal.of(with_fewer_columns(np.hstack([
+        response @ update.prior.root, whitened(_solver_error(update))])))
     training = whitened(update.readings - update.response.offset
                         - update.response.matrix @ update.prior.mean)
     residual = training
@@ -168,7 +169,6 @@ def score_hypotheses(
                           if name == effect.name)))]
     candidates: list[Candidate] = []
     columns: list[Floats] = []
-    width = 0
     for number, hypothesis in enumerate(shortlisted):
         progress(number, len(shortlisted))
         effect, place = hypothesis.effect, hypothesis.place
@@ -193,12 +193,17 @@ def score_hypotheses(
             residual = residual + signature @ present.values
         columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
         candidates.append(Candidate(
-            effect.name, place.name, tuple(range(width, width + signature.shape[1])),
+            effect.name, place.name, tuple(range(signature.shape[1])),
             effect.is_binary or signature.shape[1] > len(effect.parameters), effect.unique))
-        width += signature.shape[1]
-    stacked = np.hstack(columns)
-    return Search(tuple(shortlisted), tuple(candidates), marginal.evidence(stacked, residual),
-                  stacked, residual, marginal, training)
+    chosen = most_likely(candidates, columns, marginal, residual, {
+        number for number, hypothesis in enumerate(shortlisted)
+        if (hypothesis.effect.name, hypothesis.place) in in_model})
+    ends = np.cumsum([columns[number].shape[1] for number in chosen]).tolist()
+    compared = [replace(candidates[number], columns=tuple(range(
+        end - columns[number].shape[1], end))) for number, end in zip(chosen, ends, strict=True)]
+    stacked = np.hstack([columns[number] for number in chosen])
+    return Search(tuple(shortlisted[number] for number in chosen), tuple(compared),
+                  marginal.evidence(stacked, residual), stacked, residual, marginal, training)
 
 
 def _solver_error(update: InferenceResult) -> Floats:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.inference.result import InferenceResult
 
 
@@ -43,7 +43,7 @@ def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation |
     training = ~update.held_out
     noise = update.noise.subset(training)
     matrix = update.response.matrix[training]
-    marginal = Marginal.of(noise.whiten(matrix @ update.prior.root))
+    marginal = Marginal.of(with_fewer_columns(noise.whiten(matrix @ update.prior.root)))
     residual = noise.whiten(
         update.readings[training] - update.response.offset[training] - matrix @ update.prior.mean)
     chi2 = float(residual @ marginal.remove(residual[:, None])[:, 0]) / len(residual)

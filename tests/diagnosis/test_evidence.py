@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.loo_residuals import loo_residuals, residual_groups
 from halbach_fe.diagnosis.model_selection import (
     Candidate,
@@ -175,3 +175,11 @@ def test_shuffled_signatures_break_the_naming():
              for number, candidate in enumerate(candidates)]
     assert {one.candidate.effect for one in select_effects(evidence, wrong)}.isdisjoint(
         {"effect 3", "effect 7"})
+
+
+def test_fewer_columns_have_the_same_covariance(generator):
+    for shape in ((5, 40), (40, 5)):
+        root = generator.standard_normal(shape)
+        fewer = with_fewer_columns(root)
+        assert fewer.shape == (shape[0], 5)
+        np.testing.assert_allclose(fewer @ fewer.T, root @ root.T, atol=1e-12)

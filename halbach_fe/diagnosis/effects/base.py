@@ -202,6 +202,8 @@ def with_array(study: Study, **keys: Any) -> Study:
 
 def blocks_at(nominal: NominalFields, place: Place) -> list[int]:
     """Return the numbers of the blocks at a place, counted from 0."""
+    if place.ring and place.slot:
+        return [nominal.magnet.number_of(place.ring, place.slot)]
     return [number for number, block in enumerate(nominal.blocks)
             if place.ring in (0, block.ring) and place.slot in (0, block.slot)]
 

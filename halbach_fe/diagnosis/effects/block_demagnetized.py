@@ -16,7 +16,6 @@ from halbach_fe.diagnosis.effects.base import (
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -42,7 +41,7 @@ class BlockDemagnetizedEffect(Effect):
         (number,) = blocks_at(nominal, place)
         block = nominal.blocks[number]
         # relative to the intact block, even if the study contains a loss already
-        intact = as_meant(nominal.magnet).blocks[number].remanence
+        intact = nominal.intact_blocks[number].remanence
         return -intact * (nominal.unit_fields[number] @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
