@@ -6,6 +6,7 @@ The file is a valid study, and a comment explains every key.
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from halbach_fe.cli import common
@@ -33,16 +34,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shape", choices=("sector", "trapezoid", "cuboid"),
                         default=template.shape,
                         help="shape of the blocks (default: %(default)s)")
+    parser.add_argument("--material", metavar="GRADE",
+                        help="grade of the blocks, such as N42, in place of the remanence")
+    rings = parser.add_mutually_exclusive_group()
+    rings.add_argument("--inner-radii-m", type=_radii, metavar="X,X,...", default=(),
+                       help="inner radii of rings that differ, in the order of z")
+    rings.add_argument("--free-blocks", type=Path, metavar="TABLE",
+                       help="table of the blocks (CSV or HDF5), in place of rings")
     parser.add_argument("--iron-ring", action="store_true",
                         help="add an iron tube around the blocks")
+
+
+def _radii(text: str) -> tuple[float, ...]:
+    """Return the radii in m of a list, or refuse it."""
+    return tuple(map(common.positive_number, text.split(",")))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and print the command that solves it."""
     given = {name: value for name, value in vars(arguments).items()
              if name in MagnetTemplate.__dataclass_fields__ and value is not None}
-    if "inner_radius_m" in given:
-        given.setdefault("outer_radius_m", round(1.8 * given["inner_radius_m"], 6))
+    inner = max([*given["inner_radii_m"], given.get("inner_radius_m", 0.0)])
+    if inner:
+        given.setdefault("outer_radius_m", round(1.8 * inner, 6))
+    if "free_blocks" in given:
+        given["free_blocks"] = os.path.relpath(given["free_blocks"], arguments.study.parent)
     write_new_study(arguments.study, MagnetTemplate(**given))
     common.say(f"Wrote {arguments.study}. Next: halbach-fe solve {arguments.study} -o DIR")
     return 0

@@ -80,7 +80,7 @@ def read_study(path: str | Path) -> Study:
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
         ) from None
-    document = _with_free_blocks(document, path.parent, where)
+    document = with_free_blocks(document, path.parent, where)
     return _with_table(parse_study(document, where), path.parent, where)
 
 
@@ -92,7 +92,7 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
         raise StudyError(_sentence(error, where)) from None
 
 
-def _with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
+def with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
     """Return the document with the table of free blocks in place of its file's name."""
     array = document.get("array")
     free = array.get("free_blocks") if isinstance(array, dict) else None

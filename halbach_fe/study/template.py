@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,8 +12,10 @@ import jinja2
 
 from halbach_fe.core.errors import OutputError, must_be
 from halbach_fe.core.files import atomic
+from halbach_fe.study.free_blocks import FreeBlocks
+from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.model import Study
-from halbach_fe.study.reader import parse_study
+from halbach_fe.study.reader import parse_study, with_free_blocks
 
 TEMPLATE = "new_study.toml.j2"
 
@@ -23,6 +25,9 @@ class MagnetTemplate:
     """Values of the magnet in a new study file; all other values of the file follow from them.
 
     Lengths are in m, the remanence is in T. ``ring_length_m`` is None for a cross-section.
+    ``material`` names a grade of magnet in place of the remanence. ``inner_radii_m`` are the inner
+    radii of rings of their own, in the order of z. ``free_blocks`` is the path of a table of blocks
+    that takes the place of the rings, from the folder of the study file.
     """
 
     multipole_order: int = 1
@@ -34,27 +39,49 @@ class MagnetTemplate:
     remanence_T: float = 1.3
     shape: Literal["sector", "trapezoid", "cuboid"] = "sector"
     iron_ring: bool = False
+    material: str | None = None
+    inner_radii_m: tuple[float, ...] = ()
+    free_blocks: str | None = None
 
 
-def new_study(name: str, magnet: MagnetTemplate) -> str:
-    """Return the text of a valid study file with comments that explain its keys.
+def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
+    """Return the text of a valid study file in a folder, with comments that explain its keys.
 
     Raises
     ------
     StudyError
         If no valid study has these values.
     """
+    table = None
+    if magnet.free_blocks is not None:
+        table = free_blocks_of_file(folder / magnet.free_blocks)
+        inner, outer = table.radii_m
+        magnet = replace(magnet, inner_radius_m=float(f"{inner:.4g}"),
+                         outer_radius_m=float(f"{outer:.4g}"))
+    elif magnet.inner_radii_m:
+        magnet = replace(magnet, rings=len(magnet.inner_radii_m),
+                         inner_radius_m=min(magnet.inner_radii_m))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe.study", "."), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
-    text = environment.get_template(TEMPLATE).render(name=_name(name), magnet=magnet)
-    parse_new_study(text)
+    text = environment.get_template(TEMPLATE).render(
+        name=_name(name), magnet=magnet, table=table, half=_half_length(magnet, table))
+    parse_new_study(text, folder)
     return text
 
 
-def parse_new_study(text: str) -> Study:
+def _half_length(magnet: MagnetTemplate, table: FreeBlocks | None) -> float | None:
+    """Return the half length of the magnet in m, None for a cross-section."""
+    if table is not None:
+        return max(abs(z) + (size or 0.0) / 2 for z, size in zip(
+            table.z_m, table.size_z_m, strict=True)) if table.size_z_m else None
+    return None if magnet.ring_length_m is None else magnet.rings * magnet.ring_length_m / 2
+
+
+def parse_new_study(text: str, folder: Path = Path()) -> Study:
     """Return the study in a new file; raise StudyError if the options make it invalid."""
-    return parse_study(tomllib.loads(text), "new study")
+    where = "new study"
+    return parse_study(with_free_blocks(tomllib.loads(text), folder, where), where)
 
 
 def write_new_study(path: Path, magnet: MagnetTemplate) -> None:
@@ -70,7 +97,7 @@ def write_new_study(path: Path, magnet: MagnetTemplate) -> None:
     if path.exists():
         raise OutputError(must_be("path", "new study", "a file that does not exist yet",
                                   f"'{path}'", "Choose another name, or remove it."))
-    text = new_study(path.stem, magnet)
+    text = new_study(path.stem, magnet, path.parent)
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 
@@ -10,16 +11,24 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import held_out_readings, observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.study.grades import grade
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
+from tests.conftest import ROOT
 
 MAGNETS = [
     MagnetTemplate(shape=shape, iron_ring=iron, ring_length_m=length, rings=3 if length else 1,
                   multipole_order=order)
            for shape, iron, length, order in itertools.product(
                ("sector", "trapezoid", "cuboid"), (False, True), (None, 0.03), (1, 2))]
+MAGNETS += [MagnetTemplate(material="N42"),
+            MagnetTemplate(inner_radii_m=(0.05, 0.06), ring_length_m=0.03, shape="trapezoid"),
+            MagnetTemplate(free_blocks=str(ROOT / "studies/mri4all/blocks.csv")),
+            MagnetTemplate(free_blocks=str(ROOT / "studies/hybrid-quadrupole/blocks.csv"),
+                           multipole_order=2)]
 
 
 @pytest.mark.parametrize("magnet", MAGNETS, ids=str)
@@ -31,8 +40,8 @@ def test_every_option_can_be_used_as_it_stands(magnet):
     if magnet.shape == "cuboid":
         assert "side_gap_m" not in whole
     assert parse_new_study(whole) != parse_new_study(text)
-    spoiled = whole.replace("remanence_T", "remanance_T")  # the comparison would see it
-    with pytest.raises(StudyError, match="remanance_T"):
+    spoiled = whole.replace("direction_sd_deg", "direktion_sd_deg")  # the comparison would see it
+    with pytest.raises(StudyError, match="direktion_sd_deg"):
         parse_new_study(spoiled)
 
 
@@ -47,6 +56,30 @@ def test_command_writes_what_was_asked_for(tmp_path):
     assert study.array.rings == 4
     assert study.array.outer_radius_m == pytest.approx(0.036)
     assert study.iron_ring is not None
+
+
+def test_command_writes_rings_of_their_own_and_free_blocks(tmp_path, capsys):
+    stepped, free = tmp_path / "stepped.toml", tmp_path / "free.toml"
+    assert main(["new", str(stepped), "--inner-radii-m", "0.02,0.03", "--ring-length-m", "0.05",
+                 "--material", "N42"]) == 0
+    magnet = build_magnet(read_study(stepped))
+    assert [section[1][0] for section in magnet.ring_sections] == pytest.approx([0.02, 0.03])
+    assert magnet.blocks[0].remanence == pytest.approx(grade("N42").nominal_remanence)
+    table = ROOT / "studies/mri4all/blocks.csv"
+    assert main(["new", str(free), "--free-blocks", str(table)]) == 0
+    magnet = build_magnet(read_study(free))
+    assert len(magnet.blocks) == 990
+    points = points_from(read_study(free).observation.positions)
+    assert not magnet.contains(points).any()
+    assert np.abs(points[:, 2]).max() > magnet.half_length
+    capsys.readouterr()
+    for wrong in (["--material", "N99"], ["--free-blocks", "absent.csv"],
+                  ["--inner-radii-m", "0.02,0.03", "--free-blocks", str(table)],
+                  ["--inner-radii-m", "0.02,x"]):
+        with contextlib.suppress(SystemExit):  # of argparse
+            assert main(["new", str(tmp_path / "wrong.toml"), *wrong]) == 3
+        assert capsys.readouterr().err
+        assert not (tmp_path / "wrong.toml").exists()
 
 
 def test_nothing_is_overwritten_and_nonsense_is_refused(tmp_path, capsys):
