@@ -112,7 +112,7 @@ def solve_separate(
     GetDPError
         If the iron cannot be solved.
     """
-    blocks = _present(magnet.blocks)
+    blocks = present_blocks(magnet.blocks)
     systems = _systems(blocks, magnet.study.mesh.cells_per_side)[:2 if estimate else 1]
     if not magnet.iron:
         return SeparateReaction(tuple(system.solve() for system in systems), None)
@@ -151,7 +151,7 @@ def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
     bodies = iron_rectangles(magnet)
     most = None if magnet.is_nonlinear else highest_mode_at(bodies, points)
     resolution = Resolution(modes=None if most is None else min(most, MOST_MODES))
-    return solve_iron(bodies, _field_in_vacuum(_present(magnet.blocks)), session, magnet.name,
+    return solve_iron(bodies, _field_in_vacuum(present_blocks(magnet.blocks)), session, magnet.name,
                       resolution, estimate=False).field(points)
 
 
@@ -251,7 +251,7 @@ def _systems(blocks: Sequence[MagnetBlock], cells_per_side: int | None) -> tuple
     return refinement(blocks, cells_per_side)
 
 
-def _present(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
+def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
     """Return the blocks that are there: a missing one has neither remanence nor permeability."""
     return tuple(block for block in blocks if block.remanence
                  or block.recoil_permeability != 1.0 or not block.isotropic)

@@ -182,3 +182,23 @@ def test_a_large_matrix_stays_on_the_disk():
     assert many.disk_GiB > many_matrix > many.own_memory_GiB
     # the square root of the information, which is what grows
     assert many.own_memory_GiB > 8 * 6000**2 / resource_estimate.GIB
+
+
+def test_separate_blocks_are_estimated_by_their_cells(short_dipole):
+    """Half the size makes some eight times as many cells; iron and columns take more, vacuum nothing."""
+    def of(estimate, permeability=1.05, cells=2, **changes):
+        study = short_dipole(array__recoil_permeability=permeability, array__outer_radius_m=0.14,
+                             mesh__cells_per_side=cells,
+                             array__block={"shape": "cuboid", "width_m": 0.03}, **changes)
+        return estimate(build_magnet(study), observation_of(study), 1)
+
+    solve = of(resource_estimate.estimate_solve)
+    vacuum = of(resource_estimate.estimate_solve, 1.0)
+    assert solve.route == "moments"
+    own = solve.own_memory_GiB - vacuum.own_memory_GiB
+    fine = of(resource_estimate.estimate_solve, cells=4).own_memory_GiB - vacuum.own_memory_GiB
+    assert 6 < fine / own < 9  # of cuboids whose sides are no multiples of each other
+    infer = of(resource_estimate.estimate_infer)
+    assert infer.own_memory_GiB > solve.own_memory_GiB
+    iron = of(resource_estimate.estimate_solve, iron_ring=STEEL)
+    assert iron.own_memory_GiB > solve.own_memory_GiB + 1
