@@ -185,7 +185,7 @@ def test_a_large_matrix_stays_on_the_disk():
 
 
 def test_separate_blocks_are_estimated_by_their_cells(short_dipole):
-    """Half the size makes some eight times as many cells; iron and columns take more, vacuum nothing."""
+    """Half the size makes some eight times as many cells; iron and columns take more."""
     def of(estimate, permeability=1.05, cells=2, **changes):
         study = short_dipole(array__recoil_permeability=permeability, array__outer_radius_m=0.14,
                              mesh__cells_per_side=cells,
