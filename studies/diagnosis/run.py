@@ -32,7 +32,7 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.search import NominalSolver, memoized_solver
+from halbach_fe.diagnosis.search import NominalSolver
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT
@@ -306,7 +306,7 @@ def run_one(
             folder = TemporaryDirectory(prefix="halbach-fe-")
             session = Session(find_getdp(getdp), Path(folder.name), time_limit_s=time_limit_s,
                                 cache=cache, processes=processes)
-            _known[threading.get_ident()] = folder, session, memoized_solver(session)
+            _known[threading.get_ident()] = folder, session, NominalSolver(session)
         return run_case(study, case, *_known[threading.get_ident()][1:])
     except HalbachError as error:
         return {"failure": str(error)}
