@@ -32,8 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--field-unit", choices=FIELDS, default="", help="unit of B")
     parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
-                        help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, or "
-                        "- for a column that is ignored; a unit may follow, as in Bx[mT]")
+                        help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
+                        "dx, dy, dz (moves of a stage from reading to reading), t (time), or - "
+                        "for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
     parser.add_argument("--component", choices=COMPONENTS, default="",
                         help="component of the field in a column B")
     parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",

@@ -103,6 +103,24 @@ def test_declared_columns_and_units(tmp_path):
     assert same(left, field=np.where([True, False, False], FIELD, np.nan))
 
 
+STAGE = ["dx[mm]", "dy[mm]", "dz[mm]", "Bx[T]", "By[T]", "Bz[T]", "t[min]"]
+
+
+def test_moves_and_times_of_a_stage(tmp_path):
+    """Moves from reading to reading, times with separated thousands, remarks in brackets."""
+    moves = np.diff(POINTS, axis=0, prepend=0) * 1e3
+    body = "".join(f'{",".join(map(str, (*move, *b)))},"{1000 + n:,}.5"\n'
+                   for n, (move, b) in enumerate(zip(moves, FIELD, strict=True)))
+    header = "dx,dy,dz (stage),Hall 1,Hall 2,Hall 3,clock\n"
+    found = imported(tmp_path, header + body, columns=tuple(STAGE))
+    assert same(found)
+    assert found.data["time_s"].values == pytest.approx(60 * (1000.5 + np.arange(len(POINTS))))
+    assert not same(found, np.cumsum(POINTS, axis=0))  # positions that were taken for moves
+    # nothing is guessed: dx of a header may be anything
+    assert "(--columns" in said(tmp_path, header + body, length_unit="mm", field_unit="T")
+    assert "t[s]" in said(tmp_path, header + body, columns=(*STAGE[:-1], "t"))
+
+
 @pytest.mark.parametrize(("length", "field", "metre", "tesla"), [
     ("m", "T", 1, 1), ("mm", "mT", 1000, 1000), ("cm", "G", 100, 1e4), ("um", "uT", 1e6, 1e6),
     ("inch", "kG", 1 / 0.0254, 10)])

@@ -11,6 +11,10 @@ POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
 KNOWN = (*POSITIONS, *FIELDS, "B")
 """Quantities of columns; B is a single component, or the magnitude beside its components."""
+MOVES = ("dx", "dy", "dz")
+STATED = (*MOVES, "t")
+"""Quantities that only the user can state: moves of a stage from reading to reading, and the time.
+"""
 
 ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
@@ -31,7 +35,7 @@ class ColumnName:
     text : str
         Name as the file spells it.
     quantity : str
-        One of `KNOWN`; empty if the name is not recognized.
+        One of `KNOWN` and `STATED`; empty if the name is not recognized.
     unit : str
         Text of the unit as the file spells it; may be empty.
     """
@@ -41,14 +45,15 @@ class ColumnName:
     unit: str = ""
 
 
-def parse(text: str) -> ColumnName:
-    """Return quantity and unit of the name of a column."""
+def parse(text: str, stated: bool = False) -> ColumnName:
+    """Return quantity and unit of the name of a column, which the user may have ``stated``."""
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
     base, unit = _split(text)
     key = re.sub(r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
-    return ColumnName(text, ALIASES.get(key, ""), unit.strip())
+    more = key if stated and key in STATED else ""
+    return ColumnName(text, ALIASES.get(key, more), unit.strip())
 
 
 def _split(text: str) -> tuple[str, str]:

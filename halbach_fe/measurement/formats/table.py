@@ -22,11 +22,13 @@ from halbach_fe.measurement.formats.text import Line, comma_hint
 from halbach_fe.study.types import MAX_LENGTH_M
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
-           "field": "--field-unit T, mT, uT, G or kG", "angle": "--angle-unit deg or rad"}
+           "field": "--field-unit T, mT, uT, G or kG", "angle": "--angle-unit deg or rad",
+           "time": "--columns ...t[s], t[min] or t[h]"}
 MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
-KINDS = {"length": units.LENGTHS, "field": units.FIELDS, "angle": units.ANGLES}
+KINDS = {"length": units.LENGTHS, "field": units.FIELDS, "angle": units.ANGLES,
+         "time": units.TIMES}
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,15 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
           for name, column in used.items()}
     count = len(table.values)
     si |= {name: np.full(count, value) for name, value in declared.at.items()}
+    # a stage that reports its moves starts at the file's origin
+    si |= {name[1]: np.cumsum(si[name]) for name in names.MOVES if name in si}
     points, flux_density = _cartesian(si, table.where)
     if declared.origin_m is not None:
         points = points + declared.origin_m
     blank = np.isnan(flux_density).all(axis=1)
     data = _checked(points[~blank], flux_density[~blank], table.where)
+    if "t" in si:
+        data["time_s"] = ("point", si["t"][~blank], {"units": "s"})
     if table.comments:
         data.attrs["comments"] = table.comments
     lengths = {unit for name, unit in unit_of.items() if unit in units.LENGTHS}
@@ -139,20 +145,21 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
     for text, column in zip(declared.columns, table.columns, strict=True):
-        stated = ColumnName("") if text == "-" else names.parse(text)
+        stated = ColumnName("") if text == "-" else names.parse(text, stated=True)
         if text != "-" and not stated.quantity:
             raise MeasurementError(must_be(
-                "--columns", table.where, f"made of {', '.join(names.KNOWN)} and -", f"'{text}'"))
+                "--columns", table.where,
+                f"made of {', '.join((*names.KNOWN, *names.STATED))} and -", f"'{text}'"))
         if text != "-" and column.quantity not in ("", stated.quantity) and not (
                 column.quantity == "B" and stated.quantity in names.FIELDS):
             raise _contradiction(table, f"column '{column.text}'", column.quantity,
                                  f"--columns {stated.quantity}")
-        if column.unit and stated.unit and (
-                units.unit_symbol(column.unit) != units.unit_symbol(stated.unit)):
+        in_file = units.unit_symbol(column.unit)  # brackets may also hold a remark: Z (stage)
+        if in_file and stated.unit and in_file != units.unit_symbol(stated.unit):
             raise _contradiction(table, f"unit of column '{column.text}'", column.unit,
                                  f"--columns {text}")
         found.append(ColumnName(column.text or stated.text, stated.quantity,
-                                column.unit or stated.unit))
+                                stated.unit if stated.unit and not in_file else column.unit))
     return tuple(found)
 
 
@@ -199,7 +206,8 @@ def _missing(
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
     missing = []
     wanted = ("r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
-    absent = [name for name in wanted if name not in used and name not in declared.at]
+    absent = [name for name in wanted if name not in used and name not in declared.at
+              and f"d{name}" not in used]
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
@@ -225,20 +233,20 @@ def _units(
     kind: str, used: dict[str, int], table: ForeignTable, declared: DeclaredFormat,
     missing: list[str]
 ) -> dict[str, str]:
-    """Return the unit of each column of a kind: length, field or angle.
+    """Return the unit of each column of a kind, one of `KINDS`.
 
     Columns without a unit are added to the descriptions in ``missing``.
     """
     found, unknown = {}, []
     option = {"length": declared.length_unit, "field": declared.field_unit,
-              "angle": declared.angle_unit}[kind]
-    common = {"length": table.length_unit, "field": table.field_unit, "angle": ""}[kind]
+              "angle": declared.angle_unit, "time": ""}[kind]
+    common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
     columns = _columns(table, declared)
     for name in (name for name in used if _kind(name) == kind):
         text = columns[used[name]].unit
         if units.states_no_unit(text):
             text = common
-        unit = units.unit_symbol(text)
+        unit = text if kind == "time" and text in units.TIMES else units.unit_symbol(text)
         if not units.states_no_unit(text) and unit not in KINDS[kind]:
             raise MeasurementError(must_be(
                 f"unit of {name}", table.where, f"one of {', '.join(KINDS[kind])}", f"'{text}'"))
@@ -254,8 +262,10 @@ def _units(
 
 
 def _kind(name: str) -> str:
-    """Return the kind of unit of a quantity: length, field or angle."""
-    return "angle" if name == "phi" else "length" if name in names.POSITIONS else "field"
+    """Return the kind of unit of a quantity, one of `KINDS`."""
+    if name in ("phi", "t"):
+        return "angle" if name == "phi" else "time"
+    return "length" if name in (*names.POSITIONS, *names.MOVES) else "field"
 
 
 def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:

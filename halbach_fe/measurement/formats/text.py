@@ -16,6 +16,8 @@ from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 COMMENTS = "#%!"
 """Characters that begin a comment."""
+THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3}){1,9}\.\d{1,30}", re.ASCII)
+"""A number whose thousands are separated by commas; the point says that they are no decimals."""
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
 
@@ -87,6 +89,8 @@ def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
     """Return the number in a cell, NaN if the cell is empty or ``nan``; else raise ValueError."""
     if decimal_comma:
         cell = cell.replace(",", ".")
+    elif THOUSANDS.fullmatch(cell):
+        cell = cell.replace(",", "")
     if not cell or cell.lower() == "nan":
         return np.nan
     return number_in(cell)

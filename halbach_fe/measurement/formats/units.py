@@ -18,6 +18,7 @@ LENGTHS = {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000),
 FIELDS = {"T": Fraction(1), "mT": Fraction(1, 1000), "uT": Fraction(1, 1_000_000),
           "G": Fraction(1, 10_000), "kG": Fraction(1, 10)}
 ANGLES = ("deg", "rad")
+TIMES = {"s": Fraction(1), "min": Fraction(60), "h": Fraction(3600)}
 
 # Spellings in lower case; upper and lower case are equivalent. T and G are in EXACT instead, since
 # mT is not MT, and t and g are tonne and gram.
@@ -52,11 +53,11 @@ def states_no_unit(text: str) -> bool:
 
 
 def in_si(values: Floats, unit: str) -> Floats:
-    """Convert values in a unit to m, T or rad.
+    """Convert values in a unit to m, T, rad or s.
 
     If the factor is a power of ten, the result is rounded only once.
     """
     if unit in ANGLES:
         return np.deg2rad(values) if unit == "deg" else values
-    factor = LENGTHS[unit] if unit in LENGTHS else FIELDS[unit]
+    factor = (LENGTHS | FIELDS | TIMES)[unit]
     return np.asarray(values * float(factor.numerator) / float(factor.denominator))
