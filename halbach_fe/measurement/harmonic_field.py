@@ -1,0 +1,183 @@
+"""A magnetic field in free space, expanded in charges around the region where it is known.
+
+Where there are no currents and no magnets, div B = 0 and curl B = 0, so that ``B = -grad psi`` with
+a harmonic psi. Fictitious magnetic charges on a box around the region make such fields only, and
+with enough of them any such field (C. Runge's theorem for harmonic functions; the method of
+fundamental solutions, R. Mathon and R. L. Johnston, SIAM J. Numer. Anal. 14 (1977) 638). Their
+amplitudes have a normal prior of mean 0, whose width the evidence of the readings chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+
+MOST_CHARGES = 1500
+"""Largest number of charges, which limits memory and time."""
+
+UNIFORM = 1e3
+"""Prior width of the uniform field in units of the charges' field: it is as good as free."""
+
+
+@dataclass(frozen=True)
+class Charges:
+    """Charges around a region, and a uniform field.
+
+    Attributes
+    ----------
+    places : ndarray, shape (k, 3), in m
+    scale : float, in m^2
+        A charge of amplitude 1 has the field ``scale R / |R|^3`` at the distance R, which has an
+        rms of some 1/sqrt(k) in the region.
+    """
+
+    places: Floats
+    scale: float
+
+    @classmethod
+    def around(cls, points: Floats, gap: float) -> Charges:
+        """Place charges on a box that is ``gap`` in m larger than points (n, 3) in m on all sides.
+
+        Their distance from each other is that gap, or larger if there were too many.
+        """
+        low, high = points.min(axis=0) - gap, points.max(axis=0) + gap
+        sides = high - low
+        area = 2 * float(np.sum(sides * np.roll(sides, 1)))
+        step = max(gap, np.sqrt(area / MOST_CHARGES))
+        found = []
+        for axis in range(3):
+            first, second = (other for other in range(3) if other != axis)
+            grids = np.meshgrid(*(
+                np.linspace(low[other], high[other], 1 + max(1, round(sides[other] / step)))
+                for other in (first, second)), indexing="ij")
+            face = np.empty((grids[0].size, 3))
+            face[:, first], face[:, second] = grids[0].ravel(), grids[1].ravel()
+            for value in (low[axis], high[axis]):
+                face[:, axis] = value
+                found.append(face.copy())
+        places = np.unique(np.vstack(found).round(9), axis=0)
+        some = points[::max(1, len(points) // 200)]
+        field = _fields(some, places)
+        return cls(places, float(1 / np.sqrt(np.mean(field**2) * len(places))))
+
+    def __len__(self) -> int:
+        """Return the number of amplitudes: of the charges, and of three uniform fields."""
+        return len(self.places) + 3
+
+    def fields(self, points: Floats) -> Floats:
+        """Return B (n, 3, amplitudes) at points (n, 3) in m per amplitude."""
+        result = np.empty((len(points), 3, len(self)))
+        result[..., :-3] = _fields(points, self.places) * self.scale
+        result[..., -3:] = UNIFORM * np.eye(3)
+        return result
+
+    def fields_along(self, points: Floats, directions: Floats) -> Floats:
+        """Return B . u (n, amplitudes) per amplitude at points (n, 3) in m, for u (n, 3)."""
+        result = np.empty((len(points), len(self)))
+        for part in _parts(len(points), len(self.places)):
+            away = points[part, None] - self.places
+            along = np.einsum("nki,ni->nk", away, directions[part])
+            result[part, :-3] = self.scale * along / np.einsum("nki,nki->nk", away, away)**1.5
+        result[:, -3:] = UNIFORM * directions
+        return result
+
+    def field(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return B (n, 3) in T at points (n, 3) in m for amplitudes (k,) in T."""
+        result = np.empty((len(points), 3))
+        for part in _parts(len(points), len(self.places)):
+            away = points[part, None] - self.places
+            weights = amplitudes[:-3] / np.einsum("nki,nki->nk", away, away)**1.5
+            result[part] = self.scale * np.einsum("nk,nki->ni", weights, away)
+        return result + UNIFORM * amplitudes[-3:]
+
+    def gradient(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return the gradient (n, 3, 3) in 1/m of the field of amplitudes (k,).
+
+        ``[i, c, j]`` is the derivative of component c along direction j.
+        """
+        result = np.empty((len(points), 3, 3))
+        for part in _parts(len(points), len(self.places)):
+            away = points[part, None] - self.places
+            square = np.einsum("nki,nki->nk", away, away)
+            weights = self.scale * amplitudes[:-3] / square**1.5
+            result[part] = np.sum(weights, axis=1)[:, None, None] * np.eye(3) - 3 * np.matmul(
+                (away * (weights / square)[..., None]).transpose(0, 2, 1), away)
+        return result
+
+
+def _parts(points: int, charges: int) -> list[slice]:
+    """Return slices of points whose distances to all charges fit into a processor's cache."""
+    step = max(1, 100_000 // charges)
+    return [slice(first, first + step) for first in range(0, points, step)]
+
+
+def _fields(points: Floats, places: Floats) -> Floats:
+    """Return R/|R|^3 (n, 3, k) in 1/m^2 for distances R from places (k, 3) to points (n, 3)."""
+    away = points[:, :, None] - places.T
+    return np.asarray(away / np.linalg.norm(away, axis=1)[:, None] ** 3)
+
+
+@dataclass(frozen=True)
+class HarmonicFit:
+    """Amplitudes of charges that fit readings, without any instrument.
+
+    Attributes
+    ----------
+    amplitudes : ndarray, shape (k,), in T
+    penalty : float
+        Ratio of the variances of the noise and of an amplitude.
+    sigma : float, in T
+        Standard deviation of the readings from the fit.
+    log_evidence : float
+        Log probability of the readings, up to a constant, at the most probable penalty and sigma.
+    used : float
+        Number of amplitudes that the readings determine.
+    """
+
+    amplitudes: Floats
+    penalty: float
+    sigma: float
+    log_evidence: float
+    used: float
+
+
+PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
+"""Penalties among which the evidence chooses, in units of the mean information per amplitude."""
+
+
+def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> list[HarmonicFit]:
+    """Fit each of some fields B (n, 3) in T at points (n, 3) in m by charges.
+
+    The width of their prior and the noise are those of largest evidence (D. J. C. MacKay, Neural
+    Comput. 4 (1992) 415).
+    """
+    design = charges.fields(points).reshape(-1, len(charges))
+    values, vectors = np.linalg.eigh(design.T @ design)
+    values = np.maximum(values, 0.0)
+    return [_most_probable(values, vectors, vectors.T @ (design.T @ field.ravel()), field.ravel())
+            for field in fields]
+
+
+def _most_probable(
+    values: Floats, vectors: Floats, projected: Floats, readings: Floats
+) -> HarmonicFit:
+    """Return the fit of largest evidence.
+
+    ``values`` (k,) and ``vectors`` (k, k) belong to the information, and ``projected`` (k,) are the
+    products of the vectors with it.
+    """
+    best: HarmonicFit | None = None
+    for penalty in PENALTIES * values.sum() / len(values):
+        rest = float(readings @ readings - np.sum(projected**2 / (values + penalty)))
+        sigma = np.sqrt(max(rest, 1e-30) / len(readings))
+        evidence = (-len(readings) * np.log(sigma)
+                    - float(np.log1p(values / penalty).sum()) / 2)
+        if best is None or evidence > best.log_evidence:
+            best = HarmonicFit(vectors @ (projected / (values + penalty)), float(penalty),
+                               float(sigma), evidence, float(np.sum(values / (values + penalty))))
+    assert best is not None  # there are penalties
+    return best

@@ -1,0 +1,663 @@
+"""Maxwell's check of a field map: div B = 0, curl B = 0, and the instrument that this takes.
+
+The map is fitted by a field of sources outside the mapped region (`halbach_fe.measurement.
+harmonic_field`), of which no magnet is assumed. An instrument that exchanges axes, reverses signs,
+has its three sensors in three places or turns during the scan makes a map that no such field has;
+its parameters are fitted together with the field. What remains is the model-free floor: no model of
+a magnet can explain the map any better.
+
+Some errors no map can show by itself: a common factor or sign of all components, a shift of the
+whole map, a uniform offset, and a position axis that counts backwards (the map of a mirrored
+magnet is as good as that of the magnet).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.optimize import nnls
+from scipy.spatial import KDTree
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields
+from halbach_fe.study.types import COMPONENTS
+
+FEWEST_POINTS = 30
+"""Smallest number of complete readings that are checked."""
+
+MOST_POINTS = 3000
+"""Number of points that are fitted at most; of larger maps, whole scan lines are left out."""
+
+ORIENTATION_POINTS = 600
+"""Number of points by which orientations are compared."""
+
+GAPS = (1.0, 1.5, 2.5, 4.0)
+"""Distances of the charges from the region that are tried, in units of the points' spacing."""
+
+ALIKE = 30.0
+"""Orientations whose log probabilities differ by less cannot be told apart. Errors that the
+instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
+
+WORTH_TRYING = 3.0
+"""Orientations are tried with an instrument of their own if their rms residuals without one differ
+by less than this factor."""
+
+HELD_OUT_EVERY = 5
+"""Every so many scan lines one is held out, to measure the floor."""
+
+ITERATIONS, FEW_ITERATIONS = 12, 6
+"""Largest number of steps of the fit of field and instrument, and while orientations are tried."""
+
+SPIKE = 8.0
+"""A reading is a spike if its residual is larger than this multiple of the standard deviation of
+the residuals around it and of all, both from their medians."""
+
+HALVINGS = 8
+"""Number of times that a step is halved until it improves the fit."""
+
+AT_REST = 1.0
+"""Decrease of chi-squared below which the fit is at rest, of thousands of readings."""
+
+NEIGHBOURS = 26
+"""Number of neighbours of a reading, as many as a point of a grid has."""
+
+DETERMINED = 0.5
+"""A parameter is determined if its standard deviation is below this part of its prior one."""
+
+SIGNIFICANT = 4.0
+"""Standard deviations from which a parameter is reported as found."""
+
+ENOUGH = 0.2
+"""Smallest share of readings beyond those that determine the field. With fewer, a field obeys any
+map."""
+
+WINDOWS = 6
+"""Number of parts along the longest axis for which the residual is given."""
+
+
+@dataclass(frozen=True)
+class InstrumentTerm:
+    """A parameter of the instrument as the map alone shows it.
+
+    Attributes
+    ----------
+    name, unit : str
+        Its unit is mm, mrad, % or mT.
+    value, sd : float
+        Estimate and standard deviation, in that unit.
+    determined : bool
+        Whether the map tells more about it than its prior.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    determined: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether it differs from 0 with certainty."""
+        return self.determined and abs(self.value) > SIGNIFICANT * self.sd
+
+
+@dataclass(frozen=True)
+class MapCheck:
+    """What a map shows by itself.
+
+    Attributes
+    ----------
+    readings, points : int
+        Number of components that were measured, and of positions.
+    spacing_m : float
+        Median distance of neighbouring points.
+    size_T : float
+        Largest |B|.
+    orientation : tuple of str
+        The component that each column of the map shows, with its sign, such as ``-z``; a common
+        sign of all three is unknown.
+    alike : tuple of tuple of str
+        Other orientations that fit nearly as well.
+    rms_as_given_T, rms_T : ndarray, shape (3,)
+        Rms residual of each component without and with orientation and instrument.
+    floor_T : ndarray, shape (3,)
+        Rms difference of held-out scan lines from the field of all others.
+    terms : tuple of InstrumentTerm
+    broken : dict of str to list of int
+        Numbers of the rows that are zero, repeated or spikes, counted from 1.
+    windows : tuple
+        Axis, and for each part along it its limits in m and the rms residual in T of each
+        component.
+    noise_T, position_noise_m : float
+        Noise of the readings, and of their positions: the part of the residual that grows with the
+        field's gradient.
+    structure : float
+        Correlation of the residuals of neighbours: 0 for noise, near 1 if a smooth part remains.
+    redundancy : float
+        Share of the readings that are not used up by the field.
+    excluded : ndarray of bool, shape (n,)
+        Rows that were not fitted.
+    residual_T : ndarray, shape (n, 3)
+        Residual in the given columns; NaN where nothing was measured.
+    """
+
+    readings: int
+    points: int
+    spacing_m: float
+    size_T: float
+    orientation: tuple[str, str, str]
+    alike: tuple[tuple[str, str, str], ...]
+    rms_as_given_T: Floats
+    rms_T: Floats
+    floor_T: Floats
+    terms: tuple[InstrumentTerm, ...]
+    broken: dict[str, list[int]]
+    windows: tuple[str, tuple[tuple[float, float, tuple[float, float, float]], ...]]
+    noise_T: float
+    position_noise_m: float
+    structure: float
+    redundancy: float
+    excluded: NDArray[np.bool_]
+    residual_T: Floats
+
+    @property
+    def suffices(self) -> bool:
+        """Whether the map has enough readings to tell."""
+        return self.redundancy >= ENOUGH
+
+    @property
+    def floor_rms_T(self) -> float:  # noqa: N802 - a unit
+        """The model-free floor: rms over the components of held-out lines."""
+        return float(np.sqrt(np.mean(self.floor_T**2)))
+
+    @property
+    def is_reoriented(self) -> bool:
+        """Whether the components have other signs or axes than the map says."""
+        return self.orientation != COMPONENTS
+
+    def plain(self) -> dict[str, object]:
+        """Return the results as plain data for JSON, without the arrays over rows."""
+        left_out = ("excluded", "residual_T")
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in self.__dict__.items()
+                if name not in left_out and name != "terms"} | {
+            "terms": [asdict(term) | {"found": term.found} for term in self.terms],
+            "floor_rms_T": self.floor_rms_T, "suffices": self.suffices}
+
+
+def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> MapCheck:
+    """Check whether a field map obeys Maxwell's equations, without a model of the magnet.
+
+    Parameters
+    ----------
+    data : Dataset
+        The map, see `halbach_fe.read_map`.
+    say : callable, optional
+        Called with a description of each step before it starts.
+
+    Returns
+    -------
+    MapCheck
+
+    Raises
+    ------
+    MeasurementError
+        If fewer than `FEWEST_POINTS` points have all three components.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.check_map(hf.read_map("map.csv")).orientation
+    ('x', 'y', 'z')
+    """
+    points, field = points_of(data), np.asarray(data["B_T"].values, float)
+    complete = np.isfinite(field).all(axis=1)
+    if complete.sum() < FEWEST_POINTS:
+        raise MeasurementError(must_be(
+            "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
+            "components", f"{int(complete.sum())}",
+            "A line of one component obeys Maxwell's equations whatever it is."))
+    broken = _broken_rows(points, field)
+    usable = complete.copy()
+    for rows in broken.values():
+        usable[np.array(rows, int) - 1] = False
+    lines = scan_lines(points)
+    chosen = usable & _some_lines(lines, usable)
+    time = _time(data, len(points))
+    say("comparing the orientations of the probe")
+    places, readings = points[chosen], field[chosen]
+    spacing = _spacing(places)
+    directions = _directions(points, lines)
+    matrix, alike = _orientation(places, readings, time[chosen], directions[chosen], spacing)
+    say("fitting the field and the instrument")
+    gap, first_fit = _gap(places, readings @ matrix.T, spacing)
+    charges = Charges.around(places, gap)
+    turned = field @ matrix.T
+    model = _Model(charges, points, turned, time, directions)
+    held_out = (lines % HELD_OUT_EVERY == HELD_OUT_EVERY // 2) & chosen
+    train = _fitted(model, chosen & ~held_out, first_fit)
+    spikes = _spikes(points, turned - model.readings(train), usable)
+    if spikes.any():
+        broken["spike"] = (1 + np.flatnonzero(spikes)).tolist()
+        usable, chosen = usable & ~spikes, chosen & ~spikes
+        held_out &= ~spikes
+        train = _fitted(model, chosen & ~held_out, first_fit, train)
+    floor = turned[held_out] - model.readings(train, held_out)
+    say("fitting all scan lines")
+    whole = _fitted(model, chosen, first_fit, train)
+    residual = turned - model.readings(whole)
+    noise, displaced = _noise(charges.gradient(points[chosen], whole.amplitudes), residual[chosen])
+    (as_given,) = fit_fields(charges, places, [readings])
+    given = readings - charges.fields(places) @ as_given.amplitudes
+    return MapCheck(
+        readings=int(np.isfinite(field).sum()), points=len(points), spacing_m=spacing,
+        size_T=float(np.linalg.norm(field[usable], axis=1).max()),
+        orientation=_named(matrix), alike=alike,
+        rms_as_given_T=_rms(given), rms_T=_rms(residual[chosen] @ np.abs(matrix)),
+        floor_T=_rms(floor @ np.abs(matrix)), terms=_terms(whole), broken=broken,
+        windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
+        noise_T=noise, position_noise_m=displaced,
+        structure=_structure(points[chosen], residual[chosen]),
+        redundancy=1 - whole.used / (3 * int(chosen.sum())), excluded=~usable,
+        residual_T=residual @ matrix)
+
+
+def _rms(residual: Floats) -> Floats:
+    """Return the rms (3,) of residuals (n, 3)."""
+    return np.asarray(np.sqrt(np.mean(residual**2, axis=0)))
+
+
+def _time(data: xr.Dataset, count: int) -> Floats:
+    """Return the times (n,) of the readings, from -1 to 1; by their order if there are none."""
+    time = np.asarray(data["time_s"].values, float) if "time_s" in data else np.arange(count) * 1.0
+    time = np.where(np.isfinite(time), time, np.nanmean(time) if np.isfinite(time).any() else 0.0)
+    span = float(np.ptp(time))
+    return np.asarray((time - time.min()) / span * 2 - 1 if span else np.zeros(count))
+
+
+def _spacing(points: Floats) -> float:
+    """Return the median distance in m of points (n, 3) from their nearest neighbours."""
+    distance = KDTree(points).query(points, 2)[0][:, 1]
+    return float(np.median(distance[distance > 0])) if (distance > 0).any() else 1e-3
+
+
+def scan_lines(points: Floats) -> Ints:
+    """Return the number of the scan line (n,) of every point (n, 3).
+
+    Scan lines run along the axis along which there are fewest of them. If they are no lines, every
+    point is one.
+    """
+    spacing = _spacing(points)
+    best = np.arange(len(points))
+    for axis in range(3):
+        across = np.delete(points, axis, axis=1)
+        number = np.unique(np.round(across / (spacing / 4)).astype(int), axis=0,
+                           return_inverse=True)[1].ravel()
+        if number.max() < best.max():
+            best = number
+    return best if len(points) >= 3 * (best.max() + 1) else np.arange(len(points))
+
+
+def _some_lines(lines: Ints, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether a row is in one of the scan lines that are fitted, see `MOST_POINTS`."""
+    every = max(1, round(int(usable.sum()) / MOST_POINTS))
+    # a step that has no factor with HELD_OUT_EVERY, so that held-out lines remain
+    while every > 1 and every % HELD_OUT_EVERY == 0:
+        every += 1
+    return np.asarray(lines % every == 0)
+
+
+def _broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
+    """Return the rows that are zero, or repeat the row before them at another position."""
+    zero = (field == 0).all(axis=1)
+    repeated = np.zeros(len(field), bool)
+    repeated[1:] = (field[1:] == field[:-1]).all(axis=1) & (
+        points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
+    return {name: (1 + np.flatnonzero(rows)).tolist()
+            for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
+
+
+def _directions(points: Floats, lines: Ints) -> Floats:
+    """Return the direction (n, 3) in which the stage moved to every point, 0 at jumps."""
+    step = np.diff(points, axis=0, prepend=points[:1])
+    size = np.linalg.norm(step, axis=1)
+    same = np.diff(lines, prepend=lines[:1]) == 0
+    return np.asarray(np.where((same & (size > 0))[:, None],
+                               step / np.maximum(size, 1e-12)[:, None], 0.0))
+
+
+# --- orientation --------------------------------------------------------------------------------
+
+
+def _orientations() -> list[Floats]:
+    """Return the matrices that turn columns into components, with the sign of one column fixed."""
+    found = [np.eye(3)[list(order)] * np.array(signs) for order in permutations(range(3))
+             for signs in product((1, -1), repeat=3) if signs[0] == 1]
+    return sorted(found, key=lambda matrix: -float(np.trace(matrix)))  # as given comes first
+
+
+def _named(matrix: Floats) -> tuple[str, str, str]:
+    """Return the component that each column shows."""
+    names = [("-" if column.sum() < 0 else "") + COMPONENTS[int(np.abs(column).argmax())]
+             for column in matrix.T]
+    return names[0], names[1], names[2]
+
+
+def _orientation(
+    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float
+) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
+    """Return the matrix of the orientation, and others that fit as well.
+
+    If orientations fit about equally well with a perfect instrument, each gets its own instrument.
+    The axes are taken as they are given if nothing speaks against them.
+    """
+    some = np.linspace(0, len(points) - 1, min(len(points), ORIENTATION_POINTS)).astype(int)
+    charges = Charges.around(points[some], GAPS[-2] * spacing)
+    matrices = _orientations()
+    fits = fit_fields(charges, points[some], [field[some] @ matrix.T for matrix in matrices])
+    sigma = np.array([fit.sigma for fit in fits])
+    left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min())
+    if len(left) == 1:
+        return matrices[left[0]], ()
+    every, against = np.ones(len(some), bool), {}
+    for number in left.tolist():
+        model = _Model(charges, points[some], field[some] @ matrices[number].T, time[some],
+                       directions[some])
+        fitted = _fitted(model, every, fits[number], iterations=FEW_ITERATIONS)
+        against[number] = float(3 * len(some) * np.log(fitted.sigma)
+                                + fitted.instrument @ fitted.instrument / 2)
+    alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
+    best = 0 if 0 in alike else min(alike, key=lambda number: against[number])
+    return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
+
+
+def _gap(points: Floats, field: Floats, spacing: float) -> tuple[float, HarmonicFit]:
+    """Return the distance in m of the charges from points (n, 3) in m, and the fit by them."""
+    fitted = {gap: fit_fields(Charges.around(points, gap * spacing), points, [field])[0]
+              for gap in GAPS}
+    gap = max(fitted, key=lambda each: fitted[each].log_evidence)
+    return gap * spacing, fitted[gap]
+
+
+# --- field and instrument -----------------------------------------------------------------------
+
+WAVES = 4
+"""Number of Legendre polynomials of the time by which the probe turns and its gain drifts."""
+
+SENSORS, MIXING = slice(0, 9), slice(9, 18)
+TURNS = slice(18, 18 + 3 * WAVES)
+OFFSETS = slice(TURNS.stop, TURNS.stop + 3)
+GAINS = slice(OFFSETS.stop, OFFSETS.stop + WAVES)
+LAG = GAINS.stop
+"""Places of the parameters: coordinates of the sensors, elements of the matrix between the axes of
+probe and stage, turns, changes of offsets, changes of the gain, and the lag."""
+
+PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 9, *(0.01,) * (3 * WAVES), *(2e-3,) * 3, *(0.01,) * WAVES,
+            1e-3)
+"""Prior standard deviations: in m, 1, rad, of the largest field, 1, and m."""
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A field together with an instrument.
+
+    Attributes
+    ----------
+    amplitudes : ndarray, shape (k,)
+    instrument : ndarray, shape (p,)
+        In units of `PRIOR_SD`.
+    covariance : ndarray, shape (p, p)
+    sigma : float, in T
+    used : float
+        Number of parameters that the readings determine.
+    prior_sd : ndarray, shape (p,)
+        Prior standard deviations in SI.
+    lag : bool
+        Whether the stage moved in more than one direction along the lines.
+    """
+
+    amplitudes: Floats
+    instrument: Floats
+    covariance: Floats
+    sigma: float
+    used: float
+    prior_sd: Floats
+    lag: bool
+
+    @property
+    def sensors_m(self) -> Floats:
+        """Places (3, 3) of the sensors relative to their mean."""
+        places = (self.instrument * self.prior_sd)[SENSORS].reshape(3, 3)
+        return np.asarray(places - places.mean(axis=0))
+
+    @property
+    def mixing(self) -> Floats:
+        """Matrix (3, 3) that is added to 1: reading c is row c times B."""
+        return np.asarray((self.instrument * self.prior_sd)[MIXING].reshape(3, 3))
+
+
+class _Model:
+    """Readings of a three-axis probe in a harmonic field."""
+
+    def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
+                 directions: Floats) -> None:
+        self.charges, self.points, self.field = charges, points, field
+        self.time, self.directions = time, directions
+        self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
+        sd = np.array(PRIOR_SD)
+        sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
+        self.prior_sd = sd
+
+    def lag_shows(self, rows: NDArray[np.bool_]) -> bool:
+        """Tell whether the stage moved both ways, without which a lag is a shift of the map."""
+        return bool(np.ptp(self.directions[rows], axis=0).max() > 1.5)
+
+    def start(self, fit: HarmonicFit) -> _Fitted:
+        """Return the fit of a perfect instrument."""
+        count = len(PRIOR_SD)
+        return _Fitted(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
+                       self.prior_sd, False)
+
+    def offsets(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
+        """Return the change (n, 3) in T of the sensors' offsets."""
+        return np.asarray(self.time[rows, None] * (at.instrument * self.prior_sd)[OFFSETS])
+
+    def _sensor(
+        self, at: _Fitted, rows: NDArray[np.bool_], sensor: int
+    ) -> tuple[Floats, Floats]:
+        """Return the places (n, 3) in m of a sensor and the directions (n, 3) that it reads."""
+        value, waves, own = at.instrument * self.prior_sd, self.waves[rows], np.eye(3)[sensor]
+        turn, gain = waves @ value[TURNS].reshape(WAVES, 3), waves @ value[GAINS]
+        reads = own + at.mixing[sensor] + np.cross(own, turn) + gain[:, None] * own
+        return (self.points[rows] + at.sensors_m[sensor] - value[LAG] * self.directions[rows],
+                reads)
+
+    def by_amplitude(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
+        """Return the readings (n, 3, k) per amplitude."""
+        found = np.empty((int(rows.sum()), 3, len(self.charges)))
+        for sensor in range(3):
+            places, reads = self._sensor(at, rows, sensor)
+            found[:, sensor] = self.charges.fields_along(places, reads)
+        return found
+
+    def by_parameter(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
+        """Return the derivatives (n, 3, p) in T of the readings by the parameters / `PRIOR_SD`."""
+        found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
+        for sensor in range(3):
+            places, reads = self._sensor(at, rows, sensor)
+            field = self.charges.field(places, at.amplitudes)
+            gradient = np.einsum("nc,ncj->nj", reads,
+                                 self.charges.gradient(places, at.amplitudes))
+            for other in range(3):  # of the mean of the sensors, which stays where it is
+                found[:, sensor, 3 * other:3 * other + 3] = gradient * (
+                    (sensor == other) - 1 / 3)
+            found[:, sensor, 9 + 3 * sensor:12 + 3 * sensor] = field
+            found[:, sensor, TURNS] = np.einsum(
+                "nw,na->nwa", self.waves[rows], np.cross(field, np.eye(3)[sensor])
+            ).reshape(len(found), -1)
+            found[:, sensor, OFFSETS.start + sensor] = self.time[rows]
+            found[:, sensor, GAINS] = self.waves[rows] * field[:, sensor, None]
+            if at.lag:
+                found[:, sensor, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
+        return found * self.prior_sd
+
+    def readings(self, at: _Fitted, rows: NDArray[np.bool_] | None = None) -> Floats:
+        """Return what the instrument reads (n, 3) in T at some rows, by default at all."""
+        chosen = np.flatnonzero(np.ones(len(self.points), bool) if rows is None else rows)
+        found = np.empty((len(chosen), 3))
+        some = np.zeros(len(self.points), bool)
+        some[chosen] = True
+        for sensor in range(3):
+            places, reads = self._sensor(at, some, sensor)
+            found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
+        return np.asarray(found + self.offsets(at, some))
+
+
+def _fitted(
+    model: _Model, rows: NDArray[np.bool_], fit: HarmonicFit, start: _Fitted | None = None,
+    iterations: int = ITERATIONS
+) -> _Fitted:
+    """Fit field and instrument together by Gauss-Newton steps, each of which improves the fit.
+
+    ``fit`` is that of a perfect instrument, and has the prior width of the amplitudes.
+    """
+    at = replace(start or model.start(fit), lag=model.lag_shows(rows))
+    readings, count = model.field[rows].ravel(), len(PRIOR_SD)
+    width2 = fit.sigma**2 / fit.penalty
+
+    def projected(instrument: Floats, sigma: float) -> tuple[float, _Fitted, Floats, Floats]:
+        """Return chi-squared, the fit, its design and residual for an instrument."""
+        of = replace(at, instrument=instrument)
+        by_amplitude = model.by_amplitude(of, rows).reshape(len(readings), -1)
+        target = readings - model.offsets(of, rows).ravel()
+        information = by_amplitude.T @ by_amplitude
+        information[np.diag_indices(len(information))] += sigma**2 / width2
+        amplitudes = linalg.cho_solve(linalg.cho_factor(information, lower=True),
+                                      by_amplitude.T @ target)
+        left = target - by_amplitude @ amplitudes
+        chi2 = (float(left @ left) / sigma**2 + float(amplitudes @ amplitudes) / width2
+                + float(instrument @ instrument))
+        return chi2, replace(of, amplitudes=amplitudes), by_amplitude, left
+
+    chi2, at, by_amplitude, left = projected(at.instrument, at.sigma)
+    for _ in range(iterations):
+        design = np.hstack([by_amplitude, model.by_parameter(at, rows).reshape(-1, count)])
+        ratio = np.concatenate([np.full(len(model.charges), at.sigma**2 / width2),
+                                np.full(count, at.sigma**2)])
+        information = design.T @ design
+        inverse = np.linalg.inv(information + np.diag(ratio))
+        step = (inverse @ (design.T @ left - ratio * np.concatenate(
+            [at.amplitudes, at.instrument])))[-count:]
+        for halving in range(HALVINGS):
+            after, other, by_amplitude, left = projected(
+                at.instrument + step / 2**halving, at.sigma)
+            if after <= chi2:
+                break
+        else:
+            return at
+        used = float(np.sum(inverse * information))
+        sigma = float(np.sqrt(left @ left / max(len(readings) - used, 1.0)))
+        at_rest = chi2 - after < AT_REST
+        at = replace(other, covariance=sigma**2 * inverse[-count:, -count:], sigma=sigma, used=used)
+        if at_rest:
+            break
+        chi2, at, by_amplitude, left = projected(at.instrument, at.sigma)
+    return at
+
+
+CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
+           "from the ends to the middle": {1: -1.5, 3: -0.625}}
+"""Differences of the Legendre polynomials 1 to 4 between times of the scan."""
+
+
+def _terms(fitted: _Fitted) -> tuple[InstrumentTerm, ...]:
+    """Return the parameters of the instrument in the units of people."""
+    value, found = fitted.instrument * fitted.prior_sd, []
+    scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
+
+    def add(name: str, unit: str, factor: float, weights: dict[int, float]) -> None:
+        row = np.zeros(len(value))
+        row[list(weights)] = factor * np.array(list(weights.values()))
+        sd = float(np.sqrt(row @ scaled @ row))
+        prior = float(np.linalg.norm(row * fitted.prior_sd))
+        found.append(InstrumentTerm(name, unit, float(row @ value), sd, sd < DETERMINED * prior))
+
+    for sensor, along in product(range(3), repeat=2):
+        add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",
+            1e3, {3 * other + along: (sensor == other) - 1 / 3 for other in range(3)})
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        one, other = 9 + 3 * first + second, 9 + 3 * second + first
+        add(f"probe turned about {COMPONENTS[axis]}", "mrad", 1e3, {one: 0.5, other: -0.5})
+        add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
+            {one: 1.0, other: 1.0})
+        add(f"gain of B{COMPONENTS[axis]} over the mean of all", "%", 100.0,
+            {9 + 4 * other: (axis == other) - 1 / 3 for other in range(3)})
+        turn = f"turn about {COMPONENTS[axis]}"
+        for when, weights in CHANGES.items():
+            add(f"{turn} {when}", "mrad", 1e3,
+                {TURNS.start + 3 * wave + axis: weight for wave, weight in weights.items()})
+        add(f"change of the offset of B{COMPONENTS[axis]} from start to end", "mT", 2e3,
+            {OFFSETS.start + axis: 1.0})
+    for when, weights in CHANGES.items():
+        add(f"change of the gain {when}", "%", 100.0,
+            {GAINS.start + wave: weight for wave, weight in weights.items()})
+    add("lag of the readings behind the stage", "mm", 1e3, {LAG: 1.0})
+    return tuple(found)
+
+
+# --- what remains -------------------------------------------------------------------------------
+
+
+def _spikes(points: Floats, residual: Floats, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the usable rows whose residual (n, 3) is far larger than those around."""
+    rows = np.flatnonzero(usable)
+    size = np.abs(residual[rows])
+    count = min(NEIGHBOURS + 1, len(rows))
+    near = KDTree(points[rows]).query(points[rows], np.arange(2, count + 1))[1]
+    around = 1.4826 * np.maximum(np.median(size[near], axis=1), np.median(size, axis=0))
+    found = np.zeros(len(points), bool)
+    found[rows] = (size > SPIKE * around).any(axis=1)
+    return found
+
+
+def _windows(
+    points: Floats, residual: Floats
+) -> tuple[str, tuple[tuple[float, float, tuple[float, float, float]], ...]]:
+    """Return the rms residual of each component in parts along the longest axis."""
+    axis = int(np.argmax(np.ptp(points, axis=0)))
+    edges = np.linspace(points[:, axis].min(), points[:, axis].max(), WINDOWS + 1)
+    number = np.clip(np.searchsorted(edges, points[:, axis], side="right") - 1, 0, WINDOWS - 1)
+    found = []
+    for window in range(WINDOWS):
+        if (number == window).any():
+            x, y, z = _rms(residual[number == window]).tolist()
+            found.append((float(edges[window]), float(edges[window + 1]), (x, y, z)))
+    return COMPONENTS[axis], tuple(found)
+
+
+def _noise(gradient: Floats, residual: Floats) -> tuple[float, float]:
+    """Return the noise in T of readings and in m of positions that residuals (n, 3) show.
+
+    A position noise s makes an error of s |grad B_c| in component c, for a gradient (n, 3, 3).
+    """
+    steepness = np.sum(gradient**2, axis=2).ravel()
+    unit = float(steepness.mean()) or 1.0
+    constant, slope = nnls(np.column_stack([np.ones(len(steepness)), steepness / unit]),
+                           residual.ravel()**2)[0]
+    return float(np.sqrt(constant)), float(np.sqrt(slope / unit))
+
+
+def _structure(points: Floats, residual: Floats) -> float:
+    """Return the correlation of the residuals (n, 3) of nearest neighbours."""
+    nearest = KDTree(points).query(points, 2)[1][:, 1]
+    total = float(np.sum(residual**2))
+    return float(np.sum(residual * residual[nearest]) / total) if total else 0.0
