@@ -18,7 +18,8 @@ VERBS = {
     "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
     "multipoles": "multipoles", "plan": "plan", "prior": "prior", "shim": "shim", "sort": "sort",
     "tolerance": "tolerance", "demagnetization": "demagnetization",
-    "simulate-measurement": "simulate_measurement", "import-map": "import_map", "export": "export",
+    "simulate-measurement": "simulate_measurement", "import-map": "import_map", "check": "check",
+    "export": "export",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
 """Name of the module of each verb."""
 

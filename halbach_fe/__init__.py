@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
     from halbach_fe.measurement.block_table import read_blocks as read_blocks
     from halbach_fe.measurement.field_map import read_map as read_map
+    from halbach_fe.measurement.map_check import MapCheck as MapCheck
+    from halbach_fe.measurement.map_check import check_map as check_map
     from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.mesh_convergence import Verification as Verification
     from halbach_fe.response.mesh_convergence import verify as verify
@@ -56,14 +58,15 @@ if TYPE_CHECKING:
 _HOME = {
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
     "read_map": "measurement.field_map", "read_blocks": "measurement.block_table",
-    "Session": "solver.session",
+    "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "plan": "api", "shim": "api",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
     "write_report": "report.result_files",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
-    "Solution": "response.solution", "InferenceResult": "inference.result",
-    "Diagnosis": "diagnosis.result", "Verification": "response.mesh_convergence",
+    "MapCheck": "measurement.map_check", "Solution": "response.solution",
+    "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
+    "Verification": "response.mesh_convergence",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
     "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
     "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",

@@ -16,8 +16,12 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 
-MOST_CHARGES = 1500
+MOST_CHARGES = 3300
 """Largest number of charges, which limits memory and time."""
+
+CLOSENESS = 0.6
+"""Distance of charges from each other, relative to that from the region: where they are as far from
+each other as from a point, the field there is rough."""
 
 UNIFORM = 1e3
 """Prior width of the uniform field in units of the charges' field: it is as good as free."""
@@ -42,12 +46,12 @@ class Charges:
     def around(cls, points: Floats, gap: float) -> Charges:
         """Place charges on a box that is ``gap`` in m larger than points (n, 3) in m on all sides.
 
-        Their distance from each other is that gap, or larger if there were too many.
+        Their distance from each other is `CLOSENESS` of it, or larger if there were too many.
         """
         low, high = points.min(axis=0) - gap, points.max(axis=0) + gap
         sides = high - low
         area = 2 * float(np.sum(sides * np.roll(sides, 1)))
-        step = max(gap, np.sqrt(area / MOST_CHARGES))
+        step = max(CLOSENESS * gap, np.sqrt(area / MOST_CHARGES))
         found = []
         for axis in range(3):
             first, second = (other for other in range(3) if other != axis)
@@ -155,11 +159,16 @@ def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> li
     The width of their prior and the noise are those of largest evidence (D. J. C. MacKay, Neural
     Comput. 4 (1992) 415).
     """
-    design = charges.fields(points).reshape(-1, len(charges))
+    return fit_readings(charges.fields(points).reshape(-1, len(charges)),
+                        [field.ravel() for field in fields])
+
+
+def fit_readings(design: Floats, readings: Sequence[Floats]) -> list[HarmonicFit]:
+    """Fit each of some readings (m,) in T, of which ``design`` (m, k) is that per amplitude."""
     values, vectors = np.linalg.eigh(design.T @ design)
     values = np.maximum(values, 0.0)
-    return [_most_probable(values, vectors, vectors.T @ (design.T @ field.ravel()), field.ravel())
-            for field in fields]
+    return [_most_probable(values, vectors, vectors.T @ (design.T @ each), each)
+            for each in readings]
 
 
 def _most_probable(

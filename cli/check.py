@@ -1,0 +1,47 @@
+"""Check a field map against Maxwell's equations, before any magnet.
+
+Fits the map by a field of sources outside the mapped region together with the parameters of a
+three-axis probe. Says which signs or exchanged axes make the map obey div B = 0 and curl B = 0,
+where the sensors are, how the probe is turned, which rows are broken, and which noise remains: no
+model of a magnet can explain the map any better. With an output folder, also writes check.json,
+check.csv (the residual of every reading), check.html and its figures, and oriented_map.csv, the
+map without broken rows and with its components along the right axes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from halbach_fe.cli import common
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    parser.add_argument("map", type=Path, metavar="MAP",
+                        help="field map (CSV, HDF5 or VTU); see import-map for other formats")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR",
+                        help="folder for the page and its files")
+    common.add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Check the map, write the results, print a summary."""
+    from halbach_fe.measurement.field_map import read_map
+    from halbach_fe.measurement.map_check import check_map
+    from halbach_fe.report.map_check import instrument_table, sentences, write_map_check
+
+    data = read_map(arguments.map)
+    check = check_map(data, say=(lambda _: None) if arguments.json else common.say)
+    if arguments.output is not None:
+        write_map_check(data, check, arguments.output, {
+            "map": common.digest(arguments.map)})
+    if arguments.json:
+        common.print_json(check.plain())
+        return 0
+    for sentence in sentences(check):
+        common.say(sentence)
+    common.print_table(instrument_table(check), "The instrument, by the map alone")
+    if arguments.output is not None:
+        common.say(f"Report: {arguments.output / 'check.html'}")
+    return 0

@@ -1,0 +1,172 @@
+"""Maxwell's check of maps that magpylib and an imperfect instrument make."""
+
+from __future__ import annotations
+
+import json
+
+import magpylib
+import numpy as np
+import pytest
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.harmonic_field import Charges, fit_fields
+from halbach_fe.measurement.map_check import check_map, scan_lines
+from halbach_fe.report.map_check import oriented, sentences, verdict
+
+NOISE_T = 2e-5
+FLOOR = 2.0
+"""Held-out lines at the map's edge are extrapolated: 1.6 times the noise was measured."""
+STEP_M = 0.006
+AXES = [STEP_M * np.arange(-n, n + 1) for n in (2, 3, 4)]
+GRID = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1).reshape(-1, 3)
+"""5 x 7 x 9 points; scan lines run along z."""
+
+
+def source():
+    """Some magnets around the map, not symmetric: 0.1 T with gradients of 1 T/m."""
+    return magpylib.Collection([magpylib.magnet.Cuboid(
+        dimension=(0.02, 0.02, 0.03), polarization=polarization, position=place)
+        for polarization, place in (((1.2, 0, 0), (0.05, 0, 0.01)),
+                                    ((1.0, 0.5, 0), (-0.05, 0.01, 0)),
+                                    ((-0.6, 0.2, 0.9), (0.01, 0.05, -0.02)),
+                                    ((0, 0.4, 1.0), (0.0, -0.055, 0.03)))])
+
+
+TOGETHER = np.zeros((3, 3))
+
+
+def read_by(generator, sensors=TOGETHER, turn_rad=(0.0, 0.0, 0.0), noise=NOISE_T):
+    """The map (n, 3) that a probe reads with its sensors elsewhere and turned."""
+    body = source()
+    rotation = np.array(magpylib.Sensor().orientation.from_rotvec(turn_rad).as_matrix())
+    field = np.column_stack([body.getB(GRID + place) @ axis
+                             for place, axis in zip(sensors, rotation.T, strict=True)])
+    return field + noise * generator.standard_normal(field.shape)
+
+
+def named(check, name):
+    (term,) = [term for term in check.terms if term.name == name]
+    return term
+
+
+def test_charges_make_any_field_in_free_space(generator):
+    """They fit a field to its noise, and not one that has a curl."""
+    field = read_by(generator)
+    (fit,) = fit_fields(Charges.around(GRID, 2.5 * STEP_M), GRID, [field])
+    assert fit.sigma == pytest.approx(NOISE_T, rel=0.2)
+    curl = field + 1e-3 * np.column_stack([-GRID[:, 1], GRID[:, 0], 0 * GRID[:, 0]]) / STEP_M
+    (wrong,) = fit_fields(Charges.around(GRID, 2.5 * STEP_M), GRID, [curl])
+    assert wrong.sigma > 10 * NOISE_T
+
+
+def test_gradient_of_charges(generator):
+    charges = Charges.around(GRID, 0.01)
+    amplitudes, points = generator.standard_normal(len(charges)), GRID[::40]
+    gradient, step = charges.gradient(points, amplitudes), 1e-6
+    for axis in range(3):
+        shift = step * np.eye(3)[axis]
+        difference = (charges.field(points + shift, amplitudes)
+                      - charges.field(points - shift, amplitudes)) / (2 * step)
+        np.testing.assert_allclose(gradient[:, :, axis], difference,
+                                   atol=1e-6 * np.abs(gradient).max())
+    reads = generator.standard_normal((len(points), 3))
+    np.testing.assert_allclose(
+        charges.fields_along(points, reads) @ amplitudes,
+        np.sum(reads * charges.field(points, amplitudes), axis=1), rtol=1e-9)
+    np.testing.assert_allclose(charges.fields(points) @ amplitudes,
+                               charges.field(points, amplitudes), rtol=1e-9)
+
+
+def test_scan_lines():
+    lines = scan_lines(GRID)
+    assert lines.max() + 1 == 35
+    assert all(np.ptp(GRID[lines == line, :2], axis=0).max() == 0 for line in range(35))
+    alone = scan_lines(np.random.default_rng(0).uniform(size=(20, 3)))
+    assert sorted(alone) == list(range(20))
+
+
+def test_a_perfect_instrument(generator):
+    check = check_map(field_map(GRID, read_by(generator)))
+    assert check.orientation == ("x", "y", "z")
+    assert not check.is_reoriented
+    assert check.suffices
+    assert not [term.name for term in check.terms if term.found]
+    assert not check.broken
+    assert check.noise_T == pytest.approx(NOISE_T, rel=0.2)
+    assert NOISE_T < check.floor_rms_T < FLOOR * NOISE_T
+    assert abs(check.structure) < 0.3
+    assert "obeys" in verdict(check)
+
+
+def test_an_imperfect_instrument(generator):
+    """Exchanged and reversed columns, sensors apart, a roll, a row of zeros and a spike."""
+    sensors = np.array([[1e-3, 0, 0], [-0.5e-3, 0.8e-3, 0], [-0.5e-3, -0.8e-3, 0]])
+    field = read_by(generator, sensors, (0.0, 0.0, 0.02))
+    shown = np.column_stack([field[:, 1], field[:, 0], -field[:, 2]])  # columns of the map
+    shown[50], shown[120] = 0.0, shown[120] + [0, 0.05, 0]
+    data = field_map(GRID, shown)
+    check = check_map(data)
+    # a common sign cannot be known: that of the first column is taken as it is
+    assert check.orientation == ("y", "x", "-z")
+    assert check.broken == {"zero": [51], "spike": [121]}
+    for sensor, (name, place) in enumerate(zip("xyz", sensors, strict=True)):
+        for axis, along in enumerate("xyz"):
+            term = named(check, f"{along} of the B{name} sensor from the mean of all")
+            assert abs(term.value - 1e3 * place[axis]) < 4 * term.sd, (sensor, along)
+            assert term.determined
+    roll = named(check, "probe turned about z")
+    assert roll.found
+    assert abs(roll.value - 20) < 4 * roll.sd
+    assert named(check, "lag of the readings behind the stage").determined is False
+    assert NOISE_T < check.floor_rms_T < FLOOR * NOISE_T
+    assert check.rms_as_given_T.max() > 50 * NOISE_T
+    # the oriented map can be used as it is
+    kept = oriented(data, check)
+    assert len(points_of(kept)) == len(GRID) - 2
+    assert check_map(kept).orientation == ("x", "y", "z")
+    text = " ".join(sentences(check))
+    assert "column Bz is −Bz" in text
+    assert "row 51" in text
+
+
+@pytest.mark.parametrize("spoiled", ["shuffled lines", "curl"])
+def test_what_no_magnet_makes_is_not_fitted(generator, spoiled):
+    points, field = GRID[:189], read_by(generator)[:189]  # three planes suffice
+    if spoiled == "curl":
+        field += 0.02 * np.column_stack([-points[:, 1], points[:, 0], 0 * points[:, 0]]) / STEP_M
+    else:
+        field = field.reshape(21, 9, 3)[generator.permutation(21)].reshape(-1, 3)
+    check = check_map(field_map(points, field))
+    assert "does not obey" in verdict(check)
+
+
+def test_a_small_map_cannot_tell(generator):
+    line = GRID[scan_lines(GRID) % 5 == 0][:40]
+    check = check_map(field_map(line, source().getB(line)
+                                + NOISE_T * generator.standard_normal(line.shape)))
+    assert not check.suffices or check.floor_rms_T > 0
+    with pytest.raises(MeasurementError, match="at least 30 points"):
+        check_map(field_map(GRID[:9], source().getB(GRID[:9])))
+    partly = read_by(generator)
+    partly[:, 2] = np.nan
+    with pytest.raises(MeasurementError, match="all three components"):
+        check_map(field_map(GRID, partly))
+
+
+def test_command(generator, tmp_path, capsys):
+    field = read_by(generator) * [1, 1, -1]
+    write_map(field_map(GRID, field), tmp_path / "map.csv")
+    assert main(["check", str(tmp_path / "map.csv"), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "The map obeys" in said
+    assert "−Bz" in said
+    page = (tmp_path / "out" / "check.html").read_text()
+    assert "The map obeys" in page
+    found = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert found["orientation"] == ["x", "y", "-z"]
+    turned = read_map(tmp_path / "out" / "oriented_map.csv")
+    np.testing.assert_allclose(turned["B_T"].values, field * [1, 1, -1], atol=1e-12)
+    assert main(["check", str(tmp_path / "map.csv"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["suffices"] is True
