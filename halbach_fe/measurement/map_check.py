@@ -70,9 +70,9 @@ AT_REST = 1.0
 NEIGHBOURS = 26
 """Number of neighbours of a reading, as many as a point of a grid has."""
 
-ROUGH = 4.0
-"""The same multiple of the residuals around a row that is far off a function through its
-neighbours: a spike is in the functions of all its neighbours, too."""
+ROUGH = 1.8
+"""Multiple of the largest residual around a row that is far off a function through its neighbours.
+A single spike is 2 to 4 times as far off its own as off theirs."""
 
 ROUGH_ROUNDS = 10
 """Number of times that spikes are looked for among the rows that are left."""
@@ -259,7 +259,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     directions = _directions(points, lines)
     matrix, alike = _orientation(places, readings, time[chosen], directions[chosen], spacing)
     say("fitting the field and the instrument")
-    gap, first_fit = _gap(places, readings @ matrix.T, spacing)
+    gap, first_fit = _gap(places, readings @ matrix.T, time[chosen], directions[chosen], spacing)
     charges = Charges.around(places, gap)
     turned = field @ matrix.T
     model = _Model(charges, points, turned, time, directions)
@@ -305,8 +305,8 @@ def _rough_rows(
 ) -> NDArray[np.bool_]:
     """Return the rows that are far off a quadratic function through their neighbours.
 
-    A row that is far off spoils the functions of its neighbours. Therefore only the worst row of
-    every neighbourhood is taken at a time.
+    A row that is far off spoils the functions of its neighbours, but less than its own. A field
+    that is steeper than a quadratic function spoils those of neighbours alike.
     """
     found = np.zeros(len(points), bool)
     for _ in range(ROUGH_ROUNDS):
@@ -323,8 +323,8 @@ def _rough_rows(
             residual[rows[part]] = field[rows[part]] - np.einsum(
                 "nk,nkc->nc", weights, field[rows[near[part]]])
         size = np.linalg.norm(residual[rows], axis=1)
-        worst = _spikes(points, residual, usable & ~found, ROUGH)
-        worst[rows] &= size >= size[near].max(axis=1)
+        worst = _spikes(points, residual, usable & ~found, 1.0)
+        worst[rows] &= size > ROUGH * size[near].max(axis=1)
         if not worst.any():
             break
         found |= worst
@@ -444,10 +444,19 @@ def _orientation(
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
 
 
-def _gap(points: Floats, field: Floats, spacing: float) -> tuple[float, HarmonicFit]:
-    """Return the distance in m of the charges from points (n, 3) in m, and the fit by them."""
-    fitted = {gap: fit_fields(Charges.around(points, gap * spacing), points, [field])[0]
+def _gap(
+    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float
+) -> tuple[float, HarmonicFit]:
+    """Return the distance in m of the charges from points (n, 3) in m, and the fit by them.
+
+    The instrument is fitted with the charges that are farthest away, which are fewest.
+    """
+    every = np.ones(len(points), bool)
+    models = {gap: _Model(Charges.around(points, gap * spacing), points, field, time, directions)
               for gap in GAPS}
+    (perfect,) = fit_fields(models[GAPS[-1]].charges, points, [field])
+    instrument = _fitted(models[GAPS[-1]], every, perfect)
+    fitted = {gap: model.fit(instrument, every) for gap, model in models.items()}
     gap = max(fitted, key=lambda each: fitted[each].log_evidence)
     return gap * spacing, fitted[gap]
 
