@@ -76,7 +76,7 @@ def verdict(check: MapCheck) -> str:
             f"{_share(share)} of the largest field ({_field(check.size_T)})")
     if share > VIOLATED:
         return f"The map does not obey div B = 0 and curl B = 0: they leave {size}."
-    wrong = [term.name for term in check.terms if not term.plausible]
+    wrong = [term.name for term in check.terms if term.determined and not term.plausible]
     if wrong:
         return (f"The map does not obey div B = 0 and curl B = 0 with any likely instrument: it "
                 f"would take an impossible one ({wrong[0]}"
