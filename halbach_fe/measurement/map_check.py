@@ -229,7 +229,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     Raises
     ------
     MeasurementError
-        If fewer than `FEWEST_POINTS` points have all three components.
+        If fewer than `FEWEST_POINTS` points have all three components and are not broken.
 
     Examples
     --------
@@ -238,16 +238,15 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     ('x', 'y', 'z')
     """
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
-    complete = np.isfinite(field).all(axis=1)
-    if complete.sum() < FEWEST_POINTS:
-        raise MeasurementError(must_be(
-            "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
-            "components", f"{int(complete.sum())}",
-            "A line of one component obeys Maxwell's equations whatever it is."))
     broken = _broken_rows(points, field)
-    usable = complete.copy()
+    usable = np.isfinite(field).all(axis=1)
     for rows in broken.values():
         usable[np.array(rows, int) - 1] = False
+    if usable.sum() < FEWEST_POINTS:
+        raise MeasurementError(must_be(
+            "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
+            "components, neither all zero nor repeated", f"{int(usable.sum())}",
+            "A line of one component obeys Maxwell's equations whatever it is."))
     rough = _rough_rows(points, field, usable)
     usable &= ~rough
     lines = scan_lines(points)
@@ -311,11 +310,12 @@ def _rough_rows(
     found = np.zeros(len(points), bool)
     for _ in range(ROUGH_ROUNDS):
         rows = np.flatnonzero(usable & ~found)
-        near = KDTree(points[rows]).query(points[rows], np.arange(2, NEIGHBOURS + 2))[1]
+        count = min(NEIGHBOURS + 1, len(rows))
+        near = KDTree(points[rows]).query(points[rows], np.arange(2, count + 1))[1]
         residual = np.full_like(field, np.nan)
         for part in np.array_split(np.arange(len(rows)), max(1, len(rows) // 1000)):
             away = points[rows[near[part]]] - points[rows[part], None]
-            away /= np.abs(away).max(axis=(1, 2), keepdims=True)
+            away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
             x, y, z = np.moveaxis(away, 2, 0)
             terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x],
                              axis=2)
