@@ -234,8 +234,12 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     Examples
     --------
     >>> import halbach_fe as hf
-    >>> hf.check_map(hf.read_map("map.csv")).orientation
-    ('x', 'y', 'z')
+    >>> from halbach_fe.measurement.field_map import field_map
+    >>> axis = 0.01 * np.arange(-2, 3)
+    >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    >>> field = points * [1.0, 1.0, -2.0] + [0.1, 0.0, 0.0]  # has no divergence and no curl
+    >>> hf.check_map(field_map(points, field)).suffices
+    True
     """
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     broken = _broken_rows(points, field)
