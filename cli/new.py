@@ -17,6 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     template = MagnetTemplate()
     parser.add_argument("study", type=Path, metavar="STUDY", help="file to write (TOML)")
+    strength = parser.add_mutually_exclusive_group()
+    rings = parser.add_mutually_exclusive_group()
+    groups = {"remanence-T": strength, "inner-radius-m": rings}
     for name, kind, text in (
             ("multipole-order", common.positive, "main multipole: 1 dipole, 2 quadrupole, ..."),
             ("blocks-per-ring", common.positive, "number of blocks in each ring"),
@@ -28,15 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
              "study is a cross-section"),
             ("remanence-T", common.positive_number, "remanence of the blocks")):
         default = getattr(template, name.replace("-", "_"))
-        parser.add_argument(f"--{name}", type=kind, metavar="N" if kind is common.positive else "X",
+        groups.get(name, parser).add_argument(
+                            f"--{name}", type=kind, metavar="N" if kind is common.positive else "X",
                             help=text if "default" in text or default is None
                             else f"{text} (default: {default})")
     parser.add_argument("--shape", choices=("sector", "trapezoid", "cuboid"),
                         default=template.shape,
                         help="shape of the blocks (default: %(default)s)")
-    parser.add_argument("--material", metavar="GRADE",
+    strength.add_argument("--material", metavar="GRADE",
                         help="grade of the blocks, such as N42, in place of the remanence")
-    rings = parser.add_mutually_exclusive_group()
     rings.add_argument("--inner-radii-m", type=_radii, metavar="X,X,...", default=(),
                        help="inner radii of rings that differ, in the order of z")
     rings.add_argument("--free-blocks", type=Path, metavar="TABLE",

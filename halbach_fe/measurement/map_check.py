@@ -61,6 +61,10 @@ SPIKE = 12.0
 """A reading is a spike if its residual is larger than this multiple of the standard deviation of
 the residuals around it and of all, both from their medians."""
 
+ROUNDING = 1e-13
+"""Added to the information of the amplitudes, relative to its mean, so that maps without noise have
+positive definite matrices too."""
+
 HALVINGS = 8
 """Number of times that a step is halved until it improves the fit."""
 
@@ -229,7 +233,8 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     Raises
     ------
     MeasurementError
-        If fewer than `FEWEST_POINTS` points have all three components and are not broken.
+        If fewer than `FEWEST_POINTS` points have all three components and are not broken, or if
+        they lie on a line.
 
     Examples
     --------
@@ -251,6 +256,10 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
             "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
             "components, neither all zero nor repeated", f"{int(usable.sum())}",
             "A line of one component obeys Maxwell's equations whatever it is."))
+    if (np.ptp(points[usable], axis=0) > _spacing(points[usable]) / 2).sum() < 2:
+        raise MeasurementError(must_be(
+            "map", "Maxwell's check", "of points in a plane or a volume", "points on a line",
+            "Along a line any field has div B = 0 and curl B = 0."))
     rough = _rough_rows(points, field, usable)
     usable &= ~rough
     lines = scan_lines(points)
@@ -260,17 +269,19 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     places, readings = points[chosen], field[chosen]
     spacing = _spacing(places)
     directions = _directions(points, lines)
-    matrix, alike = _orientation(places, readings, time[chosen], directions[chosen], spacing)
+    held_out = _held_out(lines, chosen)  # nothing that follows sees them, until the floor
+    train_rows = chosen & ~held_out
+    seen = points[train_rows], field[train_rows], time[train_rows], directions[train_rows]
+    matrix, alike = _orientation(*seen, spacing)
     say("fitting the field and the instrument")
-    gap, first_fit = _gap(places, readings @ matrix.T, time[chosen], directions[chosen], spacing)
+    gap, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing)
     charges = Charges.around(places, gap)
     turned = field @ matrix.T
     model = _Model(charges, points, turned, time, directions)
-    held_out = _held_out(lines, chosen)
-    train = _fitted(model, chosen & ~held_out, first_fit)
+    train = _fitted(model, train_rows, first_fit)
     # the prior width of the field, now that the instrument no longer counts as noise
-    fit = model.fit(train, chosen & ~held_out)
-    train = _fitted(model, chosen & ~held_out, fit, train)
+    fit = model.fit(train, train_rows)
+    train = _fitted(model, train_rows, fit, train)
     spikes = _spikes(points, turned - model.readings(train), usable)
     if rough.any() or spikes.any():
         broken["spike"] = (1 + np.flatnonzero(rough | spikes)).tolist()
@@ -629,7 +640,8 @@ def _fitted(
         by_amplitude = model.by_amplitude(of, rows).reshape(len(readings), -1)
         target = readings - model.offsets(of, rows).ravel()
         information = by_amplitude.T @ by_amplitude
-        information[np.diag_indices(len(information))] += sigma**2 / width2
+        information[np.diag_indices(len(information))] += (
+            sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
         amplitudes = linalg.cho_solve(linalg.cho_factor(information, lower=True),
                                       by_amplitude.T @ target)
         left = target - by_amplitude @ amplitudes
