@@ -19,6 +19,7 @@ VERBS = {
     "multipoles": "multipoles", "plan": "plan", "prior": "prior", "shim": "shim", "sort": "sort",
     "tolerance": "tolerance", "demagnetization": "demagnetization",
     "simulate-measurement": "simulate_measurement", "import-map": "import_map", "check": "check",
+    "register": "register",
     "export": "export",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
 """Name of the module of each verb."""

@@ -155,7 +155,7 @@ def score_hypotheses(
         points = probe_points(other.instrument, update.observation.map_points)
         return NominalFields(other, points, times, lambda changed: solver.field(changed, points),
                              solve_iron=lambda changed: solver.iron_change(changed, points),
-                             measured_magnetizations=prior_mean.reshape(-1, other.dimension))
+                             measured_magnetizations=update.by_block(prior_mean))
 
     nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect

@@ -120,10 +120,17 @@ class Magnet(ShownInNotebook):
         """Whether the field is a non-linear function of the magnetizations (iron with a curve)."""
         return is_nonlinear(self.study)
 
+    @property
+    def has_losses(self) -> bool:
+        """Whether the blocks have lost remanence irreversibly in their own field."""
+        return self.study.demagnetization is not None and self.study.demagnetization.irreversible
+
     @cached_property
     def is_vacuum(self) -> bool:
-        """Whether all permeabilities are 1, so that the closed-form field needs no correction."""
-        return not self.iron and all(
+        """Whether all permeabilities are 1 and nothing is lost, so that the closed-form field needs
+        no correction.
+        """
+        return not self.has_losses and not self.iron and all(
             block.isotropic and block.recoil_permeability == 1.0 for block in self.blocks)
 
     @cached_property

@@ -34,6 +34,7 @@ from halbach_fe.measurement.observation import (
     study_for_validation_map,
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
+from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.formulation_choice import choose_route, solve_nominal
@@ -70,7 +71,7 @@ def infer(
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
     prior : Gaussian, optional
-        Prior of the parameters in A/m, which replaces those of the study and of ``blocks``.
+        Prior of all parameters in A/m, which replaces those of the study and of ``blocks``.
     linearized_only : bool
         Skip the solve of the updated magnet that checks whether its iron is linear enough.
     validation_map : Dataset, optional
@@ -119,9 +120,10 @@ def infer(
         model = response_matrix(magnet, observation, session)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
-    prior_used = prior or (of_blocks.gaussian if of_blocks else nominal_prior(
-        model.nominal, study.dimension, study.prior.magnitude_sd, study.prior.direction_sd_deg,
-        study.prior.common_mode_sd))
+    prior_used = prior or with_variations(of_blocks.gaussian if of_blocks else nominal_prior(
+        magnet.nominal_magnetization, study.dimension, study.prior.magnitude_sd,
+        study.prior.direction_sd_deg, study.prior.common_mode_sd),
+        len(model.parameters) - len(magnet.parameter_names))
     errors = noise.with_independent_errors(model.error)
     update = linear_gaussian.update(
         model.matrix, (readings - model.offset)[training], errors.subset(training), prior_used,

@@ -21,7 +21,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.matrix import Response
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import row_slices, whitened
+from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 
@@ -184,6 +184,19 @@ class InferenceResult(ShownInNotebook):
         return xr.Dataset({name: ("parameter", value, {"units": "A/m"})
                            for name, value in values.items()},
                           coords={"parameter": list(self.response.parameters)})
+
+    def by_block(self, values: Floats) -> Floats:
+        """Return the uniform magnetizations (blocks, dimension, ...) among parameters (m, ...)."""
+        size = self.magnet.dimension
+        count = len(self.magnet.blocks)
+        return values[:size * count].reshape(count, size, *values.shape[1:])
+
+    @property
+    def contraction(self) -> Floats:
+        """Posterior contraction (blocks,) of the uniform magnetizations, see `contraction` of
+        `halbach_fe.stats.linear_gaussian`.
+        """
+        return contraction(self.by_block(self.prior.sd), self.by_block(self.posterior.sd))
 
     @property
     def predictions(self) -> xr.Dataset:

@@ -19,7 +19,6 @@ from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.core.tables import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult
-from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 
 WRITTEN_COVARIANCE = 2000
@@ -52,7 +51,7 @@ def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
     MeasurementError
         If the file cannot be read as a posterior.h5, or belongs to another magnet.
     """
-    nominal = np.concatenate([block.magnetization[:magnet.dimension] for block in magnet.blocks])
+    nominal = magnet.nominal_magnetization
     distributions: dict[str, Gaussian] = {}
     try:
         data = untrusted.read_dataset(path)
@@ -65,6 +64,8 @@ def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
         raise MeasurementError(must_be(
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
             "a file that cannot be read as such")) from None
+    if magnet.study.prior.variation_sd:  # amplitudes of variations are 0 in the nominal magnet
+        nominal = np.concatenate([nominal, np.zeros(max(0, len(own) - len(nominal)))])
     if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
         raise MeasurementError(must_be(
             "--posterior", str(path), f"that of the magnet of study {magnet.name}",
@@ -140,8 +141,7 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "log_evidence": update.log_evidence,
         "information_left_out": update.left_out,
         "contraction_by_block": [None if np.isnan(value) else value for value in
-                                 linear_gaussian.contraction(
-            update.prior, update.posterior, update.study.dimension).round(6).tolist()],
+                                 update.contraction.round(6).tolist()],
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
         "scores": [asdict(score) for score in update.scores],

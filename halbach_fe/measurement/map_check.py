@@ -27,6 +27,12 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, fit_readings
+from halbach_fe.measurement.scan_lines import (
+    HELD_OUT_EVERY,
+    held_out_lines,
+    point_spacing,
+    scan_lines,
+)
 from halbach_fe.study.types import COMPONENTS
 
 FEWEST_POINTS = 30
@@ -50,9 +56,6 @@ instrument's parameters leave out are no noise; they shift log probabilities by 
 WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
-
-HELD_OUT_EVERY = 5
-"""Every so many scan lines one is held out, to measure the floor."""
 
 ITERATIONS, FEW_ITERATIONS = 12, 6
 """Largest number of steps of the fit of field and instrument, and while orientations are tried."""
@@ -256,7 +259,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
             "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
             "components, neither all zero nor repeated", f"{int(usable.sum())}",
             "A line of one component obeys Maxwell's equations whatever it is."))
-    if (np.ptp(points[usable], axis=0) > _spacing(points[usable]) / 2).sum() < 2:
+    if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
         raise MeasurementError(must_be(
             "map", "Maxwell's check", "of points in a plane or a volume", "points on a line",
             "Along a line any field has div B = 0 and curl B = 0."))
@@ -267,7 +270,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     time = _time(data, len(points))
     say("comparing the orientations of the probe")
     places, readings = points[chosen], field[chosen]
-    spacing = _spacing(places)
+    spacing = point_spacing(places)
     directions = _directions(points, lines)
     held_out = _held_out(lines, chosen)  # nothing that follows sees them, until the floor
     train_rows = chosen & ~held_out
@@ -354,33 +357,9 @@ def _time(data: xr.Dataset, count: int) -> Floats:
     return np.asarray((time - time.min()) / span * 2 - 1 if span else np.zeros(count))
 
 
-def _spacing(points: Floats) -> float:
-    """Return the median distance in m of points (n, 3) from their nearest neighbours."""
-    distance = KDTree(points).query(points, 2)[0][:, 1]
-    return float(np.median(distance[distance > 0])) if (distance > 0).any() else 1e-3
-
-
-def scan_lines(points: Floats) -> Ints:
-    """Return the number of the scan line (n,) of every point (n, 3).
-
-    Scan lines run along the axis along which there are fewest of them. If they are no lines, or
-    too few to hold one out, every point is one.
-    """
-    spacing = _spacing(points)
-    best = np.arange(len(points))
-    for axis in range(3):
-        across = np.delete(points, axis, axis=1)
-        number = np.unique(np.round(across / (spacing / 4)).astype(int), axis=0,
-                           return_inverse=True)[1].ravel()
-        if number.max() < best.max():
-            best = number
-    few, short = best.max() + 1 < HELD_OUT_EVERY, len(points) < 3 * (best.max() + 1)
-    return np.arange(len(points)) if few or short else best
-
-
 def _held_out(lines: Ints, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which of the chosen rows are held out: those of some lines, or of no line at all."""
-    found = (lines % HELD_OUT_EVERY == HELD_OUT_EVERY // 2) & chosen
+    found = held_out_lines(lines, HELD_OUT_EVERY) & chosen
     if not found.any():
         found[np.flatnonzero(chosen)[::HELD_OUT_EVERY]] = True
     return np.asarray(found)

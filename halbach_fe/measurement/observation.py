@@ -19,6 +19,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import sensor_model
+from halbach_fe.measurement.scan_lines import held_out_lines, scan_lines
 from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCoefficients
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -345,6 +346,14 @@ def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool
               for component in settings.components}
     named |= {f"z_ranges_m = {low:g}, {high:g}": (z >= low) & (z <= high)
               for low, high in settings.z_ranges_m}
+    if settings.scan_lines_every is not None:
+        if study.observation.quantity != "flux_density":
+            raise MeasurementError(must_be(
+                "readings", "map", "flux densities, to hold out lines of the scan by "
+                "`inference.held_out.scan_lines_every`", "Fourier coefficients"))
+        apart = held_out_lines(scan_lines(observation.map_points), settings.scan_lines_every)
+        named[f"scan_lines_every = {settings.scan_lines_every}"] = apart[
+            observation.analysis.indices // len(COMPONENTS)]
     for name, mask in named.items():
         if not mask.any():
             raise MeasurementError(must_be(

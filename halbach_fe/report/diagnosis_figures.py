@@ -302,13 +302,13 @@ def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:
     the easy axis in %, across it and along z in mrad.
     """
     dimension = update.study.dimension
-    nominal = update.response.nominal.reshape(-1, dimension)
+    nominal = update.by_block(update.response.nominal)
     length = np.linalg.norm(nominal, axis=1)
     length[length == 0] = np.inf  # a missing block has no magnetization
     axis = nominal / length[:, None]
     across = np.zeros_like(axis)
     across[:, 0], across[:, 1] = -axis[:, 1], axis[:, 0]
-    relative = vectors.reshape(len(nominal), dimension, -1) / length[:, None, None]
+    relative = update.by_block(vectors.reshape(len(vectors), -1)) / length[:, None, None]
     found = {"along the easy axis in %": 100 * np.einsum("bck,bc->bk", relative, axis),
              "across it in mrad": 1e3 * np.einsum("bck,bc->bk", relative, across)}
     if dimension == 3:

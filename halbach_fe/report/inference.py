@@ -23,7 +23,6 @@ from halbach_fe.report.prediction import (
     whitened_quantiles_figure,
 )
 from halbach_fe.response.multipoles import circle_models
-from halbach_fe.stats.linear_gaussian import contraction
 
 NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
@@ -137,9 +136,8 @@ def _figure_height(rings: int) -> float:
 
 def _magnetization_change_figure(result: InferenceResult) -> Figure:
     """Draw the change of each magnetization along the easy axis, from nominal to posterior."""
-    dimension = result.study.dimension
-    nominal = result.response.nominal.reshape(-1, dimension)
-    shift = (result.posterior.mean - result.response.nominal).reshape(-1, dimension)
+    nominal = result.by_block(result.response.nominal)
+    shift = result.by_block(result.posterior.mean - result.response.nominal)
     length = np.linalg.norm(nominal, axis=1)
     length[length == 0] = np.nan  # the place of a missing block is left blank
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
@@ -163,7 +161,7 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
 def _contraction_figure(result: InferenceResult) -> Figure:
     """Draw the contraction of each block: as bars for a single ring, else by ring and slot."""
     percent = 100 * result.magnet.by_ring(
-        contraction(result.prior, result.posterior, result.study.dimension))
+        result.contraction)
     rings = len(percent)
     slots = np.arange(1, percent.shape[1] + 1)
     figure = Figure(figsize=(8, 3 if rings == 1 else _figure_height(rings)),

@@ -145,15 +145,15 @@ def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
 
 def view_of_inference(result: InferenceResult) -> Markup:
     """Return the view of an inference result: posterior magnetizations and residuals."""
-    size = result.study.dimension
-    nominal = result.response.nominal.reshape(-1, size)
+    nominal = result.by_block(result.response.nominal)
     length = np.linalg.norm(nominal, axis=1)
     there = length > 0  # the change of a missing block is shown as 0
     length[~there] = 1.0
     easy = nominal / length[:, None]
-    mean = result.posterior.mean.reshape(-1, size)
+    mean = result.by_block(result.posterior.mean)
     number = np.arange(len(easy) + 1)
     along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
+    along.resize(len(easy), len(result.posterior.mean))  # variations in blocks do not count
     change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
     sd = 100 * result.posterior.sd_of(along) / length
     values = BlockValues(mean, Colours(change, "posterior change<br>along the easy axis in %", [

@@ -30,6 +30,7 @@ from halbach_fe.core.files import atomic
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.block_variation import Variations
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
@@ -45,7 +46,6 @@ from halbach_fe.stats.linear_gaussian import row_slices
 from halbach_fe.stats.noise import Rows
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import FIELD_KEYS
-from halbach_fe.study.types import COMPONENTS
 
 LOADED_BYTES = 2**30
 """Size in bytes above which a matrix stays on the disk and is read in parts."""
@@ -155,12 +155,6 @@ class Response:
         return self.matrix[np.arange(len(self.matrix))]
 
 
-def parameter_names(magnet: Magnet) -> tuple[str, ...]:
-    """Return the names of the parameters p, block by block; a cross-section has no M_z."""
-    components = COMPONENTS[: magnet.dimension]
-    return tuple(f"{block.name}.M{c}" for block in magnet.blocks for c in components)
-
-
 def response_matrix(magnet: Magnet, observation: Observation, session: Session) -> Response:
     """Build H, or read it from the session's folder if it was built for the same inputs.
 
@@ -183,15 +177,20 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
     parts = finite_element_part(magnet, observation.points, session)
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
-    def rows() -> Iterator[Floats]:
-        for part in row_slices(len(observation), dimension * len(blocks), len(observation)):
-            matrix, total[part], magnitude[part] = _rows(magnet, observation, parts, part)
-            yield matrix
+    variations = Variations.of(magnet)
+    names = magnet.parameter_names + (variations.names if variations else ())
+    shape = len(observation), len(names)
 
-    shape = len(observation), dimension * len(blocks)
+    def rows() -> Iterator[Floats]:
+        for part in row_slices(*shape, len(observation)):
+            matrix, total[part], magnitude[part] = _rows(magnet, observation, parts, part)
+            yield matrix if variations is None else np.hstack([
+                matrix, variations.readings(observation, part)])
+
     matrix = _whole(rows(), shape) if 8 * np.prod(shape) <= LOADED_BYTES else StoredMatrix.of(
         rows(), shape, _beside(path, key))
-    nominal = np.concatenate([block.magnetization[:dimension] for block in blocks])
+    nominal = np.zeros(shape[1])
+    nominal[:dimension * len(blocks)] = magnet.nominal_magnetization
     direct = observation.apply(parts.along_nominal)
     error = reading_errors(magnet, observation, parts, error_bar_session(session))
     superposition = verify_superposition(total, magnitude, direct, parts.superposition_tolerance)
@@ -203,7 +202,7 @@ def response_matrix(magnet: Magnet, observation: Observation, session: Session) 
         unequal *= DEVIATION
         field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
-    built = Response(matrix, magnet.parameter_names, nominal, offset,
+    built = Response(matrix, names, nominal, offset,
                      np.hypot(error, unequal), superposition)
     _write(path, key, built)
     return built
@@ -287,6 +286,9 @@ def verify_superposition(
 def _key(magnet: Magnet, observation: Observation, session: Session) -> str:
     """Return a digest of everything that the matrix depends on."""
     relevant = magnet.study.model_dump(mode="json", include=FIELD_KEYS)
+    if magnet.study.prior.variation_sd:
+        relevant["variation"] = [magnet.study.prior.variation_sd,
+                                 magnet.study.prior.variation_length_m]
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
     curve = magnet.curve  # the study may only name the steel, whose data may change
     if curve is not None:

@@ -128,6 +128,28 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
         magnet, points, session, columns=False, estimate=False).nominal
 
 
+def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:
+    """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
+
+    It serves points that move little by little. The blocks are solved for once where that does not
+    depend on the points.
+    """
+    def solved(points: Floats) -> Floats:
+        return solve_nominal(magnet, points, session)
+
+    auto = magnet.study.solver.route == "auto" and not magnet.has_losses
+    if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) != "moments" or (
+            auto and is_axisymmetric(magnet)):
+        return solved
+    reaction = solve_separate(magnet, session, estimate=False)
+
+    def field(points: Floats) -> Floats:
+        check_points(magnet, points)
+        return vacuum_part(magnet, points) + reaction.field(points)
+
+    return field
+
+
 def iron_change(magnet: Magnet, points: Floats, session: Session) -> Floats | None:
     """Return the change (n, 3) in T that the iron makes to B of blocks in vacuum.
 
@@ -211,7 +233,7 @@ def _by_moments(
     that would need too many modes, because they are so near to the blocks.
     """
     few = few_modes_suffice(magnet, points)
-    if magnet.study.solver.route == "auto" and few.any():
+    if magnet.study.solver.route == "auto" and few.any() and not magnet.has_losses:
         parts = [(np.flatnonzero(chosen), finite_element_part(
             magnet.with_(solver__route=route), points[chosen], session.within(route), columns,
             estimate))
@@ -227,7 +249,7 @@ def _by_moments(
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
     block = separate_columns(magnet, points, solved.iron)
     along = nominal
-    if magnet.is_nonlinear:  # the columns are derivatives at the nominal magnet
+    if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
     return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error,
@@ -319,6 +341,8 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
     if magnet.dimension == 2:
         return "cross_section"
     asked = magnet.study.solver.route
+    if magnet.has_losses:  # which are not rotationally symmetric
+        asked = "moments"
     symmetric = is_axisymmetric(magnet) and bool(few_modes_suffice(magnet, points).all())
     if asked == "azimuthal_modes" and not symmetric:
         raise StudyError(

@@ -66,10 +66,14 @@ class SeparateReaction:
         Polarization of the blocks in cells of the study's size and, for the error bar, of another;
         none if all permeabilities are 1.
     iron : IronReaction or None
+    without_losses : tuple of Moments
+        The same of blocks that have lost nothing, from which the error bar follows if the study
+        infers variations inside the blocks, which make up for errors of the losses.
     """
 
     blocks: tuple[Moments, ...]
     iron: IronReaction | None
+    without_losses: tuple[Moments, ...] = ()
 
     def field(self, points: Floats) -> Floats:
         """Return the reaction (n, 3) in T at points (n, 3) in m."""
@@ -86,7 +90,9 @@ class SeparateReaction:
         if self.blocks:
             from halbach_fe.solver.moments.solve import field_with_errors
 
-            field, error = field_with_errors(self.blocks[0], self.blocks[1], points)
+            field, error = field_with_errors(*(self.without_losses or self.blocks), points)
+            if self.without_losses:
+                field = self.blocks[0].reaction(points)
         if self.iron is not None:
             field, error = field + self.iron.field(points), error + self.iron.error(points)
         return field, error
@@ -113,9 +119,12 @@ def solve_separate(
         If the iron cannot be solved.
     """
     blocks = present_blocks(magnet.blocks)
-    systems = _systems(blocks, magnet.study.mesh.cells_per_side)[:2 if estimate else 1]
+    systems = _systems(magnet)[:2 if estimate else 1]
     if not magnet.iron:
-        return SeparateReaction(tuple(system.solve() for system in systems), None)
+        apart = estimate and magnet.has_losses and magnet.study.prior.variation_sd > 0
+        return SeparateReaction(
+            tuple(_polarized(magnet, system) for system in systems[:1 if apart else 2]), None,
+            tuple(system.solve() for system in systems) if apart else ())
     bodies = iron_rectangles(magnet)
     remanent = _remembered(_field_in_vacuum(blocks))
     if not systems:
@@ -126,7 +135,7 @@ def solve_separate(
     scale = max(abs(block.remanence) for block in blocks)
     before = iron.field(middles)
     for _ in range(MAX_TURNS):
-        polarized = systems[0].solve(iron.field)
+        polarized = _polarized(magnet, systems[0], iron.field)
         source = _sum(remanent, partial(polarized.reaction, degree=IRON_DEGREE))
         iron = solve_iron(bodies, source, session, magnet.name, estimate=False, start=iron)
         now = iron.field(middles)
@@ -134,7 +143,7 @@ def solve_separate(
             if estimate:
                 iron = solve_iron(bodies, source, session, magnet.name, start=iron)
             return SeparateReaction(tuple(
-                system.solve(iron.field) for system in systems), iron)
+                _polarized(magnet, system, iron.field) for system in systems), iron)
         before = now
     raise HalbachError(
         f"Blocks and iron of study {magnet.name} do not come to rest in {MAX_TURNS} turns: the "
@@ -242,13 +251,24 @@ def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
     return any(not block.isotropic or block.recoil_permeability != 1.0 for block in blocks)
 
 
-def _systems(blocks: Sequence[MagnetBlock], cells_per_side: int | None) -> tuple[System, ...]:
-    """Return the blocks in cells of two sizes, see `refinement`; none in vacuum."""
-    if not _permeable(blocks):
+def _systems(magnet: Magnet) -> tuple[System, ...]:
+    """Return the blocks in cells of two sizes, see `refinement`; none where nothing reacts."""
+    blocks = present_blocks(magnet.blocks)
+    if not _permeable(blocks) and not magnet.has_losses:
         return ()
     from halbach_fe.solver.moments.solve import refinement  # imports numba
 
-    return refinement(blocks, cells_per_side)
+    return refinement(blocks, magnet.study.mesh.cells_per_side, magnet.has_losses)
+
+
+def _polarized(magnet: Magnet, system: System, applied: Field | None = None) -> Moments:
+    """Return the polarization of the blocks, less what they have lost irreversibly if they have."""
+    if not magnet.has_losses:
+        return system.solve(applied)
+    from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
+
+    assert magnet.study.demagnetization is not None  # there are losses
+    return solve_irreversible(system, KneeLaw.of(magnet.study.demagnetization), applied)[0]
 
 
 def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:

@@ -161,15 +161,15 @@ def posterior(matrix: Floats, readings: Floats, noise: NoiseCovariance,
     return update(matrix, readings, noise, prior).distribution
 
 
-def contraction(prior: Gaussian, after: Gaussian, size: int) -> Floats:
-    """Return the posterior contraction 1 - trace(C_1) / trace(C_0) of each block, (m / size,).
+def contraction(prior_sd: Floats, posterior_sd: Floats) -> Floats:
+    """Return the posterior contraction 1 - trace(C_1) / trace(C_0) of each block, (blocks,).
 
-    C_0 and C_1 are the prior and posterior covariances of the ``size`` consecutive parameters of a
-    block. The contraction is 0 if the readings carry no information about the block, and 1 if they
-    determine it completely. It is NaN for a block without prior uncertainty: a missing block.
+    C_0 and C_1 are the prior and posterior covariances of the components of a block's
+    magnetization, whose standard deviations are given, (blocks, components) each. The contraction
+    is 0 if the readings carry no information about the block, and 1 if they determine it
+    completely. It is NaN for a block without prior uncertainty: a missing block.
     """
-    before, now = ((distribution.sd**2).reshape(-1, size).sum(axis=1)
-                   for distribution in (prior, after))
+    before, now = ((sd**2).sum(axis=1) for sd in (prior_sd, posterior_sd))
     return np.asarray(1 - now / np.where(before > 0, before, np.nan))
 
 

@@ -12,6 +12,7 @@ from halbach_fe.study.types import (
     Component,
     Coordinate,
     Gap,
+    Length,
     Line,
     StudyModel,
     Temperature,
@@ -27,6 +28,11 @@ class Prior(StudyModel):
     ``direction_sd_deg`` is the standard deviation of the angle of the magnetization, in each of the
     two directions perpendicular to the easy axis.
 
+    With ``variation_sd`` the magnetization along the easy axis varies inside the blocks: its
+    deviation, a fraction of the nominal magnetization, has this standard deviation at every place,
+    and those of two places of a block at the distance d have the correlation
+    ``exp(-d^2 / (2 variation_length_m^2))``. In 3D and without iron only.
+
     The other keys concern a block table, the measured moments of the single blocks (see
     `halbach_fe.measurement.block_table`). With a block table, the measured moments replace
     ``magnitude_sd`` and ``direction_sd_deg``; ``common_mode_sd`` still applies.
@@ -40,6 +46,8 @@ class Prior(StudyModel):
     magnitude_sd: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.01
     direction_sd_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 1.0
     common_mode_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    variation_sd: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    variation_length_m: Length | None = None
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
     types: dict[Line, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}  # noqa: RUF012
     temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
@@ -50,6 +58,8 @@ class Prior(StudyModel):
         if (self.temperature_coefficient_per_K is None) != (self.reference_temperature_C is None):
             raise ValueError("give temperature_coefficient_per_K and reference_temperature_C "
                              "together, or neither")
+        if (self.variation_sd > 0) != (self.variation_length_m is not None):
+            raise ValueError("give variation_sd and variation_length_m together, or neither")
         return self
 
 
@@ -60,7 +70,8 @@ class HeldOut(StudyModel):
     windows of ``window`` consecutive z positions and selects the last of every ``every`` windows;
     a table without any key means ``every = 2``. ``radii_m`` selects readings at these distances
     from the axis, ``components`` selects components of B, and ``z_ranges_m`` selects readings
-    between a lower and an upper limit of z.
+    between a lower and an upper limit of z. ``scan_lines_every`` selects the middle one of every so
+    many lines of the scan, the same ones that `halbach-fe check` holds out.
     """
 
     every: Annotated[int, Field(ge=2, le=1000)] | None = None
@@ -68,6 +79,7 @@ class HeldOut(StudyModel):
     radii_m: tuple[Gap, ...] = ()
     components: tuple[Component, ...] = ()
     z_ranges_m: tuple[tuple[Coordinate, Coordinate], ...] = ()
+    scan_lines_every: Annotated[int, Field(ge=2, le=1000)] | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -16,6 +16,9 @@ from halbach_fe.study.types import (
     Temperature,
 )
 
+MOST_SQUARE = 0.99
+"""Largest squareness for which irreversible losses are computed."""
+
 
 class Neighbour(StudyModel):
     """Another magnet with the same blocks, in vacuum, on the same axis.
@@ -55,6 +58,10 @@ class Demagnetization(StudyModel):
     ``..._coefficient_per_K`` per kelvin. ``temperature_C`` is the highest temperature of the
     magnet. The knee of the demagnetization curve is at ``squareness`` times the intrinsic
     coercivity, where the polarization is a tenth below the remanence (H_k of IEC 60404-8-1).
+
+    With ``irreversible`` the blocks have lost for good what the field that they are in takes, and
+    the field of the magnet is that with the losses; see `halbach_fe.solver.moments.irreversible`.
+    The remanence is then that of blocks which have lost nothing. This needs a magnet in 3D.
     """
 
     intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=1e4, le=1e7)]
@@ -63,9 +70,13 @@ class Demagnetization(StudyModel):
     coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
     reference_temperature_C: Temperature = 20.0
     temperature_C: Temperature = 20.0
+    irreversible: bool = False
 
     @model_validator(mode="after")
     def _consistent(self) -> Demagnetization:
+        if self.irreversible and self.squareness > MOST_SQUARE:
+            raise ValueError(f"squareness must be at most {MOST_SQUARE} for irreversible losses, "
+                             f"not {self.squareness}; the polarization would jump at the knee")
         for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
                                   ("coercivity", self.coercivity_coefficient_per_K)):
             if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:

@@ -24,6 +24,7 @@ from halbach_fe.study.types import (
     Point,
     PositionSd,
     RadiusScale,
+    RotationVector,
     StudyModel,
     Unit,
     one_or_list,
@@ -59,8 +60,8 @@ class Instrument(StudyModel):
     flux_density_unit_T: Unit = 1.0
     position_axes: Axes = ("x", "y", "z")
     field_axes: Axes = ("x", "y", "z")
-    translation_m: Displacement = (0.0, 0.0, 0.0)
-    rotation_rad: Fractions = (0.0, 0.0, 0.0)
+    translation_m: Point = (0.0, 0.0, 0.0)
+    rotation_rad: RotationVector = (0.0, 0.0, 0.0)
     z_scale: Fraction = 0.0
     radius_scale: RadiusScale = 0.0
     radius_offset_m: Offset = 0.0

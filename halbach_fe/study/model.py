@@ -28,7 +28,7 @@ from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 
 FIELD_KEYS = {"dimension", "array", "iron_ring", "iron", "external", "mesh", "open_boundary",
-              "solver"}
+              "solver", "demagnetization"}
 """Keys of a study that its computed field depends on."""
 
 
@@ -81,6 +81,13 @@ class Study(StudyModel):
         if self.iron_ring is not None and self.iron is not None:
             raise ValueError("give either iron_ring or iron, of which a ring can be one of the "
                              "bodies")
+        if self.demagnetization and self.demagnetization.irreversible and (
+                self.dimension == 2 or self.solver.method == "direct"
+                or self.solver.route not in ("auto", "moments")):
+            raise ValueError("demagnetization.irreversible needs a 3D study, and the route moments "
+                             "of the method reaction: leave solver.route and solver.method out")
+        if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
+            raise ValueError("prior.variation_sd needs a 3D study without iron")
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
             "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),

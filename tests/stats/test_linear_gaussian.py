@@ -207,7 +207,8 @@ def test_rows_take_over_where_the_product_is_not_exact_enough(generator, monkeyp
 def test_contraction_by_block(generator):
     prior = Gaussian(np.zeros(4), np.eye(4))
     after = Gaussian(np.zeros(4), np.diag([1.0, 1.0, 0.1, 0.1]))
-    assert contraction(prior, after, 2) == pytest.approx([0.0, 0.99])
+    assert contraction(*(each.sd.reshape(-1, 2) for each in (prior, after))) == pytest.approx(
+        [0.0, 0.99])
 
 
 def test_block_prior_along_and_across(generator):

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -141,10 +142,10 @@ class System:
         tensors = np.array([block.recoil_tensor for block in blocks]) - np.eye(3)
         there = [number for number in range(len(blocks))
                  if np.any(remanence[number]) or np.any(tensors[number])]
-        cells = cells_of([blocks[number] for number in there],
-                         cells_per_side or CELLS_PER_SIDE, divisions)
-        cells = replace(cells, block=np.array(there, int)[cells.block])
-        return cls(Interaction(cells), remanence[cells.block], tensors[cells.block], len(blocks))
+        interaction = _interaction(tuple(_shape(blocks[number]) for number in there), tuple(there),
+                                   cells_per_side or CELLS_PER_SIDE, divisions)
+        owner = interaction.cells.block
+        return cls(interaction, remanence[owner], tensors[owner], len(blocks))
 
     def solve(self, applied: Applied | None = None) -> Moments:
         """Return the polarization of the blocks in their own field and an applied one."""
@@ -195,6 +196,20 @@ class System:
             "with the study.")
 
 
+def _shape(block: MagnetBlock) -> MagnetBlock:
+    """Return a block of the same shape in the same place, of no particular material."""
+    return replace(block, easy_axis=(0.0, 0.0, 1.0), remanence=1.0, recoil_permeability=1.0,
+                   recoil_permeability_across=1.0, gradient=0.0)
+
+
+@lru_cache(maxsize=2)  # fits of materials solve the same cells again and again
+def _interaction(blocks: tuple[MagnetBlock, ...], numbers: tuple[int, ...], cells_per_side: int,
+                 divisions: int) -> Interaction:
+    """Return the cells of blocks with the given numbers."""
+    cells = cells_of(blocks, cells_per_side, divisions)
+    return Interaction(replace(cells, block=np.array(numbers, int)[cells.block]))
+
+
 def solve_moments(
     blocks: Sequence[MagnetBlock], *, cells_per_side: int | None = None, divisions: int = 2,
     applied: Applied | None = None,
@@ -219,11 +234,15 @@ def solve_moments(
     return System.of(blocks, cells_per_side, divisions).solve(applied)
 
 
-def refinement(blocks: Sequence[MagnetBlock],
-               cells_per_side: int | None = None) -> tuple[System, System]:
-    """Return blocks in cells, and in half as many along each side; a single cell, also in two."""
+def refinement(blocks: Sequence[MagnetBlock], cells_per_side: int | None = None,
+               slow: bool = False) -> tuple[System, System]:
+    """Return blocks in cells, and in half as many along each side; a single cell, also in two.
+
+    Where convergence is ``slow``, the others are one fewer along each side.
+    """
     cells = cells_per_side or CELLS_PER_SIDE
-    return System.of(blocks, cells), System.of(blocks, cells // 2 if cells > 1 else 2)
+    fewer = cells - 1 if slow else cells // 2
+    return System.of(blocks, cells), System.of(blocks, fewer if cells > 1 else 2)
 
 
 def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,738 @@
+"""The pose of a map in the magnet, found from nothing, and the probe's axes.
+
+A stage has coordinates of its own: its origin is somewhere, its axes point somewhere, and the axes
+of the probe point elsewhere again. Two steps find the rotation and the translation that bring the
+map's coordinates to those of the magnet.
+
+1. Every rotation by right angles is combined with translations along the magnet's axis. The nominal
+   blocks in vacuum, multiplied by any factor, are compared with the map; the best candidates are
+   improved by least squares, and those that end in the same place are one.
+2. For each of the best, least squares with the magnet's own model: pose and probe are fitted
+   together with the magnetizations of the blocks, whose prior is that of the study. The evidence
+   compares the candidates. A symmetric magnet makes some of them equal, and all of these are
+   results.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    remove_nonlinear_part,
+    sensor_matrix,
+    sensor_positions,
+)
+from halbach_fe.measurement.observation import held_out_readings, observe
+from halbach_fe.response.block_variation import Variations, with_variations
+from halbach_fe.solver.exact_block_field import field_of, unit_fields
+from halbach_fe.solver.formulation_choice import field_function
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import nominal_prior, root_matrix
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
+
+COARSE_POINTS, MIDDLE_POINTS = 60, 150
+"""Numbers of points of the map that are used to search, and to improve candidates."""
+
+STEP = 0.4
+"""Step of the translations along the axis, in units of the bore's radius."""
+
+CANDIDATES, WORTH_TRYING = 24, 3.0
+"""Largest number of candidates of the search that are improved, and multiple of the smallest rms
+residual up to which they are."""
+
+NEARLY_AS_GOOD = 1.5
+"""Candidates are kept whose rms residual is below this multiple of the smallest."""
+
+SAME_M, SAME_RAD = 1e-3, 0.02
+"""Candidates that differ by less are one: in m, and in rad."""
+
+MOST_POSES = 4
+"""Largest number of poses that are fitted with the magnet's own model."""
+
+ITERATIONS = 12
+"""Largest number of steps of a fit."""
+
+AT_REST = 0.02
+"""Largest step, in standard deviations of a parameter, at which a fit is at rest."""
+
+DIFFERENCE_M, SMALL = 2e-4, 1e-5
+"""Steps of finite differences: for the gradient of the field, and for the instrument."""
+
+CLOSE_M = 3e-4
+"""Distance of the sensors from their mean up to which the field is linear between them: in a
+gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
+
+KEPT_M = 1e-4
+"""Largest shift of the readings up to which the columns of the blocks are kept. They describe
+deviations of some per cent."""
+
+SEEN = 0.1
+"""Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
+of a reading."""
+
+RENEWED = 0.3
+"""Change of an open key, in prior standard deviations, after which derivatives by open keys are
+computed anew."""
+
+HALVINGS = 5
+"""Largest number of halvings of a step that does not improve the fit."""
+
+PROBE = 21
+"""Number of parameters of the probe: crosstalk, gains, offsets, and places of the sensors."""
+
+OFFSETS = slice(9, 12)
+"""Offsets among the parameters of the probe."""
+
+PART_OF_SD = 0.1
+"""Step of the finite differences by open keys, in prior standard deviations."""
+
+LONGEST_M, LONGEST_RAD = 5e-3, 0.05
+"""Longest step of a fit, along a direction and about it."""
+
+CROSSTALK = ("xy", "xz", "yx", "yz", "zx", "zy")
+
+Field = Callable[[Floats], Floats]
+"""Takes points (n, 3) in m and returns B (n, 3) in T."""
+
+
+@dataclass(frozen=True)
+class ProbePrior:
+    """Prior standard deviations of the instrument, apart from its pose.
+
+    Attributes
+    ----------
+    crosstalk : float
+        Of the probe's axes against those of the stage.
+    gain : float
+    offset_T : float
+    sensor_m : float
+        Of a sensor's place along each axis.
+    """
+
+    crosstalk: float = 0.03
+    gain: float = 0.003
+    offset_T: float = 1e-3
+    sensor_m: float = 1e-4
+
+
+@dataclass(frozen=True)
+class OpenKey:
+    """A number of the study that a drawing leaves open, to be fitted with the pose.
+
+    Attributes
+    ----------
+    key : str
+        Such as ``demagnetization.squareness``.
+    sd : float
+        Prior standard deviation about the value in the study.
+    longest_sd : float
+        Longest step of the fit, in these.
+    """
+
+    key: str
+    sd: float
+    longest_sd: float = 0.5
+
+    def value(self, study: Study) -> float:
+        """Return the number in a study.
+
+        Raises
+        ------
+        StudyError
+            If the key is not one number.
+        """
+        found: object = study
+        for name in self.key.split("."):
+            found = getattr(found, name, None)
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            raise StudyError(must_be(f"`{self.key}`", f"study {study.name}",
+                                     "a number that is given, to be fitted", f"'{found}'"))
+        return float(found)
+
+    def apply(self, study: Study, value: float) -> Study:
+        """Return the study with another number."""
+        return study.with_(**{self.key.replace(".", "__"): value})
+
+
+@dataclass(frozen=True)
+class Registration:
+    """One pose of a map in the magnet.
+
+    Attributes
+    ----------
+    study : Study
+        The study with the pose, axes, gains, offsets and sensors of its instrument, and with the
+        open keys.
+    translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
+        Standard deviations of the pose.
+    open_keys : dict of str to (float, float)
+        Value and standard deviation of each open key.
+    rms_T : ndarray, shape (3,)
+        Rms residual of the readings along each axis that were fitted, by the updated blocks.
+    nominal_rms_T : ndarray, shape (3,)
+        The same of the nominal blocks.
+    held_out_rms_T, held_out_nominal_rms_T : ndarray, shape (3,)
+        The same of the readings that the study holds out; NaN if there are none.
+    log_evidence : float
+        Log probability of the readings, up to a constant that all poses share.
+    at_rest : bool
+        Whether the fit came to rest.
+    """
+
+    study: Study
+    translation_sd_m: Floats
+    rotation_sd_rad: Floats
+    open_keys: dict[str, tuple[float, float]]
+    rms_T: Floats
+    nominal_rms_T: Floats
+    held_out_rms_T: Floats
+    held_out_nominal_rms_T: Floats
+    log_evidence: float
+    at_rest: bool
+
+    @property
+    def instrument(self) -> Instrument:
+        """The registered instrument."""
+        return self.study.instrument
+
+
+def register(
+    magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
+    open_keys: Sequence[OpenKey] = (), say: Callable[[str], None] = lambda _: None,
+) -> list[Registration]:
+    """Find the pose of a map in a magnet.
+
+    Parameters
+    ----------
+    magnet : Magnet
+        Its study states the noise, what is held out, and units, axes and law of the instrument; the
+        pose that it states is not used.
+    data : Dataset
+        The map, see `halbach_fe.read_map`, with all three components along axes of one sign; see
+        `halbach_fe.check_map`.
+    session : Session
+    probe : ProbePrior, optional
+    open_keys : sequence of OpenKey, optional
+        Numbers of the study that are fitted too.
+    say : callable, optional
+        Called with a description of each step before it starts.
+
+    Returns
+    -------
+    list of Registration
+        The most probable pose first.
+
+    Raises
+    ------
+    MeasurementError
+        If no pose puts the map's points in air, or the map has no field.
+    """
+    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys))
+    say("searching the pose among rotations by right angles and shifts along the axis")
+    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training)
+    found = []
+    for number, pose in enumerate(starts):
+        say(f"fitting pose {number + 1} of {len(starts)} with the blocks")
+        found.append(fit.refined(pose))
+    return sorted(found, key=lambda each: -each.log_evidence)
+
+
+# --- the search ---------------------------------------------------------------------------------
+
+
+def right_angles() -> list[Floats]:
+    """Return the 24 rotation matrices that bring axes to axes."""
+    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3))
+             for signs in product((1.0, -1.0), repeat=3)]
+    proper = [matrix for matrix in found if np.linalg.det(matrix) > 0]
+    return sorted(proper, key=lambda matrix: -float(np.trace(matrix)))
+
+
+def coarse_poses(
+    magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_]
+) -> list[Floats]:
+    """Return poses (6,), translation in m and rotation vector in rad, the best first.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    points, readings : ndarray, shape (n, 3)
+        In m and T; NaN for components that were not measured.
+    training : ndarray of bool, shape (n, 3)
+        The readings that may be used.
+    """
+    rows = np.flatnonzero(training.any(axis=1))
+    used = np.where(training, readings, 0.0)
+    if not len(rows) or not used.any():
+        raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
+    few, more = (rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
+                 for count in (COARSE_POINTS, MIDDLE_POINTS))
+    middle = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
+    reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
+    steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
+    shifts = np.linspace(-reach, reach, steps)
+    scores = []
+    for matrix in right_angles():
+        turned = (points[few] - middle) @ matrix.T
+        places = (turned[None] + np.outer(shifts, [0, 0, 1])[:, None]).reshape(-1, 3)
+        inside = magnet.contains(places).reshape(len(shifts), -1).any(axis=1)
+        fields = field_of(magnet.blocks, places).reshape(len(shifts), -1, 3) @ matrix
+        for shift, field, hit in zip(shifts, fields, inside, strict=True):
+            if not hit:
+                scores.append((_misfit(field, used[few], training[few])[0], shift, matrix))
+    if not scores:
+        raise MeasurementError(must_be(
+            "map", "registration", "one that fits into the bore, or beside the magnet",
+            f"points over {', '.join(f'{1e3 * size:.0f}' for size in np.ptp(points, axis=0))} mm",
+            "Check its unit of length, and the study's radii."))
+    scores.sort(key=lambda each: each[0])
+    improved: list[tuple[float, Floats]] = []
+    for rough, shift, matrix in scores[:CANDIDATES]:
+        if rough > WORTH_TRYING * scores[0][0]:
+            break
+        pose = np.concatenate([[0.0, 0.0, shift] - matrix @ middle,
+                               Rotation.from_matrix(matrix).as_rotvec()])
+        misfit, pose = _improved(magnet, pose, points[more], used[more], training[more])
+        if misfit is not None and not any(_same(pose, other, middle) for _, other in improved):
+            improved.append((misfit, pose))
+    if not improved:
+        raise MeasurementError(must_be("map", "registration", "one that fits into the bore",
+                                       "points inside blocks in every likely pose"))
+    improved.sort(key=lambda each: each[0])
+    best = improved[0][0]
+    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:MOST_POSES]
+
+
+def _misfit(
+    field: Floats, readings: Floats, training: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Return the rms in T of readings less a field times the best positive factor, and it."""
+    seen = np.where(training, field, 0.0)
+    power = float(np.sum(seen**2))
+    factor = max(0.0, float(np.sum(seen * readings)) / power) if power else 0.0
+    return float(np.sqrt(np.sum((readings - factor * seen)**2) / training.sum())), factor
+
+
+def _improved(
+    magnet: Magnet, pose: Floats, points: Floats, readings: Floats, training: NDArray[np.bool_]
+) -> tuple[float | None, Floats]:
+    """Return the rms and the pose (6,) of a fit to nominal blocks in vacuum; None in no air."""
+    def fields(at: Floats) -> tuple[Floats, Floats]:
+        turn = Rotation.from_rotvec(at[3:]).as_matrix()
+        return field_of(magnet.blocks, points @ turn.T + at[:3]) @ turn, turn
+
+    field, turn = fields(pose)
+    misfit, factor = _misfit(field, readings, training)
+    for _ in range(ITERATIONS):
+        columns = []
+        for axis in range(6):
+            size = DIFFERENCE_M if axis < 3 else DIFFERENCE_M / magnet.bore_radius
+            other = pose.copy()
+            if axis < 3:
+                other[axis] += size
+            else:
+                other[3:] = (Rotation.from_rotvec(size * np.eye(3)[axis - 3])
+                             * Rotation.from_matrix(turn)).as_rotvec()
+            columns.append(factor * (fields(other)[0] - field) / size)
+        design = np.stack([*columns, field], axis=-1)[training]
+        step = np.linalg.lstsq(design, (readings - factor * field)[training], rcond=None)[0][:6]
+        step *= min(1.0, LONGEST_M / np.abs(step[:3]).max(), LONGEST_RAD / np.abs(step[3:]).max())
+        for _ in range(4):
+            other = np.concatenate([pose[:3] + step[:3], (
+                Rotation.from_rotvec(step[3:]) * Rotation.from_matrix(turn)).as_rotvec()])
+            tried = fields(other)
+            score = _misfit(tried[0], readings, training)
+            if score[0] < misfit:
+                break
+            step = step / 2
+        else:
+            break
+        ended = score[0] > 0.999 * misfit
+        pose, (field, turn), (misfit, factor) = other, tried, score
+        if ended:
+            break
+    inside = magnet.contains(points @ turn.T + pose[:3])
+    return (None if inside.any() else misfit), pose
+
+
+def _same(first: Floats, second: Floats, middle: Floats) -> bool:
+    """Tell whether two poses put the middle of the map in the same place and turn it alike."""
+    one, other = (Rotation.from_rotvec(pose[3:]) for pose in (first, second))
+    apart = one.apply(middle) + first[:3] - other.apply(middle) - second[:3]
+    return bool(np.linalg.norm(apart) < SAME_M and (one * other.inv()).magnitude() < SAME_RAD)
+
+
+# --- least squares with the blocks --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What the fits of all poses share.
+
+    Attributes
+    ----------
+    points, readings : ndarray, shape (n, 3)
+        The map in m and T, by the study's units and axes.
+    training, held_out : ndarray of bool, shape (n, 3)
+    sigma, position_sd : float, in T and m
+    """
+
+    magnet: Magnet
+    points: Floats
+    readings: Floats
+    training: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
+    sigma: float
+    position_sd: float
+    session: Session
+    probe: ProbePrior
+    base: Instrument
+    open: tuple[OpenKey, ...]
+    variations: Variations | None
+    derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
+    solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
+           open_keys: tuple[OpenKey, ...]) -> _Fit:
+        study = magnet.study
+        for each in open_keys:
+            each.value(study)
+        base = study.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
+        data = in_si_and_magnet_axes(base, data)
+        points = points_of(data)
+        readings = remove_nonlinear_part(base, data)
+        measured = np.isfinite(readings)
+        observation = observe(study.with_(instrument=base), points, measured)
+        if study.observation.quantity != "flux_density":
+            raise MeasurementError(must_be(
+                "observation", f"study {study.name}", "of flux_density, to register a map",
+                study.observation.quantity))
+        entries = observation.analysis.indices  # one component of one point each
+        apart = held_out_readings(study, observation)
+        held_out, training = (np.zeros(measured.size, bool) for _ in range(2))
+        held_out[entries[apart]], training[entries[~apart]] = True, True
+        noise = study.noise
+        sigma = min((region.sigma_T for region in noise.regions), default=1e-4) if noise else 1e-4
+        position = max(noise.position_sd_m) if noise and noise.position_sd_m else 0.0
+        return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
+                   held_out.reshape(-1, 3), sigma, position, session, probe, base, open_keys,
+                   Variations.of(magnet))
+
+    def prior_sd(self) -> Floats:
+        """Return the prior standard deviations of the parameters after the pose."""
+        probe = self.probe
+        return np.concatenate([np.full(6, probe.crosstalk), np.full(3, probe.gain),
+                               np.full(3, probe.offset_T), np.full(9, probe.sensor_m),
+                               np.array([each.sd for each in self.open])])
+
+    def instrument(self, pose: Floats, values: Floats) -> Instrument:
+        """Return the instrument of a pose (6,) and of the other parameters."""
+        base = self.base
+        crosstalk = {name: base.crosstalk.get(name, 0.0) + float(value)
+                     for name, value in zip(CROSSTALK, values[:6], strict=True)}
+        gain, offset = (tuple((np.array(own) + values[part]).tolist()) for own, part in (
+            (base.gain, slice(6, 9)), (base.offset_T, slice(9, 12))))
+        sensors = np.array(base.sensor_position_m) + values[12:PROBE].reshape(3, 3)
+        return base.with_(
+            translation_m=tuple(pose[:3].tolist()), rotation_rad=tuple(pose[3:].tolist()),
+            crosstalk=crosstalk, gain=gain, offset_T=offset,
+            sensor_position_m=tuple(map(tuple, sensors.tolist())))
+
+    def study_of(self, pose: Floats, values: Floats) -> Study:
+        """Return the study of a pose and of the other parameters."""
+        return self._magnet(values).study.with_(instrument=self.instrument(pose, values))
+
+    def refined(self, pose: Floats) -> Registration:
+        """Return the registration to which least squares leads from a pose (6,)."""
+        prior_sd = self.prior_sd()
+        values = np.zeros(len(prior_sd))
+        rows = self.training.ravel()
+        columns = self._columns(pose, values)
+        state = self._state(pose, values, columns)
+        at_rest = False
+        for _ in range(ITERATIONS):
+            step, sd, chi2 = state.step(rows, values / prior_sd)
+            if float(np.abs(step / sd).max()) < AT_REST:
+                at_rest = True
+                break
+            share = min(1.0, LONGEST_M / np.abs(step[:3]).max(),
+                        LONGEST_RAD / np.abs(step[3:6]).max(),
+                        *(each.longest_sd * each.sd / max(abs(change), 1e-300) for each, change in
+                          zip(self.open, step[6 + PROBE:], strict=True)))
+            for _ in range(HALVINGS):
+                other, changed = _moved(pose, share * step[:6]), values + share * step[6:]
+                if self._is_possible(changed):
+                    near = columns if columns.serves(self._middle(other, changed)) else (
+                        self._columns(other, changed))
+                    tried = self._state(other, changed, near)
+                    if tried.chi2(rows, changed / prior_sd) <= chi2 * (1 + 1e-6):
+                        break
+                share /= 2
+            else:
+                break
+            pose, values, state, columns = other, changed, tried, near
+        step, sd, chi2 = state.step(rows, values / prior_sd)
+        updated, log_evidence = state.updated(rows, values / prior_sd)
+        return Registration(
+            self.study_of(pose, values), sd[:3], sd[3:6],
+            {each.key: (value, error) for each, value, error in zip(
+                self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
+            _rms(updated, self.training), _rms(state.residual, self.training),
+            _rms(updated, self.held_out), _rms(state.residual, self.held_out),
+            log_evidence, at_rest)
+
+    def _is_possible(self, values: Floats) -> bool:
+        """Tell whether a valid study has these values of the open keys."""
+        try:
+            self._magnet(values)
+        except HalbachError:
+            return False
+        return True
+
+    def _middle(self, pose: Floats, values: Floats) -> Floats:
+        """Return the mean positions (n, 3) in m of the sensors."""
+        return np.asarray(sensor_positions(self.instrument(pose, values), self.points).mean(axis=1))
+
+    def _columns(self, pose: Floats, values: Floats) -> _BlockColumns:
+        """Return the field of the blocks' magnetizations at a pose."""
+        middle, study = self._middle(pose, values), self.magnet.study
+        fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
+            self.magnet.blocks, unit_fields(self.magnet.blocks, middle), strict=True)]
+        variations = self.variations
+        if variations is not None:
+            fields.append(variations.fields(middle))
+        prior = with_variations(nominal_prior(
+            self.magnet.nominal_magnetization, 3, study.prior.magnitude_sd,
+            study.prior.direction_sd_deg, study.prior.common_mode_sd),
+            len(variations.names) if variations is not None else 0)
+        root = root_matrix(prior.root)
+        columns = np.concatenate(fields, axis=2) @ (
+            root if isinstance(root, np.ndarray) else root.toarray())
+        flat = columns.reshape(-1, columns.shape[-1])
+        sizes, directions = np.linalg.eigh(flat.T @ flat)
+        kept = sizes > len(flat) * (SEEN * self.sigma)**2
+        return _BlockColumns(middle, columns @ directions[:, kept])
+
+    def _magnet(self, values: Floats) -> Magnet:
+        """Return the magnet with the values of the open keys."""
+        magnet = self.magnet
+        for each, value in zip(self.open, each_value(self, values), strict=True):
+            magnet = magnet.with_study(each.apply(magnet.study, value))
+        return magnet
+
+    def _field(self, values: Floats) -> Field:
+        """Return the field of the nominal magnet with the values of the open keys."""
+        key = values[PROBE:].tobytes()
+        if key not in self.solved:
+            while len(self.solved) > len(self.open) + 1:
+                del self.solved[next(iter(self.solved))]
+            self.solved[key] = field_function(self._magnet(values), self.session)
+        return self.solved[key]
+
+    def _by_open_keys(self, values: Floats, middle: Floats) -> list[Floats]:
+        """Return the derivatives (n, 3) of B at places (n, 3) in m by every open key."""
+        scaled = values[PROBE:] / self.prior_sd()[PROBE:]
+        known = self.derivatives.get("at")
+        if known is None or np.abs(scaled - known).max(initial=0.0) > RENEWED:
+            self.derivatives["at"] = scaled
+            here = self._field(values)(middle) if self.open else middle
+            for number, each in enumerate(self.open):
+                step = each.sd * PART_OF_SD * np.eye(len(values))[PROBE + number]
+                changed = values + step if self._is_possible(values + step) else values - step
+                self.derivatives[each.key] = (self._field(changed)(middle) - here) / (
+                    changed - values)[PROBE + number]
+        return [self.derivatives[each.key] for each in self.open]
+
+    def _state(self, pose: Floats, values: Floats, near: _BlockColumns) -> _State:
+        """Return residual and derivatives of all readings at a pose and instrument."""
+        instrument = self.instrument(pose, values)
+        sensors = sensor_positions(instrument, self.points)
+        middle, count = sensors.mean(axis=1), len(self.points)
+        apart = np.abs(sensors - middle[:, None]).max() > CLOSE_M
+        places = sensors.reshape(-1, 3) if apart else middle
+        field = self._field(values)
+        steps = DIFFERENCE_M * np.eye(3)
+        fields = field(np.concatenate([places, *(
+            places + sign * step for step in steps for sign in (1, -1))]))
+        here, around = fields[:len(places)], fields[len(places):].reshape(3, 2, -1, 3)
+        gradient = np.moveaxis(around[:, 0] - around[:, 1], 0, -1) / (2 * DIFFERENCE_M)
+        if not apart:
+            here, gradient = np.repeat(here, 3, axis=0), np.repeat(gradient, 3, axis=0)
+            here = here + np.einsum("nck,nk->nc", gradient,
+                                    (sensors - middle[:, None]).reshape(-1, 3))
+        matrix = sensor_matrix(instrument)
+
+        def seen(at_sensors: Floats, by: Floats = matrix) -> Floats:
+            """Return readings (n, 3) of B (3 n, 3) at the sensors."""
+            return np.einsum("ij,nij->ni", by, at_sensors.reshape(count, 3, 3))
+
+        residual = self.readings - seen(here) - values[OFFSETS]
+        columns = []
+        for number in range(6 + PROBE):
+            other_pose, other_values = pose, values.copy()
+            if number < 6:
+                other_pose = _moved(pose, SMALL * np.eye(6)[number])
+            else:
+                other_values[number - 6] += SMALL
+            other = self.instrument(other_pose, other_values)
+            moved = (sensor_positions(other, self.points) - sensors).reshape(-1, 3)
+            there = here + np.einsum("nck,nk->nc", gradient, moved)
+            columns.append((seen(there, sensor_matrix(other)) - seen(here)
+                            + other_values[OFFSETS] - values[OFFSETS]) / SMALL)
+        for change in self._by_open_keys(values, middle):
+            columns.append(seen(np.repeat(change, 3, axis=0)))
+        at_mean = gradient.reshape(count, 3, 3, 3).mean(axis=1)
+        sigma = np.sqrt(self.sigma**2 + self.position_sd**2 * np.sum(
+            np.einsum("ij,njk->nik", matrix, at_mean)**2, axis=2))
+        return _State(residual, np.stack(columns, axis=-1),
+                      np.einsum("ij,njk->nik", matrix, near.fields), sigma, self.prior_sd())
+
+
+@dataclass(frozen=True)
+class _BlockColumns:
+    """Fields of the blocks at the places of a map.
+
+    Attributes
+    ----------
+    places : ndarray, shape (n, 3), in m
+    fields : ndarray, shape (n, 3, k), in T
+        B per prior standard deviation of the magnetizations.
+    """
+
+    places: Floats
+    fields: Floats
+
+    def serves(self, places: Floats) -> bool:
+        """Tell whether the fields hold at places (n, 3) too, for deviations of the blocks."""
+        return bool(np.abs(places - self.places).max() < KEPT_M)
+
+
+@dataclass(frozen=True)
+class _State:
+    """Readings and their derivatives at one pose and instrument.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (n, 3), in T
+        Of the nominal blocks.
+    by_parameter : ndarray, shape (n, 3, p)
+        Derivatives by shifts, turns, and the other parameters.
+    by_block : ndarray, shape (n, 3, k), in T
+        Readings per prior standard deviation of the magnetizations.
+    sigma : ndarray, shape (n, 3), in T
+    prior_sd : ndarray, shape (p - 6,)
+    """
+
+    residual: Floats
+    by_parameter: Floats
+    by_block: Floats
+    sigma: Floats
+    prior_sd: Floats
+
+    def _whitened(self, rows: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+        """Return residual (r,), derivatives (r, p) and block columns (r, k) of some readings."""
+        sigma = self.sigma.ravel()[rows]
+        return (self.residual.ravel()[rows] / sigma,
+                self.by_parameter.reshape(len(rows), -1)[rows] / sigma[:, None],
+                self.by_block.reshape(len(rows), -1)[rows] / sigma[:, None])
+
+    def step(self, rows: NDArray[np.bool_], scaled: Floats) -> tuple[Floats, Floats, float]:
+        """Return the step (p,) to the most probable parameters, their sd (p,), and chi-squared.
+
+        The magnetizations are integrated out. ``scaled`` are the present parameters after the pose
+        in prior standard deviations; the pose has no prior. chi-squared is that of the present
+        parameters.
+        """
+        residual, derivative, blocks = self._whitened(rows)
+        inner = blocks.T @ blocks
+        inner[np.diag_indices(len(inner))] += 1.0
+        factor = cho_factor(inner, lower=True)
+
+        def kept(values: Floats) -> Floats:
+            return values - blocks @ cho_solve(factor, blocks.T @ values)
+
+        left, projected = kept(residual), kept(derivative)
+        precision = np.concatenate([np.zeros(6), self.prior_sd**-2])
+        information = derivative.T @ projected + np.diag(precision)
+        prior = np.concatenate([np.zeros(6), scaled / self.prior_sd])
+        inverse = np.linalg.inv(information)
+        return (inverse @ (derivative.T @ left - prior), np.sqrt(np.diag(inverse)),
+                float(residual @ left + scaled @ scaled))
+
+    def chi2(self, rows: NDArray[np.bool_], scaled: Floats) -> float:
+        """Return chi-squared with the magnetizations integrated out, see `step`."""
+        return self.step(rows, scaled)[2]
+
+    def updated(self, rows: NDArray[np.bool_], scaled: Floats) -> tuple[Floats, float]:
+        """Return the residual (n, 3) in T of the updated blocks, and the log evidence."""
+        residual, derivative, blocks = self._whitened(rows)
+        design = np.hstack([blocks, derivative[:, :6], derivative[:, 6:] * self.prior_sd])
+        inner = design.T @ design
+        count = blocks.shape[1]
+        keep = np.ones(len(inner))
+        keep[count:count + 6] = 0.0
+        inner[np.diag_indices(len(inner))] += keep
+        start = np.concatenate([np.zeros(count + 6), scaled])
+        factor = cho_factor(inner, lower=True)
+        solution = cho_solve(factor, design.T @ residual - start * keep)
+        updated = self.residual - self.by_block @ solution[:count] - self.by_parameter @ (
+            np.concatenate([solution[count:count + 6], solution[count + 6:] * self.prior_sd]))
+        left = residual - design @ solution
+        chi2 = float(left @ left + np.sum((keep * (solution + start))**2))
+        return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
+            np.log(self.sigma.ravel()[rows]).sum())
+
+
+def each_value(fit: _Fit, values: Floats) -> list[float]:
+    """Return the values of the open keys among the parameters after the pose."""
+    return [each.value(fit.magnet.study) + float(change)
+            for each, change in zip(fit.open, values[PROBE:], strict=True)]
+
+
+def _moved(pose: Floats, step: Floats) -> Floats:
+    """Return a pose (6,) after a shift in m and a turn in rad of the magnet's axes, (6,)."""
+    turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(pose[3:])
+    return np.concatenate([pose[:3] + step[:3], turned.as_rotvec()])
+
+
+def _rms(residual: Floats, rows: NDArray[np.bool_]) -> Floats:
+    """Return the rms (3,) of the chosen residuals of each component; NaN if there are none."""
+    count = rows.sum(axis=0)
+    total = np.sum(np.where(rows, residual, 0.0)**2, axis=0)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def odds(found: Sequence[Registration]) -> Floats:
+    """Return the probabilities (n,) of poses among each other."""
+    logs = np.array([each.log_evidence for each in found])
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())
+
+
+def axes_of_map(instrument: Instrument) -> dict[str, str]:
+    """Return for each axis of the map the magnet's axis that is nearest, such as ``-z``."""
+    matrix = Rotation.from_rotvec(instrument.rotation_rad).as_matrix()
+    found = {}
+    for number, name in enumerate(COMPONENTS):
+        column = matrix[:, number]
+        largest = int(np.abs(column).argmax())
+        found[name] = ("-" if column[largest] < 0 else "") + COMPONENTS[largest]
+    return found

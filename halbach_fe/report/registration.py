@@ -1,0 +1,147 @@
+"""Sentences, table, figure, page and study file of a registration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from halbach_fe.core.files import write_text
+from halbach_fe.inference.registration import Registration, axes_of_map, odds
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
+from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, save, write_page
+from halbach_fe.study.edit_file import edited_text, write_edited
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
+
+NOTE = "found by halbach-fe register"
+
+EQUALLY_GOOD = 0.05
+"""Odds from which a second pose is reported as a possible one."""
+
+
+def sentences(found: Sequence[Registration]) -> list[str]:
+    """Return what was found, the answer first."""
+    best, probability = found[0], odds(found)
+    along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
+                      axes_of_map(best.instrument).items())
+    shift = ", ".join(f"{1e3 * value:.3f} ± {1e3 * sd:.3f}" for value, sd in zip(
+        best.instrument.translation_m, best.translation_sd_m, strict=True))
+    answer = [f"The map's origin lies at ({shift}) mm in the magnet, with {along} of the magnet."]
+    others = [100 * value for value in probability[1:] if value > EQUALLY_GOOD]
+    if others:
+        answer.append(
+            f"{len(others)} other pose{'s' if len(others) > 1 else ''} cannot be ruled out, with "
+            f"odds of {', '.join(f'{value:.0f}' for value in others)} % beside "
+            f"{100 * probability[0]:.0f} %: the magnet looks the same from there.")
+    answer.append(
+        f"The nominal magnet there is {_mT(best.nominal_rms_T)} off the readings that were fitted, "
+        f"with updated blocks {_mT(best.rms_T)}"
+        + (f"; the lines that were held out are {_mT(best.held_out_nominal_rms_T)} and "
+           f"{_mT(best.held_out_rms_T)} off." if np.isfinite(best.held_out_rms_T).any() else "."))
+    for key, (value, sd) in best.open_keys.items():
+        answer.append(f"{key} is {value:.5g} ± {sd:.1g}.")
+    if not best.at_rest:
+        answer.append("The fit has not come to rest: its error bars may be too small. Look for "
+                      "what the model lacks with halbach-fe diagnose.")
+    return answer
+
+
+def _mT(rms: np.ndarray) -> str:  # noqa: N802 - a unit
+    """Return the rms over the components in mT."""
+    return f"{1e3 * float(np.sqrt(np.nanmean(rms**2))):.3g} mT rms"
+
+
+def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
+    """Return rows of text, one per pose."""
+    rows = []
+    for each, probability in zip(found, odds(found), strict=True):
+        rows.append({
+            "odds": f"{100 * probability:.3g} %",
+            "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
+            "origin in mm": ", ".join(f"{1e3 * value:.3f}" for value in
+                                      each.instrument.translation_m),
+            "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
+            "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
+                                          each.instrument.rotation_rad),
+            "nominal": _mT(each.nominal_rms_T), "updated": _mT(each.rms_T)})
+    return rows
+
+
+def probe_table(instrument: Instrument) -> list[dict[str, str]]:
+    """Return rows of text: what the fit says about the probe."""
+    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}", "value": f"{1e3 * value:+.2f} mrad"}
+            for name, value in instrument.crosstalk.items()]
+    for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
+                                         instrument.sensor_position_m, strict=True):
+        rows += [{"of the probe": f"gain of B{name}", "value": f"{100 * gain:+.3f} %"},
+                 {"of the probe": f"offset of B{name}", "value": f"{1e3 * offset:+.3f} mT"},
+                 {"of the probe": f"place of the B{name} sensor",
+                  "value": ", ".join(f"{1e3 * value:+.3f}" for value in place) + " mm"}]
+    return rows
+
+
+def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
+    """Return the poses as plain data, the content of registration.json."""
+    def numbers(values: np.ndarray) -> list[float | None]:
+        return [None if np.isnan(value) else float(value) for value in values]
+
+    return {"poses": [{
+        "odds": float(probability), "at_rest": each.at_rest,
+        "axes": axes_of_map(each.instrument),
+        "instrument": each.instrument.model_dump(mode="json", exclude_defaults=True),
+        "open_keys": {key: {"value": value, "sd": sd}
+                      for key, (value, sd) in each.open_keys.items()},
+        "translation_sd_m": numbers(each.translation_sd_m),
+        "rotation_sd_rad": numbers(each.rotation_sd_rad),
+        "rms_T": numbers(each.rms_T), "nominal_rms_T": numbers(each.nominal_rms_T),
+        "held_out_rms_T": numbers(each.held_out_rms_T),
+        "held_out_nominal_rms_T": numbers(each.held_out_nominal_rms_T),
+        "log_evidence": each.log_evidence,
+    } for each, probability in zip(found, odds(found), strict=True)]}
+
+
+def write_registration(
+    study: Study, text: str, data: xr.Dataset, found: Sequence[Registration], folder: Path,
+    provenance: Mapping[str, str],
+) -> None:
+    """Write study.registered.toml, registration.json, registration.html and its figure."""
+    best = found[0]
+    steps = [(best.study, NOTE)]
+    write_edited(folder / "study.registered.toml", text, steps)
+    write_text(folder / "registration.json",
+               json.dumps(registration_summary(found), indent=1, allow_nan=False) + "\n")
+    figures = {"registration.png": (_where(best, data), (
+        "The readings along the magnet's axis and in its cross-section, where the registration "
+        "puts them"))}
+    write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
+               provenance, found=sentences(found), poses=pose_table(found), name=study.name,
+               probe=probe_table(best.instrument), changed=edited_text(text, steps) != text)
+
+
+def _where(best: Registration, data: xr.Dataset) -> Figure:
+    """Draw the readings where the registration puts them in the magnet."""
+    base = best.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
+    read = in_si_and_magnet_axes(base, data)
+    points = 1e3 * probe_points(best.instrument, points_of(read))
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
+                                    (SECOND, POSTERIOR, MEASURED), strict=True):
+        along.plot(points[:, 2], values, ".", ms=2, color=colour, label=f"B{name} of the map")
+    along.set_xlabel("z in the magnet in mm")
+    along.set_ylabel("B in T")
+    along.grid(alpha=0.3)
+    along.legend(markerscale=4)
+    across.plot(points[:, 0], points[:, 1], ".", ms=3, color=POSTERIOR)
+    across.set_aspect("equal", adjustable="datalim")
+    across.set_xlabel("x in the magnet in mm")
+    across.set_ylabel("y in the magnet in mm")
+    across.grid(alpha=0.3)
+    return figure

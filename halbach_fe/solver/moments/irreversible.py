@@ -1,0 +1,180 @@
+"""What blocks have lost of their remanence in the field that they are in, for good.
+
+A block that is driven past the knee of its demagnetization curve keeps a part of its remanence
+only, and the loss changes the field that the others are in. In every cell the polarization along
+the easy axis u is ``J = B_r p(h) + chi h`` with ``h = mu_0 H . u``, and
+``p(h) = tanh((h + h_c) / (2 w))``: nearly 1 above the knee, 0.9 at it, and 0 at ``-h_c``, for
+``h_c = mu_0 H_cJ`` and a width w that follows from the squareness ``H_k / H_cJ``. This is the major
+branch of the hysteresis loop on which magnets are that have been saturated and then assembled;
+nothing has driven them back since.
+
+The equations are those of `halbach_fe.solver.moments.solve` with that J in place of a constant
+remanence. Newton's method solves them, each step by GMRES. The operator ``J - p(H(J))`` is
+monotone, since p grows with H and the field of polarized cells opposes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, gmres
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError
+from halbach_fe.solver.moments.solve import Applied, Moments, System
+from halbach_fe.study.magnet import Demagnetization
+from halbach_fe.study.materials import MU_0
+
+AT_KNEE = 0.9
+"""Part of the remanence that is left at the knee, by the definition of H_k in IEC 60404-8-1."""
+
+TOLERANCE = 1e-4
+"""Largest residual of a polarization, relative to the remanence, that ends Newton's method. Losses
+are some 10 % where they matter, and the coercivity is hardly known to 1 %."""
+
+MAX_STEPS, MAX_HALVINGS = 40, 6
+"""Largest number of Newton's steps, and of halvings of one of them."""
+
+INNER_TOLERANCE, INNER_STEPS = 0.05, 30
+"""Residual that ends GMRES, relative to its right-hand side, and its largest number of steps."""
+
+INNER_DEGREE = 3
+"""Degree of the expansions within GMRES, whose result only has to point the right way."""
+
+OWN_FIELD = 1 / 3
+"""Field of a cell in itself relative to its polarization, for the preconditioner: that of a
+cube."""
+
+
+@dataclass(frozen=True)
+class KneeLaw:
+    """A demagnetization curve with a knee.
+
+    Attributes
+    ----------
+    coercivity_T : float
+        mu_0 H_cJ.
+    squareness : float
+        Ratio of H_k, where a tenth of the remanence is lost, to H_cJ; below 1.
+    """
+
+    coercivity_T: float
+    squareness: float
+
+    @classmethod
+    def of(cls, material: Demagnetization) -> KneeLaw:
+        """Return the law of a study's material at its temperature."""
+        change = material.coercivity_coefficient_per_K * (
+            material.temperature_C - material.reference_temperature_C)
+        return cls(MU_0 * material.intrinsic_coercivity_A_per_m * (1 + change),
+                   material.squareness)
+
+    @property
+    def width_T(self) -> float:  # noqa: N802 - a unit
+        """The width w in T."""
+        return self.coercivity_T * (1 - self.squareness) / (2 * float(np.arctanh(AT_KNEE)))
+
+    def kept(self, field: Floats) -> Floats:
+        """Return the part p of the remanence that is left at mu_0 H . u = ``field``, in T."""
+        return np.tanh((field + self.coercivity_T) / (2 * self.width_T))
+
+    def slope(self, field: Floats) -> Floats:
+        """Return the derivative of `kept` in 1/T."""
+        return (1 - self.kept(field)**2) / (2 * self.width_T)
+
+
+def solve_irreversible(
+    system: System, law: KneeLaw, applied: Applied | None = None
+) -> tuple[Moments, Floats]:
+    """Return the polarization of blocks that have lost remanence, and the loss.
+
+    Parameters
+    ----------
+    system : System
+        The cells with the remanence that they had when they were saturated.
+    law : KneeLaw
+    applied : callable, optional
+        mu_0 H of other sources, such as iron.
+
+    Returns
+    -------
+    moments : Moments
+        The polarization less the original remanence.
+    lost : ndarray, shape (cells,), in T
+        Mean loss in every cell.
+
+    Raises
+    ------
+    HalbachError
+        If Newton's method does not come to rest.
+    """
+    interaction, chi, cells = system.interaction, system.susceptibility, system.interaction.cells
+    strength = np.linalg.norm(system.remanence, axis=1)
+    easy = system.remanence / np.where(strength > 0, strength, 1.0)[:, None]
+    outer = np.zeros_like(cells.nodes)
+    if applied is not None:
+        outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
+    polarization, steps = _uniform(system, strength, easy, law, cells.mean(outer))
+    # the polarization about the nodes differs as the field there does; its means stay
+    field = interaction.node_field(polarization) + outer
+    by_node = np.einsum("nij,nqj->nqi", chi, field) + (
+        strength[:, None] * law.kept(np.einsum("nqi,ni->nq", field, easy)))[..., None] * (
+        easy[:, None])
+    by_node += (polarization - cells.mean(by_node))[:, None]
+    along = np.einsum("ni,ni->n", interaction.mean_field(polarization) + cells.mean(outer), easy)
+    return (Moments(interaction, by_node - system.remanence[:, None], system.blocks, steps),
+            np.asarray(strength * (1 - law.kept(along))))
+
+
+def _uniform(
+    system: System, strength: Floats, easy: Floats, law: KneeLaw, outer: Floats
+) -> tuple[Floats, int]:
+    """Return polarizations (cells, 3) in T that are uniform in every cell, and Newton's steps.
+
+    ``strength`` (cells,) in T and ``easy`` (cells, 3) are amount and direction of the remanence;
+    ``outer`` (cells, 3) in T is the mean of mu_0 H of other sources.
+    """
+    interaction, chi = system.interaction, system.susceptibility
+    scale = float(strength.max(initial=0.0))
+
+    def residual(polarization: Floats) -> tuple[Floats, Floats]:
+        """Return the residual (cells, 3) in T, and h (cells,) in T."""
+        field = interaction.mean_field(polarization) + outer
+        along = np.einsum("ni,ni->n", field, easy)
+        return (polarization - (strength * law.kept(along))[:, None] * easy
+                - np.einsum("nij,nj->ni", chi, field)), along
+
+    polarization = system.remanence
+    left, along = residual(polarization)
+    for count in range(MAX_STEPS):
+        size = float(np.linalg.norm(left))
+        if np.abs(left).max(initial=0.0) <= TOLERANCE * scale:
+            return polarization, count
+        tangent = chi + (strength * law.slope(along))[:, None, None] * (
+            easy[:, :, None] * easy[:, None])
+
+        def times(vector: Floats, tangent: Floats = tangent) -> Floats:
+            step = vector.reshape(-1, 3)
+            field = interaction.mean_field(step, INNER_DEGREE)
+            return np.asarray(step - np.einsum("nij,nj->ni", tangent, field)).ravel()
+
+        inverse = np.linalg.inv(np.eye(3) + OWN_FIELD * tangent)
+
+        def precondition(vector: Floats, inverse: Floats = inverse) -> Floats:
+            return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).ravel()
+
+        unknowns = (left.size, left.size)
+        step, _ = gmres(LinearOperator(unknowns, times, dtype=float), -left.ravel(),
+                        rtol=INNER_TOLERANCE, restart=INNER_STEPS, maxiter=1,
+                        M=LinearOperator(unknowns, precondition, dtype=float))
+        step = step.reshape(-1, 3)
+        for _ in range(MAX_HALVINGS):
+            tried, tried_along = residual(polarization + step)
+            if np.linalg.norm(tried) < size:
+                break
+            step = step / 2
+        polarization, left, along = polarization + step, tried, tried_along
+    raise HalbachError(
+        f"The irreversible losses of the blocks do not settle in {MAX_STEPS} steps: the last left "
+        f"{np.abs(left).max() / scale:.1e} of the remanence. Please report this with the study.")
