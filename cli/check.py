@@ -4,8 +4,9 @@ Fits the map by a field of sources outside the mapped region together with the p
 three-axis probe. Says which signs or exchanged axes make the map obey div B = 0 and curl B = 0,
 where the sensors are, how the probe is turned, which rows are broken, and which noise remains: no
 model of a magnet can explain the map any better. With an output folder, also writes check.json,
-check.csv (the residual of every reading), check.html and its figures, and oriented_map.csv, the
-map without broken rows and with its components along the right axes.
+check.csv (the residual of every reading), check.html and its figures, oriented_map.csv, the
+map without broken rows and with its components along the right axes, and corrected_map.csv, what a
+probe without errors would have read.
 """
 
 from __future__ import annotations

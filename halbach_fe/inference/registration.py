@@ -60,6 +60,9 @@ residual up to which they are."""
 NEARLY_AS_GOOD = 1.5
 """Candidates are kept whose rms residual is below this multiple of the smallest."""
 
+UNEXPLAINED = 0.5
+"""Share of the field, in rms, that the nominal blocks may leave in the best pose."""
+
 SAME_M, SAME_RAD = 1e-3, 0.02
 """Candidates that differ by less are one: in m, and in rad."""
 
@@ -87,7 +90,10 @@ SEEN = 0.1
 """Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
 of a reading."""
 
-RENEWED = 0.3
+LONGEST_SD = 1.0
+"""Longest step of an open key, in prior standard deviations."""
+
+RENEWED = 0.7
 """Change of an open key, in prior standard deviations, after which derivatives by open keys are
 computed anew."""
 
@@ -142,13 +148,10 @@ class OpenKey:
         Such as ``demagnetization.squareness``.
     sd : float
         Prior standard deviation about the value in the study.
-    longest_sd : float
-        Longest step of the fit, in these.
     """
 
     key: str
     sd: float
-    longest_sd: float = 0.5
 
     def value(self, study: Study) -> float:
         """Return the number in a study.
@@ -180,8 +183,10 @@ class Registration:
     study : Study
         The study with the pose, axes, gains, offsets and sensors of its instrument, and with the
         open keys.
+    middle_m : ndarray, shape (3,)
+        Where the middle of the map lies in the magnet, see `middle_of`.
     translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
-        Standard deviations of the pose.
+        Standard deviations of that place, and of the turns about the magnet's axes.
     open_keys : dict of str to (float, float)
         Value and standard deviation of each open key.
     rms_T : ndarray, shape (3,)
@@ -197,6 +202,7 @@ class Registration:
     """
 
     study: Study
+    middle_m: Floats
     translation_sd_m: Floats
     rotation_sd_rad: Floats
     open_keys: dict[str, tuple[float, float]]
@@ -247,6 +253,11 @@ def register(
     fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys))
     say("searching the pose among rotations by right angles and shifts along the axis")
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training)
+    starts = [pose for pose in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), pose)]
+    if not starts:
+        raise MeasurementError(must_be(
+            "map", "registration", "one that fits into the bore, or beside the magnet",
+            "points inside blocks in every likely pose", "Check its unit of length."))
     found = []
     for number, pose in enumerate(starts):
         say(f"fitting pose {number + 1} of {len(starts)} with the blocks")
@@ -268,7 +279,9 @@ def right_angles() -> list[Floats]:
 def coarse_poses(
     magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_]
 ) -> list[Floats]:
-    """Return poses (6,), translation in m and rotation vector in rad, the best first.
+    """Return poses (6,), the best first: where the map's middle lies in m, and a rotation vector.
+
+    The middle is that of `middle_of`, so that a turn does not move the map.
 
     Parameters
     ----------
@@ -284,13 +297,13 @@ def coarse_poses(
         raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
     few, more = (rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
                  for count in (COARSE_POINTS, MIDDLE_POINTS))
-    middle = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
+    points = points - middle_of(points)
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
     shifts = np.linspace(-reach, reach, steps)
     scores = []
     for matrix in right_angles():
-        turned = (points[few] - middle) @ matrix.T
+        turned = points[few] @ matrix.T
         places = (turned[None] + np.outer(shifts, [0, 0, 1])[:, None]).reshape(-1, 3)
         inside = magnet.contains(places).reshape(len(shifts), -1).any(axis=1)
         fields = field_of(magnet.blocks, places).reshape(len(shifts), -1, 3) @ matrix
@@ -307,16 +320,21 @@ def coarse_poses(
     for rough, shift, matrix in scores[:CANDIDATES]:
         if rough > WORTH_TRYING * scores[0][0]:
             break
-        pose = np.concatenate([[0.0, 0.0, shift] - matrix @ middle,
-                               Rotation.from_matrix(matrix).as_rotvec()])
+        pose = np.concatenate([[0.0, 0.0, shift], Rotation.from_matrix(matrix).as_rotvec()])
         misfit, pose = _improved(magnet, pose, points[more], used[more], training[more])
-        if misfit is not None and not any(_same(pose, other, middle) for _, other in improved):
+        if misfit is not None and not any(_same(pose, other) for _, other in improved):
             improved.append((misfit, pose))
     if not improved:
         raise MeasurementError(must_be("map", "registration", "one that fits into the bore",
                                        "points inside blocks in every likely pose"))
     improved.sort(key=lambda each: each[0])
     best = improved[0][0]
+    size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
+    if best > UNEXPLAINED * size:
+        raise MeasurementError(must_be(
+            "map", "registration", "one that some pose of the magnet explains",
+            f"{best / size:.0%} of its field unexplained in the best one",
+            "Check the axes and signs of its columns with halbach-fe check."))
     return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:MOST_POSES]
 
 
@@ -372,11 +390,16 @@ def _improved(
     return (None if inside.any() else misfit), pose
 
 
-def _same(first: Floats, second: Floats, middle: Floats) -> bool:
+def middle_of(points: Floats) -> Floats:
+    """Return the middle (3,) in m of the box about points (n, 3)."""
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def _same(first: Floats, second: Floats) -> bool:
     """Tell whether two poses put the middle of the map in the same place and turn it alike."""
     one, other = (Rotation.from_rotvec(pose[3:]) for pose in (first, second))
-    apart = one.apply(middle) + first[:3] - other.apply(middle) - second[:3]
-    return bool(np.linalg.norm(apart) < SAME_M and (one * other.inv()).magnitude() < SAME_RAD)
+    return bool(np.linalg.norm(first[:3] - second[:3]) < SAME_M
+                and (one * other.inv()).magnitude() < SAME_RAD)
 
 
 # --- least squares with the blocks --------------------------------------------------------------
@@ -451,8 +474,9 @@ class _Fit:
         gain, offset = (tuple((np.array(own) + values[part]).tolist()) for own, part in (
             (base.gain, slice(6, 9)), (base.offset_T, slice(9, 12))))
         sensors = np.array(base.sensor_position_m) + values[12:PROBE].reshape(3, 3)
+        origin = pose[:3] - Rotation.from_rotvec(pose[3:]).apply(middle_of(self.points))
         return base.with_(
-            translation_m=tuple(pose[:3].tolist()), rotation_rad=tuple(pose[3:].tolist()),
+            translation_m=tuple(origin.tolist()), rotation_rad=tuple(pose[3:].tolist()),
             crosstalk=crosstalk, gain=gain, offset_T=offset,
             sensor_position_m=tuple(map(tuple, sensors.tolist())))
 
@@ -473,13 +497,13 @@ class _Fit:
             if float(np.abs(step / sd).max()) < AT_REST:
                 at_rest = True
                 break
+            longest = LONGEST_SD * prior_sd[PROBE:]
+            step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
             share = min(1.0, LONGEST_M / np.abs(step[:3]).max(),
-                        LONGEST_RAD / np.abs(step[3:6]).max(),
-                        *(each.longest_sd * each.sd / max(abs(change), 1e-300) for each, change in
-                          zip(self.open, step[6 + PROBE:], strict=True)))
+                        LONGEST_RAD / np.abs(step[3:6]).max())
             for _ in range(HALVINGS):
                 other, changed = _moved(pose, share * step[:6]), values + share * step[6:]
-                if self._is_possible(changed):
+                if self.is_possible(changed, other):
                     near = columns if columns.serves(self._middle(other, changed)) else (
                         self._columns(other, changed))
                     tried = self._state(other, changed, near)
@@ -492,20 +516,25 @@ class _Fit:
         step, sd, chi2 = state.step(rows, values / prior_sd)
         updated, log_evidence = state.updated(rows, values / prior_sd)
         return Registration(
-            self.study_of(pose, values), sd[:3], sd[3:6],
+            self.study_of(pose, values), pose[:3], sd[:3], sd[3:6],
             {each.key: (value, error) for each, value, error in zip(
                 self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
             log_evidence, at_rest)
 
-    def _is_possible(self, values: Floats) -> bool:
-        """Tell whether a valid study has these values of the open keys."""
+    def is_possible(self, values: Floats, pose: Floats | None = None) -> bool:
+        """Tell whether a valid study has these values, and all readings lie in air at a pose."""
         try:
-            self._magnet(values)
+            magnet = self._magnet(values)
+            if pose is None:
+                return True
+            sensors = sensor_positions(self.instrument(pose, values), self.points).reshape(-1, 3)
         except HalbachError:
             return False
-        return True
+        around = np.concatenate([sensors + sign * DIFFERENCE_M * axis
+                                 for axis in np.eye(3) for sign in (1, -1)])
+        return not magnet.contains(around).any()
 
     def _middle(self, pose: Floats, values: Floats) -> Floats:
         """Return the mean positions (n, 3) in m of the sensors."""
@@ -524,9 +553,9 @@ class _Fit:
             study.prior.direction_sd_deg, study.prior.common_mode_sd),
             len(variations.names) if variations is not None else 0)
         root = root_matrix(prior.root)
-        columns = np.concatenate(fields, axis=2) @ (
-            root if isinstance(root, np.ndarray) else root.toarray())
-        flat = columns.reshape(-1, columns.shape[-1])
+        whole = np.concatenate(fields, axis=2)
+        flat = np.asarray(whole.reshape(-1, whole.shape[-1]) @ root)
+        columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.sigma)**2
         return _BlockColumns(middle, columns @ directions[:, kept])
@@ -556,7 +585,7 @@ class _Fit:
             here = self._field(values)(middle) if self.open else middle
             for number, each in enumerate(self.open):
                 step = each.sd * PART_OF_SD * np.eye(len(values))[PROBE + number]
-                changed = values + step if self._is_possible(values + step) else values - step
+                changed = values + step if self.is_possible(values + step) else values - step
                 self.derivatives[each.key] = (self._field(changed)(middle) - here) / (
                     changed - values)[PROBE + number]
         return [self.derivatives[each.key] for each in self.open]
@@ -708,7 +737,7 @@ def each_value(fit: _Fit, values: Floats) -> list[float]:
 
 
 def _moved(pose: Floats, step: Floats) -> Floats:
-    """Return a pose (6,) after a shift in m and a turn in rad of the magnet's axes, (6,)."""
+    """Return a pose (6,) after a shift in m and a turn in rad about the magnet's axes, (6,)."""
     turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(pose[3:])
     return np.concatenate([pose[:3] + step[:3], turned.as_rotvec()])
 

@@ -173,6 +173,9 @@ class MapCheck:
         Rows that were not fitted.
     residual_T : ndarray, shape (n, 3)
         Residual in the given columns; NaN where nothing was measured.
+    corrected_T : ndarray, shape (n, 3)
+        What a probe without errors would have read: Bx, By and Bz at the points of the map, by the
+        instrument that the lines show which are not held out.
     """
 
     readings: int
@@ -193,6 +196,7 @@ class MapCheck:
     redundancy: float
     excluded: NDArray[np.bool_]
     residual_T: Floats
+    corrected_T: Floats
 
     @property
     def suffices(self) -> bool:
@@ -211,7 +215,7 @@ class MapCheck:
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
-        left_out = ("excluded", "residual_T")
+        left_out = ("excluded", "residual_T", "corrected_T")
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, value in self.__dict__.items()
                 if name not in left_out and name != "terms"} | {
@@ -309,7 +313,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
         noise_T=noise, position_noise_m=displaced,
         structure=_structure(points[chosen], residual[chosen]),
         redundancy=1 - whole.used / (3 * int(chosen.sum())), excluded=~usable,
-        residual_T=residual @ matrix)
+        residual_T=residual @ matrix, corrected_T=model.ideal(train))
 
 
 def _rms(residual: Floats) -> Floats:
@@ -599,6 +603,17 @@ class _Model:
             places, reads = self._sensor(at, some, sensor)
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
+
+    def ideal(self, at: _Fitted) -> Floats:
+        """Return what a probe without errors would have read (n, 3) in T.
+
+        What the fit leaves stays in it, along the axes that the sensors read.
+        """
+        every = np.ones(len(self.points), bool)
+        reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
+        left = self.field - self.readings(at)
+        return self.charges.field(self.points, at.amplitudes) + np.linalg.solve(
+            reads, left[..., None])[..., 0]
 
 
 def _fitted(

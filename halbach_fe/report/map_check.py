@@ -127,7 +127,9 @@ def residual_table(check: MapCheck) -> list[dict[str, str]]:
 def write_map_check(
     data: xr.Dataset, check: MapCheck, folder: Path, provenance: Mapping[str, str]
 ) -> None:
-    """Write check.json, check.csv, check.html, its figures, and oriented_map.csv if it differs."""
+    """Write check.json, check.csv, check.html, its figures, oriented_map.csv if it differs, and
+    corrected_map.csv if the map can tell.
+    """
     points = points_of(data)
     write_text(folder / "check.json", json.dumps(check.plain(), indent=1, allow_nan=False) + "\n")
     with atomic(folder / "check.csv") as temporary:
@@ -139,6 +141,9 @@ def write_map_check(
     if check.is_reoriented or check.excluded.any():
         write_map(oriented(data, check), folder / "oriented_map.csv")
         files.append("oriented_map.csv")
+    if check.suffices:
+        write_map(corrected(data, check), folder / "corrected_map.csv")
+        files.append("corrected_map.csv")
     figures = {
         "check_slices.png": (_slices(points, np.asarray(data["B_T"].values), check), (
             "A slice through the middle of the map: every column as it was measured, and its "
@@ -161,6 +166,13 @@ def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
         turned["B_T"][:, axis] = sign * kept["B_T"].values[:, column]
         if "sigma_T" in kept:
             turned["sigma_T"][:, axis] = kept["sigma_T"].values[:, column]
+    return turned
+
+
+def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
+    """Return the map that a probe without errors would have made, without broken rows."""
+    turned = oriented(data, check)
+    turned["B_T"] = turned["B_T"].copy(data=check.corrected_T[~check.excluded])
     return turned
 
 

@@ -31,9 +31,10 @@ def sentences(found: Sequence[Registration]) -> list[str]:
     best, probability = found[0], odds(found)
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
                       axes_of_map(best.instrument).items())
-    shift = ", ".join(f"{1e3 * value:.3f} ± {1e3 * sd:.3f}" for value, sd in zip(
-        best.instrument.translation_m, best.translation_sd_m, strict=True))
-    answer = [f"The map's origin lies at ({shift}) mm in the magnet, with {along} of the magnet."]
+    place = ", ".join(f"{1e3 * value:.3f} ± {1e3 * sd:.3f}" for value, sd in zip(
+        best.middle_m, best.translation_sd_m, strict=True))
+    answer = [f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
+              "magnet."]
     others = [100 * value for value in probability[1:] if value > EQUALLY_GOOD]
     if others:
         answer.append(
@@ -65,8 +66,7 @@ def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
         rows.append({
             "odds": f"{100 * probability:.3g} %",
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
-            "origin in mm": ", ".join(f"{1e3 * value:.3f}" for value in
-                                      each.instrument.translation_m),
+            "middle in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.middle_m),
             "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
             "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
                                           each.instrument.rotation_rad),
@@ -98,7 +98,7 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         "instrument": each.instrument.model_dump(mode="json", exclude_defaults=True),
         "open_keys": {key: {"value": value, "sd": sd}
                       for key, (value, sd) in each.open_keys.items()},
-        "translation_sd_m": numbers(each.translation_sd_m),
+        "middle_m": numbers(each.middle_m), "translation_sd_m": numbers(each.translation_sd_m),
         "rotation_sd_rad": numbers(each.rotation_sd_rad),
         "rms_T": numbers(each.rms_T), "nominal_rms_T": numbers(each.nominal_rms_T),
         "held_out_rms_T": numbers(each.held_out_rms_T),

@@ -1,0 +1,169 @@
+"""Poses of maps that magpylib computed: found from nothing, with blocks and probe in error."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.registration import OpenKey, odds, register, right_angles
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study, read_study
+
+TEXT = """
+name = "short"
+[array]
+multipole_order = 1
+rings = 2
+blocks_per_ring = 8
+inner_radius_m = 0.02
+outer_radius_m = 0.04
+ring_length_m = 0.03
+remanence_T = 1.3
+[array.block]
+shape = "sector"
+[mesh]
+block_size_m = 0.01
+[observation]
+quantity = "flux_density"
+[observation.positions]
+kind = "circles"
+radius_m = 0.01
+angles = 8
+[[noise.regions]]
+name = "bore"
+sigma_T = 2e-5
+[prior]
+magnitude_sd = 0.01
+direction_sd_deg = 0.6
+common_mode_sd = 0.01
+[inference.held_out]
+scan_lines_every = 5
+"""
+GRID = np.stack(np.meshgrid(0.005 * np.arange(-2, 3), 0.005 * np.arange(-2, 3),
+                            0.006 * np.arange(16), indexing="ij"), axis=-1).reshape(-1, 3)
+NOISE_T = 2e-5
+
+
+@pytest.fixture(scope="module")
+def magnet():
+    return build_magnet(parse_study(tomllib.loads(TEXT)))
+
+
+def truth(generator, magnitude=0.01, stretch=1.0):
+    """A magnet of magpylib with errors of its blocks, longer than the study says by a factor."""
+    sources = []
+    for z in (-0.015, 0.015):
+        for slot in range(8):
+            angle = 45.0 * slot
+            direction = np.radians(2 * angle) + 0.01 * generator.standard_normal()
+            polarization = 1.3 * (1 + magnitude * generator.standard_normal()) * np.array([
+                np.cos(direction), np.sin(direction), 0.01 * generator.standard_normal()])
+            sources.append(magpylib.magnet.CylinderSegment(
+                dimension=(0.02, 0.04, 0.03 * stretch, angle - 22.5, angle + 22.5),
+                polarization=polarization, position=(0.0, 0.0, z * stretch)))
+    return magpylib.Collection(*sources)
+
+
+def measured(magnet_of, generator, turn, shift, mixing=None, noise=NOISE_T):
+    """A map in coordinates s of a stage: the place in the magnet is turn s + shift."""
+    matrix = turn.as_matrix()
+    field = magnet_of.getB(GRID @ matrix.T + shift) @ matrix
+    field = field @ (np.eye(3) if mixing is None else mixing).T
+    return field_map(GRID, field + noise * generator.standard_normal(field.shape))
+
+
+def session(folder):
+    return Session.open(folder)
+
+
+@pytest.mark.parametrize("number", [0, 5, 17])
+def test_a_pose_is_found_from_nothing(magnet, generator, tmp_path, number):
+    turn = Rotation.from_rotvec([0.02, -0.03, 0.04]) * Rotation.from_matrix(right_angles()[number])
+    middle = np.array([0.0008, -0.0005, 0.012])
+    shift = middle - turn.apply(GRID.mean(axis=0))
+    if np.abs(GRID @ turn.as_matrix().T + shift)[:, :2].max() > 0.018:
+        # the long side lies across the bore: the map would be inside blocks
+        with pytest.raises(MeasurementError, match="unexplained"):
+            register(magnet, field_map(GRID, np.ones_like(GRID)), session(tmp_path))
+        return
+    # the origin of the stage is half a metre away
+    data = measured(truth(generator), generator, turn, shift)
+    moved = field_map(GRID + np.array([0.3, -0.2, 0.4]), data["B_T"].values)
+    found = register(magnet, moved, session(tmp_path))
+    # rotations by half a turn about the field's axis are symmetric
+    angle, best = min([((Rotation.from_rotvec(each.instrument.rotation_rad) * turn.inv()
+                        ).magnitude(), each)
+                       for each in found], key=lambda found: found[0])
+    assert best.at_rest
+    assert angle < 4 * float(np.linalg.norm(best.rotation_sd_rad))
+    assert best.middle_m == pytest.approx(
+        middle, abs=4 * float(np.linalg.norm(best.translation_sd_m)))
+    assert np.linalg.norm(best.translation_sd_m) < 2e-4
+    origin = shift - turn.apply([0.3, -0.2, 0.4])
+    # the origin is half a metre from the map, so that a turn moves it too
+    assert best.instrument.translation_m == pytest.approx(origin, abs=1e-3)
+    assert odds(found)[[each is best for each in found]] > 0.01  # among equals
+    # readings that were held out are as near as their noise
+    assert np.nanmax(best.held_out_rms_T) < 1.3 * NOISE_T
+    assert np.nanmin(best.held_out_nominal_rms_T) > 5 * NOISE_T
+
+
+def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
+    data = measured(truth(generator, 0.0), generator, Rotation.identity(),
+                    np.array([0.0, 0.0, -0.045]))
+    found = register(magnet, data, session(tmp_path))
+    assert len(found) > 1  # half a turn about y changes nothing of an ideal dipole
+    probabilities = odds(found)
+    assert probabilities.sum() == pytest.approx(1.0)
+    assert np.sort(probabilities)[-2] > 0.02
+
+
+def test_open_keys_and_probe(magnet, generator, tmp_path):
+    """A magnet 1 % longer than drawn, and a probe that is rolled and skewed."""
+    mixing = np.eye(3) + np.array([[0, -0.02, 0], [0.02, 0, 0.004], [0, 0, 0]])
+    data = measured(truth(generator, 0.002, 1.01), generator, Rotation.from_rotvec([0, 0, 0.0]),
+                    np.array([0.0, 0.0, -0.04]), mixing)
+    tight = magnet.with_(prior__magnitude_sd=0.003, prior__direction_sd_deg=0.6)
+    best = register(tight, data, session(tmp_path), open_keys=[
+        OpenKey("array.ring_length_m", 5e-4)])[0]
+    value, sd = best.open_keys["array.ring_length_m"]
+    assert value == pytest.approx(0.0303, abs=max(4 * sd, 2e-5))
+    assert sd < 2e-4
+    crosstalk = best.instrument.crosstalk
+    assert crosstalk["yz"] + crosstalk["zy"] == pytest.approx(0.004, abs=1.5e-3)
+    closed = register(tight, data, session(tmp_path))[0]
+    assert closed.log_evidence < best.log_evidence - 5  # control: without the key it fits worse
+    with pytest.raises(StudyError, match=r"array\.ring_length"):
+        register(tight, data, session(tmp_path), open_keys=[OpenKey("array.ring_length", 1.0)])
+
+
+def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):
+    (tmp_path / "study.toml").write_text(TEXT)
+    data = measured(truth(generator), generator, Rotation.from_rotvec([0.01, 0.0, 0.02]),
+                    np.array([0.0005, 0.0, -0.045]))
+    write_map(data, tmp_path / "map.csv")
+    arguments = [str(tmp_path / "study.toml"), "--measurements", str(tmp_path / "map.csv")]
+    assert main(["register", *arguments, "-o", str(tmp_path / "out")]) == 0
+    assert "middle of the map lies at" in capsys.readouterr().err
+    page = (tmp_path / "out" / "registration.html").read_text()
+    assert "Where does the map lie" in page
+    summary = json.loads((tmp_path / "out" / "registration.json").read_text())
+    assert sum(pose["odds"] for pose in summary["poses"]) == pytest.approx(1.0)
+    registered = read_study(tmp_path / "out" / "study.registered.toml")
+    assert np.abs(registered.instrument.translation_m).max() > 0.03
+    assert main(["infer", str(tmp_path / "out" / "study.registered.toml"), *arguments[1:],
+                 "-o", str(tmp_path / "inferred"), "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)["scores"]
+    held_out = next(score for score in scores if score["part"] == "held out")
+    assert 0.5 < held_out["chi2_posterior"] < 2.0
+    with pytest.raises(SystemExit, match="2"):
+        main(["register", *arguments, "-o", str(tmp_path / "x"), "--fit", "array.rings"])
