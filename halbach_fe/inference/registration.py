@@ -38,8 +38,9 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.measurement.observation import held_out_readings, observe
 from halbach_fe.response.block_variation import Variations, with_variations
-from halbach_fe.solver.exact_block_field import field_of, unit_fields
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import field_function
+from halbach_fe.solver.separate_blocks import field_in_vacuum
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior, root_matrix
 from halbach_fe.study.materials import MU_0
@@ -53,9 +54,9 @@ COARSE_POINTS, MIDDLE_POINTS = 60, 150
 STEP = 0.4
 """Step of the translations along the axis, in units of the bore's radius."""
 
-CANDIDATES, WORTH_TRYING = 24, 3.0
-"""Largest number of candidates of the search that are improved, and multiple of the smallest rms
-residual up to which they are."""
+CANDIDATES, WORTH_TRYING = 2, 3.0
+"""Largest number of candidates of every rotation that are improved, and multiple of the smallest
+rms residual up to which they are."""
 
 NEARLY_AS_GOOD = 1.5
 """Candidates are kept whose rms residual is below this multiple of the smallest."""
@@ -301,12 +302,12 @@ def coarse_poses(
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
     shifts = np.linspace(-reach, reach, steps)
-    scores = []
+    scores, vacuum = [], field_in_vacuum(magnet.blocks)
     for matrix in right_angles():
         turned = points[few] @ matrix.T
         places = (turned[None] + np.outer(shifts, [0, 0, 1])[:, None]).reshape(-1, 3)
         inside = magnet.contains(places).reshape(len(shifts), -1).any(axis=1)
-        fields = field_of(magnet.blocks, places).reshape(len(shifts), -1, 3) @ matrix
+        fields = vacuum(places).reshape(len(shifts), -1, 3) @ matrix
         for shift, field, hit in zip(shifts, fields, inside, strict=True):
             if not hit:
                 scores.append((_misfit(field, used[few], training[few])[0], shift, matrix))
@@ -317,11 +318,14 @@ def coarse_poses(
             "Check its unit of length, and the study's radii."))
     scores.sort(key=lambda each: each[0])
     improved: list[tuple[float, Floats]] = []
-    for rough, shift, matrix in scores[:CANDIDATES]:
-        if rough > WORTH_TRYING * scores[0][0]:
-            break
+    tried: dict[bytes, int] = {}
+    for rough, shift, matrix in scores:
+        key = matrix.tobytes()
+        tried[key] = tried.get(key, 0) + 1
+        if rough > WORTH_TRYING * scores[0][0] or tried[key] > CANDIDATES:
+            continue
         pose = np.concatenate([[0.0, 0.0, shift], Rotation.from_matrix(matrix).as_rotvec()])
-        misfit, pose = _improved(magnet, pose, points[more], used[more], training[more])
+        misfit, pose = _improved(magnet, vacuum, pose, points[more], used[more], training[more])
         if misfit is not None and not any(_same(pose, other) for _, other in improved):
             improved.append((misfit, pose))
     if not improved:
@@ -349,44 +353,41 @@ def _misfit(
 
 
 def _improved(
-    magnet: Magnet, pose: Floats, points: Floats, readings: Floats, training: NDArray[np.bool_]
+    magnet: Magnet, vacuum: Field, pose: Floats, points: Floats, readings: Floats,
+    training: NDArray[np.bool_]
 ) -> tuple[float | None, Floats]:
     """Return the rms and the pose (6,) of a fit to nominal blocks in vacuum; None in no air."""
-    def fields(at: Floats) -> tuple[Floats, Floats]:
-        turn = Rotation.from_rotvec(at[3:]).as_matrix()
-        return field_of(magnet.blocks, points @ turn.T + at[:3]) @ turn, turn
+    def fields(poses: Sequence[Floats]) -> list[Floats]:
+        """Return the field (n, 3) along the map's axes at every pose, computed together."""
+        turns = [Rotation.from_rotvec(each[3:]).as_matrix() for each in poses]
+        places = [points @ matrix.T + each[:3] for matrix, each in zip(turns, poses, strict=True)]
+        return [field @ matrix for field, matrix in zip(
+            np.split(vacuum(np.concatenate(places)), len(poses)), turns, strict=True)]
 
-    field, turn = fields(pose)
+    (field,) = fields([pose])
     misfit, factor = _misfit(field, readings, training)
+    sizes = np.repeat([DIFFERENCE_M, DIFFERENCE_M / magnet.bore_radius], 3)
     for _ in range(ITERATIONS):
-        columns = []
-        for axis in range(6):
-            size = DIFFERENCE_M if axis < 3 else DIFFERENCE_M / magnet.bore_radius
-            other = pose.copy()
-            if axis < 3:
-                other[axis] += size
-            else:
-                other[3:] = (Rotation.from_rotvec(size * np.eye(3)[axis - 3])
-                             * Rotation.from_matrix(turn)).as_rotvec()
-            columns.append(factor * (fields(other)[0] - field) / size)
+        around = fields([_moved(pose, step) for step in np.diag(sizes)])
+        columns = [factor * (each - field) / size for each, size in zip(around, sizes, strict=True)]
         design = np.stack([*columns, field], axis=-1)[training]
         step = np.linalg.lstsq(design, (readings - factor * field)[training], rcond=None)[0][:6]
-        step *= min(1.0, LONGEST_M / np.abs(step[:3]).max(), LONGEST_RAD / np.abs(step[3:]).max())
+        step *= _share(step)
         for _ in range(4):
-            other = np.concatenate([pose[:3] + step[:3], (
-                Rotation.from_rotvec(step[3:]) * Rotation.from_matrix(turn)).as_rotvec()])
-            tried = fields(other)
-            score = _misfit(tried[0], readings, training)
+            other = _moved(pose, step)
+            (tried,) = fields([other])
+            score = _misfit(tried, readings, training)
             if score[0] < misfit:
                 break
             step = step / 2
         else:
             break
         ended = score[0] > 0.999 * misfit
-        pose, (field, turn), (misfit, factor) = other, tried, score
+        pose, field, (misfit, factor) = other, tried, score
         if ended:
             break
-    inside = magnet.contains(points @ turn.T + pose[:3])
+    turn = Rotation.from_rotvec(pose[3:])
+    inside = magnet.contains(turn.apply(points) + pose[:3])
     return (None if inside.any() else misfit), pose
 
 
@@ -499,8 +500,7 @@ class _Fit:
                 break
             longest = LONGEST_SD * prior_sd[PROBE:]
             step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
-            share = min(1.0, LONGEST_M / np.abs(step[:3]).max(),
-                        LONGEST_RAD / np.abs(step[3:6]).max())
+            share = _share(step)
             for _ in range(HALVINGS):
                 other, changed = _moved(pose, share * step[:6]), values + share * step[6:]
                 if self.is_possible(changed, other):
@@ -734,6 +734,12 @@ def each_value(fit: _Fit, values: Floats) -> list[float]:
     """Return the values of the open keys among the parameters after the pose."""
     return [each.value(fit.magnet.study) + float(change)
             for each, change in zip(fit.open, values[PROBE:], strict=True)]
+
+
+def _share(step: Floats) -> float:
+    """Return the part of a step (6 or more,) of a pose that is not too long."""
+    longest = max(np.abs(step[:3]).max() / LONGEST_M, np.abs(step[3:6]).max() / LONGEST_RAD)
+    return float(1 / max(1.0, longest))
 
 
 def _moved(pose: Floats, step: Floats) -> Floats:

@@ -120,10 +120,13 @@ class Variations:
         for first in range(0, len(points), step):
             by_part = self.interaction.readings(
                 np.ascontiguousarray(points[first:first + step], float))
+            flat = by_part.reshape(3 * len(by_part), -1)
+            columns = flat.shape[1] // len(cells)  # per cell
             for number, polarization in enumerate(self.polarization):
-                mine = slice(self.starts[number], self.starts[number + 1])
-                found[first:first + step, :, ends[number]:ends[number + 1]] = np.tensordot(
-                    by_part[:, :, mine], polarization, 3)
+                mine = slice(columns * self.starts[number], columns * self.starts[number + 1])
+                found[first:first + step, :, ends[number]:ends[number + 1]] = (
+                    flat[:, mine] @ polarization.reshape(-1, polarization.shape[-1])
+                ).reshape(len(by_part), 3, -1)
         return found
 
 

@@ -126,7 +126,7 @@ def solve_separate(
             tuple(_polarized(magnet, system) for system in systems[:1 if apart else 2]), None,
             tuple(system.solve() for system in systems) if apart else ())
     bodies = iron_rectangles(magnet)
-    remanent = _remembered(_field_in_vacuum(blocks))
+    remanent = _remembered(field_in_vacuum(blocks))
     if not systems:
         return SeparateReaction((), solve_iron(
             bodies, remanent, session, magnet.name, estimate=estimate))
@@ -160,7 +160,7 @@ def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
     bodies = iron_rectangles(magnet)
     most = None if magnet.is_nonlinear else highest_mode_at(bodies, points)
     resolution = Resolution(modes=None if most is None else min(most, MOST_MODES))
-    return solve_iron(bodies, _field_in_vacuum(present_blocks(magnet.blocks)), session, magnet.name,
+    return solve_iron(bodies, field_in_vacuum(present_blocks(magnet.blocks)), session, magnet.name,
                       resolution, estimate=False).field(points)
 
 
@@ -208,7 +208,7 @@ def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
                  for body in magnet.iron)
 
 
-def _field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
+def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     """Return a function of points (n, 3) in m that computes mu_0 H of the blocks in vacuum, in T.
 
     Many blocks are summed by expansions, at the many points of iron in a small part of the time.
