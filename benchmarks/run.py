@@ -14,15 +14,25 @@ import os
 import platform
 from pathlib import Path
 
-from benchmarks import diagnosis, inference, iron3d, moments, nonlinear, recovery, response, scaling
+from benchmarks import (
+    diagnosis,
+    inference,
+    iron3d,
+    moments,
+    nonlinear,
+    real,
+    recovery,
+    response,
+    scaling,
+)
 from halbach_fe.cli import common
 from halbach_fe.core.files import write_text
 
 RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
-         "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run}
-ALONE = ("recovery", "scaling", "moments", "iron3d")
+         "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run, "real": real.run}
+ALONE = ("recovery", "scaling", "moments", "iron3d", "real")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -73,8 +73,9 @@ MOST_POSES = 4
 ITERATIONS = 12
 """Largest number of steps of a fit."""
 
-AT_REST = 0.02
-"""Largest step, in standard deviations of a parameter, at which a fit is at rest."""
+AT_REST, NO_BETTER = 0.02, 1e-3
+"""A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
+if a step decreases chi-squared by a smaller part than the second."""
 
 DIFFERENCE_M, SMALL = 2e-4, 1e-5
 """Steps of finite differences: for the gradient of the field, and for the instrument."""
@@ -83,9 +84,9 @@ CLOSE_M = 3e-4
 """Distance of the sensors from their mean up to which the field is linear between them: in a
 gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
 
-KEPT_M = 1e-4
-"""Largest shift of the readings up to which the columns of the blocks are kept. They describe
-deviations of some per cent."""
+DEVIATION = 0.05
+"""Deviations of the blocks relative to their magnetization. Their columns are kept as long as a
+shift of the readings changes the field of such deviations by less than the noise."""
 
 SEEN = 0.1
 """Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
@@ -249,7 +250,9 @@ def register(
     Raises
     ------
     MeasurementError
-        If no pose puts the map's points in air, or the map has no field.
+        If no pose puts the map's points in air, or no pose explains half of its field.
+    StudyError
+        If the study is a cross-section, or an open key is no number that it gives.
     """
     fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys))
     say("searching the pose among rotations by right angles and shifts along the axis")
@@ -437,6 +440,9 @@ class _Fit:
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
            open_keys: tuple[OpenKey, ...]) -> _Fit:
         study = magnet.study
+        if magnet.dimension == 2:
+            raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
+                                     "2"))
         for each in open_keys:
             each.value(study)
         base = study.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
@@ -504,15 +510,20 @@ class _Fit:
             for _ in range(HALVINGS):
                 other, changed = _moved(pose, share * step[:6]), values + share * step[6:]
                 if self.is_possible(changed, other):
-                    near = columns if columns.serves(self._middle(other, changed)) else (
+                    moved = self._middle(other, changed) - columns.places
+                    near = columns if np.abs(moved).max() < state.reach else (
                         self._columns(other, changed))
                     tried = self._state(other, changed, near)
-                    if tried.chi2(rows, changed / prior_sd) <= chi2 * (1 + 1e-6):
+                    now = tried.chi2(rows, changed / prior_sd)
+                    if now <= chi2:
                         break
                 share /= 2
             else:
                 break
             pose, values, state, columns = other, changed, tried, near
+            if chi2 - now < NO_BETTER * chi2:
+                at_rest = True
+                break
         step, sd, chi2 = state.step(rows, values / prior_sd)
         updated, log_evidence = state.updated(rows, values / prior_sd)
         return Registration(
@@ -554,7 +565,8 @@ class _Fit:
             len(variations.names) if variations is not None else 0)
         root = root_matrix(prior.root)
         whole = np.concatenate(fields, axis=2)
-        flat = np.asarray(whole.reshape(-1, whole.shape[-1]) @ root)
+        flat = whole.reshape(-1, whole.shape[-1])
+        flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.sigma)**2
@@ -632,7 +644,9 @@ class _Fit:
         sigma = np.sqrt(self.sigma**2 + self.position_sd**2 * np.sum(
             np.einsum("ij,njk->nik", matrix, at_mean)**2, axis=2))
         return _State(residual, np.stack(columns, axis=-1),
-                      np.einsum("ij,njk->nik", matrix, near.fields), sigma, self.prior_sd())
+                      np.einsum("ij,njk->nik", matrix, near.fields), sigma, self.prior_sd(),
+                      self.sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
+                          at_mean**2, axis=(1, 2)))))))
 
 
 @dataclass(frozen=True)
@@ -649,10 +663,6 @@ class _BlockColumns:
     places: Floats
     fields: Floats
 
-    def serves(self, places: Floats) -> bool:
-        """Tell whether the fields hold at places (n, 3) too, for deviations of the blocks."""
-        return bool(np.abs(places - self.places).max() < KEPT_M)
-
 
 @dataclass(frozen=True)
 class _State:
@@ -668,6 +678,8 @@ class _State:
         Readings per prior standard deviation of the magnetizations.
     sigma : ndarray, shape (n, 3), in T
     prior_sd : ndarray, shape (p - 6,)
+    reach : float, in m
+        Largest shift for which ``by_block`` holds, see `DEVIATION`.
     """
 
     residual: Floats
@@ -675,6 +687,7 @@ class _State:
     by_block: Floats
     sigma: Floats
     prior_sd: Floats
+    reach: float
 
     def _whitened(self, rows: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
         """Return residual (r,), derivatives (r, p) and block columns (r, k) of some readings."""

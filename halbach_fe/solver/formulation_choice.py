@@ -36,7 +36,13 @@ from halbach_fe.solver.magnetostatics import (
     solve_sources,
     solve_tangent,
 )
-from halbach_fe.solver.separate_blocks import applies, iron_alone, separate_columns, solve_separate
+from halbach_fe.solver.separate_blocks import (
+    applies,
+    field_in_vacuum,
+    iron_alone,
+    separate_columns,
+    solve_separate,
+)
 from halbach_fe.solver.session import Session
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -132,7 +138,7 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
     It serves points that move little by little. The blocks are solved for once where that does not
-    depend on the points.
+    depend on the points, and the field of many blocks is summed by expansions.
     """
     def solved(points: Floats) -> Floats:
         return solve_nominal(magnet, points, session)
@@ -142,10 +148,11 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
             auto and is_axisymmetric(magnet)):
         return solved
     reaction = solve_separate(magnet, session, estimate=False)
+    vacuum = field_in_vacuum(magnet.blocks)
 
     def field(points: Floats) -> Floats:
         check_points(magnet, points)
-        return vacuum_part(magnet, points) + reaction.field(points)
+        return external_field(magnet, points) + vacuum(points) + reaction.field(points)
 
     return field
 
