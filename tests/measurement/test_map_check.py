@@ -168,5 +168,45 @@ def test_command(generator, tmp_path, capsys):
     assert found["orientation"] == ["x", "y", "-z"]
     turned = read_map(tmp_path / "out" / "oriented_map.csv")
     np.testing.assert_allclose(turned["B_T"].values, field * [1, 1, -1], atol=1e-12)
+    corrected = read_map(tmp_path / "out" / "corrected_map.csv")
+    # nothing was wrong but the sign: noise decides what the instrument's parameters are
+    np.testing.assert_allclose(corrected["B_T"].values, field * [1, 1, -1], atol=2e-4)
     assert main(["check", str(tmp_path / "map.csv"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["suffices"] is True
+
+
+def test_the_corrected_map_is_that_of_an_ideal_probe(generator):
+    sensors = np.array([[0.002, 0.0, -0.001], [-0.001, 0.001, 0.0], [-0.001, -0.001, 0.001]])
+    field = read_by(generator, sensors, (0.0, 0.0, 0.02))
+    check = check_map(field_map(GRID, field))
+    truth = source().getB(GRID)
+    # the place of the mean sensor and a common turn about the field's direction are the map's own
+    left, before = (np.sqrt(np.mean((each - truth)**2)) for each in (check.corrected_T, field))
+    assert left < 3 * NOISE_T
+    assert before > 10 * left
+
+
+def test_a_study_holds_out_the_lines_that_the_check_does(generator):
+    from halbach_fe.measurement.observation import held_out_readings, observe
+    from halbach_fe.study.reader import parse_study
+
+    keys = {"name": "lines", "array": {
+        "multipole_order": 1, "rings": 1, "blocks_per_ring": 8, "inner_radius_m": 0.06,
+        "outer_radius_m": 0.08, "ring_length_m": 0.1, "remanence_T": 1.3,
+        "block": {"shape": "sector"}}, "mesh": {"block_size_m": 0.01},
+        "observation": {"quantity": "flux_density", "positions": {
+            "kind": "points", "points_m": [[0, 0, 0]]}},
+        "inference": {"held_out": {"scan_lines_every": 5}}}
+    study = parse_study(keys)
+    measured = np.ones(GRID.shape, bool)
+    measured[3] = False  # a broken row must not move the lines
+    apart = held_out_readings(study, observe(study, GRID, measured))
+    lines = np.repeat(scan_lines(GRID), 3)[measured.ravel()]
+    np.testing.assert_array_equal(apart, lines % 5 == 2)
+    fourier = study.with_(observation={
+        "quantity": "fourier_coefficients", "harmonics": 2,
+        "positions": {"kind": "circles", "radius_m": 0.01, "angles": 8}})
+    angle = np.arange(8) * np.pi / 4
+    circle = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    with pytest.raises(MeasurementError, match="scan_lines_every"):
+        held_out_readings(fourier, observe(fourier, circle, np.ones((8, 3), bool)))
