@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
@@ -69,7 +69,7 @@ class Variations:
     """
 
     interaction: Interaction
-    starts: Floats
+    starts: Ints
     polarization: tuple[Floats, ...]
     names: tuple[str, ...]
 

@@ -90,7 +90,8 @@ class SeparateReaction:
         if self.blocks:
             from halbach_fe.solver.moments.solve import field_with_errors
 
-            field, error = field_with_errors(*(self.without_losses or self.blocks), points)
+            fine, coarse = self.without_losses or self.blocks
+            field, error = field_with_errors(fine, coarse, points)
             if self.without_losses:
                 field = self.blocks[0].reaction(points)
         if self.iron is not None:

@@ -159,7 +159,7 @@ def _uniform(
             field = interaction.mean_field(step, INNER_DEGREE)
             return np.asarray(step - np.einsum("nij,nj->ni", tangent, field)).ravel()
 
-        inverse = np.linalg.inv(np.eye(3) + OWN_FIELD * tangent)
+        inverse = np.asarray(np.linalg.inv(np.eye(3) + OWN_FIELD * tangent), float)
 
         def precondition(vector: Floats, inverse: Floats = inverse) -> Floats:
             return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).ravel()
