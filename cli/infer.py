@@ -75,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(inference_summary(result))
     else:
+        if result.disagreement:
+            common.say(f"Model and measurement disagree. {result.disagreement}")
         common.print_table(score_table(result), "Median relative error, before and after")
         common.say(f"Report: {arguments.output / 'report.html'}")
     return 0

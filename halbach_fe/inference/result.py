@@ -43,6 +43,11 @@ PREDICTION_COLUMNS = (
 """Columns of prediction.csv, one row per reading."""
 
 
+TOO_NEAR = 0.1
+"""chi-squared per reading below which the noise or the prior is stated too large, by a factor of
+three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """The distribution of the readings that a model predicts, without their noise.
@@ -251,6 +256,28 @@ class InferenceResult(ShownInNotebook):
     def conflict_limit(self) -> float:
         """Limit of `prior_conflict` beyond which chance is no explanation: five sd above 1."""
         return 1 + 5 * float(np.sqrt(2 / np.sum(~self.held_out)))
+
+    @property
+    def disagreement(self) -> str:
+        """A sentence if prior, model and readings cannot all be right, else an empty string."""
+        chi2 = self.prior_conflict
+        if chi2 < TOO_NEAR:
+            return (f"The readings are {1 / np.sqrt(max(chi2, 1e-300)):.3g} times nearer to the "
+                    "model than their noise and the prior allow (chi² per reading is "
+                    f"{chi2:.2g}, where 1 is expected): the study's sigma_T, position_sd_m or prior"
+                    " is too large, so that error bars are too wide. Run `halbach-fe check` for the"
+                    " noise of the map.")
+        if chi2 <= self.conflict_limit:
+            return ""
+        free = self.prior.sd > 0  # a missing block has no parameters to change
+        change = np.abs(self.posterior.mean - self.prior.mean)[free] / self.prior.sd[free]
+        return (f"Prior, model and readings cannot all be right: chi² per reading is {chi2:.3g}, "
+                f"where 1 is expected and more than {self.conflict_limit:.2g} is rare, and the "
+                f"largest change of a block is {float(change.max(initial=0.0)):.1f} prior standard "
+                "deviations. An effect is missing from the model (geometry, position or unit of "
+                "the readings, iron, ...), so its error bars are too small. `halbach-fe check` "
+                "tests the map by itself, `register` finds where it lies, and `diagnose` finds "
+                "what is missing.")
 
     def relative_error(self, prediction: Prediction) -> Floats:
         """Return ``|measured - predicted| / |measured|`` (readings,); NaN for readings of 0."""

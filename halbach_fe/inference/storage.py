@@ -137,6 +137,7 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "largest_solver_error_over_noise": float((update.response.error / update.noise.sd).max()),
         "prior_conflict": update.prior_conflict,
         "prior_conflict_limit": update.conflict_limit,
+        "disagreement": update.disagreement,
         "parameters_learnt": update.parameters_learnt,
         "log_evidence": update.log_evidence,
         "information_left_out": update.left_out,

@@ -103,22 +103,8 @@ def write_inference_report(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
         rows=score_table(result, published), assumptions=assumptions,
-        magnet_rows=magnet_rows(result.magnet), conflict=_conflict_sentence(result),
+        magnet_rows=magnet_rows(result.magnet), conflict=result.disagreement,
         view=view_of_inference(result))
-
-
-def _conflict_sentence(result: InferenceResult) -> str:
-    """Return a warning if prior, model and readings are in conflict, else an empty string."""
-    if result.prior_conflict <= result.conflict_limit:
-        return ""
-    free = result.prior.sd > 0  # a missing block has no parameters to change
-    change = np.abs(result.posterior.mean - result.prior.mean)[free] / result.prior.sd[free]
-    shift = float(change.max(initial=0.0))
-    return (f"Prior, model and readings cannot all be right: chi² per reading is "
-            f"{result.prior_conflict:.3g}, where 1 is expected and more than "
-            f"{result.conflict_limit:.2g} is rare, and the largest change of a block is "
-            f"{shift:.1f} prior standard deviations. An effect is missing from the model "
-            "(geometry, position of the readings, iron, ...), so its error bars are too small.")
 
 
 def _percent(value: float | None) -> str:

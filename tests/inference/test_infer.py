@@ -80,8 +80,13 @@ def test_a_model_of_another_bore_does_not_fit(dipole, generator, session):
     wrong = infer(build_magnet(dipole(array__inner_radius_m=0.106, iron_ring=IRON, **tight)), data,
                   session)
     assert wrong.prior_conflict > wrong.conflict_limit
+    assert "An effect is missing" in wrong.disagreement
     loose = infer(build_magnet(study), data, session)
     assert loose.prior_conflict < loose.conflict_limit
+    assert not loose.disagreement
+    (region,) = study.noise.regions
+    careless = study.with_(noise={"regions": [region.with_(sigma_T=1000 * region.sigma_T)]})
+    assert "too large" in infer(build_magnet(careless), data, session).disagreement
 
 
 def magpylib_campaign(short_dipole, generator):
