@@ -15,6 +15,7 @@ import scipy.linalg as linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
 from halbach_fe.stats.gaussian import (
     Gaussian,
@@ -98,13 +99,16 @@ def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
     ----------
     magnet : Magnet
     nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetizations.
+        Nominal magnetizations, and 0 for variations inside blocks.
     """
     settings, size = magnet.study.prior, magnet.dimension
-    blocks = nominal_prior(nominal, size, settings.magnitude_sd, settings.direction_sd_deg,
-                         settings.common_mode_sd)
-    turns = rotation_roots(nominal.reshape(-1, size), np.radians(settings.mounting_sd_deg))
-    return Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns)))
+    uniform = nominal[:size * len(magnet.blocks)]
+    blocks = nominal_prior(uniform, size, settings.magnitude_sd, settings.direction_sd_deg,
+                           settings.common_mode_sd)
+    turns = rotation_roots(uniform.reshape(-1, size), np.radians(settings.mounting_sd_deg))
+    return with_variations(
+        Gaussian(blocks.mean, stacked_root(blocks.root, block_diagonal_root(turns))),
+        len(nominal) - len(uniform))
 
 
 def predict_tolerance(

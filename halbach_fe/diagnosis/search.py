@@ -161,10 +161,13 @@ def score_hypotheses(
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
                 for effect in identified}
     kept = marginal.remove(response)
-    information, score = response.T @ kept, kept.T @ training
+    uniform = slice(0, update.magnet.dimension * len(update.magnet.blocks))
+    information = response[:, uniform].T @ kept[:, uniform]
+    score = kept[:, uniform].T @ training
     shortlisted = [Hypothesis(effect, place) for effect in effects if effect.places(study)
                     for place in dict.fromkeys((
-                        *effect.shortlist(update.study, update.prior.mean, information, score),
+                        *effect.shortlist(update.study, update.prior.mean[uniform], information,
+                                          score),
                         *(place for name, place in (*signatures, *in_model)
                           if name == effect.name)))]
     candidates: list[Candidate] = []

@@ -282,7 +282,8 @@ def multipole_models(
         integrated = magnet.dimension == 3 and z is None
         matrix = _complexes(model.matrix[part])
         if integrated:
-            matrix[0] += beyond(magnet, _reach(magnet))
+            far = beyond(magnet, _reach(magnet))
+            matrix[0, :len(far)] += far  # variations inside blocks have next to no field there
         index = np.array([main, *orders]) - 1
         turn = _turn(magnet, matrix[main - 1], model)
         phases = np.exp(-1j * turn * (index + 1))
