@@ -24,9 +24,13 @@ WITHIN = 1.96
 """Standard deviations of the interval that holds 95 %."""
 
 
-def run(note: Note) -> None:
-    """Note the figures of both magnets."""
+def emphatic(note: Note) -> None:
+    """Note the figures of the spectrometer dipole."""
     _magnet(note, "real", "emphatic", "body_scan.csv", EMPHATIC, "oriented_map.csv")
+
+
+def mri(note: Note) -> None:
+    """Note the figures of the magnet for MRI."""
     _magnet(note, "real_mri", "mri4all", "cube_10cm_11_steps.csv", MRI, "corrected_map.csv")
 
 
