@@ -40,7 +40,7 @@ NEAR_WALL = 0.8
 """Radius of the cylinder on which modes are compared, relative to the distance of a block from the
 axis."""
 
-NOTICEABLE_T = 6e-6
+NOTICEABLE_T = 2e-5
 """Rms field on the cylinder below which a mode is left out, at one prior standard deviation."""
 
 AROUND, ALONG = 9, 13
