@@ -17,11 +17,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
+from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.d_optimal import greedy, information
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior
 from halbach_fe.stats.noise import NoiseCovariance
 
@@ -135,8 +136,7 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     noise = reading_noise(magnet, observation, xr.Dataset())
     model = response_matrix(magnet, observation, session)
     errors = noise.with_independent_errors(model.error)
-    prior = nominal_prior(model.nominal, magnet.dimension, magnet.study.prior.magnitude_sd,
-                        magnet.study.prior.direction_sd_deg, magnet.study.prior.common_mode_sd)
+    prior = study_prior(magnet, len(model.parameters) - len(magnet.parameter_names))
     size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
     chosen, gain = greedy(whitened[len(baseline):], wanted)

@@ -34,13 +34,13 @@ from halbach_fe.measurement.observation import (
     study_for_validation_map,
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
-from halbach_fe.response.block_variation import with_variations
+from halbach_fe.response.block_variation import study_prior, with_variations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.formulation_choice import choose_route, solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import predict
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.materials import MU_0
@@ -120,10 +120,9 @@ def infer(
         model = response_matrix(magnet, observation, session)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
-    prior_used = prior or with_variations(of_blocks.gaussian if of_blocks else nominal_prior(
-        magnet.nominal_magnetization, study.dimension, study.prior.magnitude_sd,
-        study.prior.direction_sd_deg, study.prior.common_mode_sd),
-        len(model.parameters) - len(magnet.parameter_names))
+    varying = len(model.parameters) - len(magnet.parameter_names)
+    prior_used = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
+                           else study_prior(magnet, varying))
     errors = noise.with_independent_errors(model.error)
     update = linear_gaussian.update(
         model.matrix, (readings - model.offset)[training], errors.subset(training), prior_used,

@@ -36,12 +36,13 @@ from halbach_fe.measurement.instrument import (
     sensor_matrix,
     sensor_positions,
 )
-from halbach_fe.measurement.observation import held_out_readings, observe
-from halbach_fe.response.block_variation import Variations, with_variations
+from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
+from halbach_fe.measurement.reading_noise import reading_noise
+from halbach_fe.response.block_variation import Variations, study_prior
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import field_function
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import nominal_prior, root_matrix
+from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -252,7 +253,15 @@ class _Fit:
     points, readings : ndarray, shape (n, 3)
         The map in m and T, by the study's units and axes.
     training, held_out : ndarray of bool, shape (n, 3)
-    sigma, position_sd : float, in T and m
+    sigma : ndarray, shape (n, 3), in T
+        Noise of the readings, without that of positions; 1 T for those that are not used.
+    position_sd : ndarray, shape (3,), in m
+    base : Instrument
+        The study's instrument without its pose.
+    derivatives : dict
+        Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
+    solved : dict
+        The last fields that were solved for, by the values of the open keys.
     """
 
     magnet: Magnet
@@ -260,8 +269,8 @@ class _Fit:
     readings: Floats
     training: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
-    sigma: float
-    position_sd: float
+    sigma: Floats
+    position_sd: Floats
     session: Session
     probe: ProbePrior
     base: Instrument
@@ -283,7 +292,7 @@ class _Fit:
         data = in_si_and_magnet_axes(base, data)
         points = points_of(data)
         readings = remove_nonlinear_part(base, data)
-        measured = np.isfinite(readings)
+        measured = np.isfinite(readings) & ~excluded_components(study, len(points))
         observation = observe(study.with_(instrument=base), points, measured)
         if study.observation.quantity != "flux_density":
             raise MeasurementError(must_be(
@@ -293,12 +302,22 @@ class _Fit:
         apart = held_out_readings(study, observation)
         held_out, training = (np.zeros(measured.size, bool) for _ in range(2))
         held_out[entries[apart]], training[entries[~apart]] = True, True
-        noise = study.noise
-        sigma = min((region.sigma_T for region in noise.regions), default=1e-4) if noise else 1e-4
-        position = max(noise.position_sd_m) if noise and noise.position_sd_m else 0.0
+        # positions make readings noisy by the gradient where the map lies, which is not known yet
+        position = np.array(study.noise.position_sd_m or (0.0,)) if study.noise else np.zeros(1)
+        if study.noise is not None and study.noise.regions:
+            study = study.with_(noise=study.noise.with_(position_sd_m=None))
+        elif "sigma_T" in data:
+            study = study.with_(noise=None)
+        sigma = np.ones(measured.size)
+        sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
-                   held_out.reshape(-1, 3), sigma, position, session, probe, base, open_keys,
-                   Variations.of(magnet))
+                   held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
+                   session, probe, base, open_keys, Variations.of(magnet))
+
+    @property
+    def smallest_sigma(self) -> float:
+        """Noise in T of the most exact reading."""
+        return float(self.sigma[self.training].min())
 
     def prior_sd(self) -> Floats:
         """Return the prior standard deviations of the parameters after the pose."""
@@ -331,6 +350,7 @@ class _Fit:
         prior_sd = self.prior_sd()
         values = np.zeros(len(prior_sd))
         rows = self.training.ravel()
+        self.derivatives.clear()  # those of another pose belong to other places
         columns = self._columns(pose, values)
         state = self._state(pose, values, columns)
         at_rest = False
@@ -388,23 +408,20 @@ class _Fit:
 
     def _columns(self, pose: Floats, values: Floats) -> _BlockColumns:
         """Return the field of the blocks' magnetizations at a pose."""
-        middle, study = self._middle(pose, values), self.magnet.study
+        middle = self._middle(pose, values)
         fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
             self.magnet.blocks, unit_fields(self.magnet.blocks, middle), strict=True)]
         variations = self.variations
         if variations is not None:
             fields.append(variations.fields(middle))
-        prior = with_variations(nominal_prior(
-            self.magnet.nominal_magnetization, 3, study.prior.magnitude_sd,
-            study.prior.direction_sd_deg, study.prior.common_mode_sd),
-            len(variations.names) if variations is not None else 0)
+        prior = study_prior(self.magnet, len(variations.names) if variations is not None else 0)
         root = root_matrix(prior.root)
         whole = np.concatenate(fields, axis=2)
         flat = whole.reshape(-1, whole.shape[-1])
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
-        kept = sizes > len(flat) * (SEEN * self.sigma)**2
+        kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
         return _BlockColumns(middle, columns @ directions[:, kept])
 
     def _magnet(self, values: Floats) -> Magnet:
@@ -476,11 +493,11 @@ class _Fit:
         for change in self._by_open_keys(values, middle):
             columns.append(seen(np.repeat(change, 3, axis=0)))
         at_mean = gradient.reshape(count, 3, 3, 3).mean(axis=1)
-        sigma = np.sqrt(self.sigma**2 + self.position_sd**2 * np.sum(
-            np.einsum("ij,njk->nik", matrix, at_mean)**2, axis=2))
+        sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
+            "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
         return _State(residual, np.stack(columns, axis=-1),
                       np.einsum("ij,njk->nik", matrix, near.fields), sigma, self.prior_sd(),
-                      self.sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
+                      self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
                           at_mean**2, axis=(1, 2)))))))
 
 

@@ -19,10 +19,11 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.stats.gaussian import Gaussian, root_matrix, stacked_root
+from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
 
 if TYPE_CHECKING:
     from halbach_fe.solver.moments.cells import Cells
@@ -33,8 +34,9 @@ PARTS_PER_LENGTH = 1.7
 the blocks of a dipole of 1.7 T saw the parts: held-out residuals were 1.05 mT, and 0.72 mT with
 1.7."""
 
-MOST_CELLS = 12
-"""Largest number of cells, of two parts each, along the sides of a cube."""
+MOST_CELLS = 6
+"""Largest number of cells, of two parts each, along the sides of a cube: the correlations between
+12^3 parts of a block take 24 MB."""
 
 NEAR_WALL = 0.8
 """Radius of the cylinder on which modes are compared, relative to the distance of a block from the
@@ -83,8 +85,14 @@ class Variations:
         from halbach_fe.solver.moments.interaction import Interaction
 
         side = float(np.cbrt(np.median([block.volume for block in magnet.blocks])))
-        per_side = int(np.ceil(PARTS_PER_LENGTH * side / prior.variation_length_m / 2))
-        cells = cells_of(magnet.blocks, int(np.clip(per_side, 1, MOST_CELLS)))
+        per_side = max(1, int(np.ceil(PARTS_PER_LENGTH * side / prior.variation_length_m / 2)))
+        if per_side > MOST_CELLS:
+            least = PARTS_PER_LENGTH * side / MOST_CELLS / 2
+            raise StudyError(must_be(
+                "`prior.variation_length_m`", f"study {magnet.name}",
+                f"at least {least:.2g} m for blocks of {side:.2g} m",
+                f"{prior.variation_length_m:g}", "Shorter variations have no field in the bore."))
+        cells = cells_of(magnet.blocks, per_side)
         starts = np.searchsorted(cells.block, np.arange(len(magnet.blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
         for number, block in enumerate(magnet.blocks):
@@ -146,6 +154,14 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
                          np.linspace(low - reach, high + reach, ALONG))
     near = NEAR_WALL * radius.min()
     return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
+
+
+def study_prior(magnet: Magnet, count: int) -> Gaussian:
+    """Return the study's prior of all parameters in A/m, ``count`` of which are variations."""
+    settings = magnet.study.prior
+    return with_variations(nominal_prior(
+        magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
+        settings.direction_sd_deg, settings.common_mode_sd), count)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:

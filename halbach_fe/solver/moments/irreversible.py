@@ -115,22 +115,22 @@ def solve_irreversible(
     outer = np.zeros_like(cells.nodes)
     if applied is not None:
         outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
-    polarization, steps = _uniform(system, strength, easy, law, cells.mean(outer))
+    polarization, along, steps = _uniform(system, strength, easy, law, cells.mean(outer))
     # the polarization about the nodes differs as the field there does; its means stay
     field = interaction.node_field(polarization) + outer
     by_node = np.einsum("nij,nqj->nqi", chi, field) + (
         strength[:, None] * law.kept(np.einsum("nqi,ni->nq", field, easy)))[..., None] * (
         easy[:, None])
     by_node += (polarization - cells.mean(by_node))[:, None]
-    along = np.einsum("ni,ni->n", interaction.mean_field(polarization) + cells.mean(outer), easy)
     return (Moments(interaction, by_node - system.remanence[:, None], system.blocks, steps),
             np.asarray(strength * (1 - law.kept(along))))
 
 
 def _uniform(
     system: System, strength: Floats, easy: Floats, law: KneeLaw, outer: Floats
-) -> tuple[Floats, int]:
-    """Return polarizations (cells, 3) in T that are uniform in every cell, and Newton's steps.
+) -> tuple[Floats, Floats, int]:
+    """Return polarizations (cells, 3) in T that are uniform in every cell, the mean mu_0 H along
+    the easy axis (cells,) in T, and the number of Newton's steps.
 
     ``strength`` (cells,) in T and ``easy`` (cells, 3) are amount and direction of the remanence;
     ``outer`` (cells, 3) in T is the mean of mu_0 H of other sources.
@@ -150,7 +150,7 @@ def _uniform(
     for count in range(MAX_STEPS):
         size = float(np.linalg.norm(left))
         if np.abs(left).max(initial=0.0) <= TOLERANCE * scale:
-            return polarization, count
+            return polarization, along, count
         tangent = chi + (strength * law.slope(along))[:, None, None] * (
             easy[:, :, None] * easy[:, None])
 
@@ -169,12 +169,12 @@ def _uniform(
                         rtol=INNER_TOLERANCE, restart=INNER_STEPS, maxiter=1,
                         M=LinearOperator(unknowns, precondition, dtype=float))
         step = step.reshape(-1, 3)
-        for _ in range(MAX_HALVINGS):
-            tried, tried_along = residual(polarization + step)
-            if np.linalg.norm(tried) < size:
+        for halving in range(MAX_HALVINGS):
+            tried = polarization + step / 2**halving
+            left, along = residual(tried)
+            if np.linalg.norm(left) < size:
                 break
-            step = step / 2
-        polarization, left, along = polarization + step, tried, tried_along
+        polarization = tried
     raise HalbachError(
         f"The irreversible losses of the blocks do not settle in {MAX_STEPS} steps: the last left "
         f"{np.abs(left).max() / scale:.1e} of the remanence. Please report this with the study.")
