@@ -127,6 +127,11 @@ def simulate_campaign(
     ExtraMissingError
         If magpylib or NGSolve is not installed.
     """
+    if study.demagnetization is not None and study.demagnetization.irreversible:
+        raise StudyError(must_be(
+            "`demagnetization.irreversible`", f"study {study.name}",
+            "left out of a simulated measurement", "true",
+            "The programs that simulate the truth know no irreversible losses."))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
     # separate streams of random numbers: a further draw from one does not change the others

@@ -189,7 +189,7 @@ COMMANDS: dict[str, tuple[str, list[str]]] = {
 """Folder and options of every command but `solve`, which makes the map for the others."""
 
 WHOLE = ("missing", "displaced", "missing-permeable", "layers-missing", "free-turned",
-         "free-missing", "free-types", "flat-missing", "flat-layers")
+         "free-missing", "free-types", "flat-missing", "flat-layers", "losses", "varying")
 """Studies for every command, which among them have every kind of magnet."""
 
 BRIEF = ("infer-dry", "infer-blocks", "diagnose", "multipoles", "demagnetization", "export")
@@ -210,6 +210,7 @@ PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
 UNLIKE = "Make them types of their own"
 REFUSED: dict[tuple[str, str], str] = {
     ("layers-missing", "sort"): UNLIKE, ("flat-layers", "sort"): UNLIKE,
+    ("losses", "simulate-measurement"): "know no irreversible losses",
 }
 """What a command refuses, with words of its sentence, by study and command."""
 

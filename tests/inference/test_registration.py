@@ -147,6 +147,36 @@ def test_open_keys_and_probe(magnet, generator, tmp_path):
         register(tight, data, session(tmp_path), open_keys=[OpenKey("array.ring_length", 1.0)])
 
 
+def test_every_pose_has_its_own_derivatives(magnet, generator, tmp_path):
+    """Equal poses of an ideal dipole find the same length, whichever is fitted first."""
+    data = measured(truth(generator, 0.0, 1.01), generator, Rotation.identity(),
+                    np.array([0.0, 0.0, -0.04]))
+    found = register(magnet.with_(prior__magnitude_sd=1e-3), data, session(tmp_path),
+                     open_keys=[OpenKey("array.ring_length_m", 5e-4)])
+    assert len(found) > 1
+    for each in found:
+        value, sd = each.open_keys["array.ring_length_m"]
+        assert value == pytest.approx(0.0303, abs=max(4 * sd, 2e-5))
+        assert each.at_rest
+
+
+def test_readings_that_the_study_excludes_are_not_fitted(magnet, generator, tmp_path):
+    """A spike of 0.1 T, and a noise that the map states, not the study."""
+    data = measured(truth(generator), generator, Rotation.identity(), np.array([0.0, 0.0, -0.045]))
+    data["B_T"][24] += 0.1  # on a line that is not held out
+    spoiled = register(magnet, data, session(tmp_path))[0]
+    excluding = magnet.with_(inference=magnet.study.inference.with_(excluded_readings=[25]))
+    found = register(excluding, data, session(tmp_path))[0]
+    assert np.nanmax(found.rms_T) < 1.3 * NOISE_T < np.nanmax(spoiled.rms_T)
+    data["sigma_T"] = data["B_T"].copy(data=np.full_like(data["B_T"].values, 2 * NOISE_T))
+    noisier = register(excluding.with_(noise=None), data, session(tmp_path))[0]
+    # twice the noise makes error bars up to twice as wide; the prior of blocks holds the rest
+    assert (noisier.translation_sd_m > found.translation_sd_m).all()
+    del data["sigma_T"]
+    with pytest.raises(StudyError, match="noise"):
+        register(excluding.with_(noise=None), data, session(tmp_path))
+
+
 def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):
     (tmp_path / "study.toml").write_text(TEXT)
     data = measured(truth(generator), generator, Rotation.from_rotvec([0.01, 0.0, 0.02]),

@@ -118,6 +118,12 @@ def test_a_varying_block_is_inferred(magnet, generator, tmp_path):
     assert result.by_block(result.posterior.mean).shape == (4, 3)
 
 
+def test_too_fine_variations_are_refused(magnet):
+    fine = magnet.with_(prior__variation_length_m=1e-3)
+    with pytest.raises(StudyError, match=r"at least 0\.0017 m"):  # 1.7 parts of 12 mm / 12
+        Variations.of(fine)
+
+
 def test_incomplete_keys_are_refused():
     study = tomllib.loads(TEXT)
     for change in ({"prior": {"variation_sd": 0.1}}, {"prior": {"variation_length_m": 0.01}},
