@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Infer, choose the moves, write the results, print moves and multipoles."""
     from halbach_fe.api import shim
+    from halbach_fe.design.shimming import check_shimming
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
@@ -50,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
                          "replaced; instead --replace is missing. Add --replace.")
     magnet = build_magnet(read_study(arguments.study))
+    check_shimming(magnet.study)
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     with common.session(arguments) as session:

@@ -31,6 +31,7 @@ import scipy.linalg as linalg
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.geometry.magnet import Magnet
@@ -386,9 +387,12 @@ def shim(
 
     Raises
     ------
+    StudyError
+        If the study has variations inside blocks.
     MeasurementError
         If the stock does not fit the study.
     """
+    check_shimming(result.study)
     magnet = result.magnet
     mounts = mounts_of(magnet)
     spares = _measured_spares(magnet, mounts, stock) if stock else _nominal_spares(magnet, mounts)
@@ -407,6 +411,19 @@ def shim(
         within = goal.within(before), goal.within(steps[-1].after if steps else before)
     return Shim(result, model, mounts, spares.names, before, steps, stop,
                 {moves.kind: len(moves.parts) for moves in candidates}, limit, within)
+
+
+def check_shimming(study: Study) -> None:
+    """Raise a StudyError if blocks of this study cannot be moved to other slots.
+
+    The amplitudes of variations inside blocks belong to the field of a block in its own slot.
+    """
+    if study.prior.variation_sd:
+        raise StudyError(must_be(
+            "`prior.variation_sd`", f"study {study.name}", "0 for shimming",
+            f"{study.prior.variation_sd:g}", "Remove prior.variation_sd and "
+            "prior.variation_length_m: a moved block's own variation is not known in its new "
+            "slot."))
 
 
 def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:

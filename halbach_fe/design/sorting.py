@@ -182,8 +182,9 @@ def _slot_responses(magnet: Magnet, table: BlockTable, model: MultipoleModel) ->
     type_of = {number: labels[label] for label, members in types_of(magnet).items()
                for number in members}
     # The order hardly changes the main multipole: scale it with the blocks' median strength.
+    nominal = magnet.nominal_magnetization.reshape(-1, size)[there]
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))
-                                      / np.median(_magnitudes(model.nominal, size)[there]))
+                                      / np.median(np.linalg.norm(nominal, axis=1)))
 
     def units(values: Complexes) -> Floats:
         return 1e4 / main * np.concatenate([values[1:].real, values[1:].imag])
@@ -201,13 +202,9 @@ def present(magnet: Magnet) -> Ints:
 
 def _columns(magnet: Magnet, model: MultipoleModel) -> Complexes:
     """Return the columns (1 + k, slots, D) of the model that belong to the slots with a block."""
-    return model.matrix.reshape(
-        len(model.matrix), len(magnet.blocks), magnet.dimension)[:, present(magnet)]
-
-
-def _magnitudes(vectors: Floats, dimension: int) -> Floats:
-    """Return the magnitudes of magnetizations, given as a vector of all their components."""
-    return np.linalg.norm(vectors.reshape(-1, dimension), axis=1)
+    uniform = model.matrix[:, :magnet.dimension * len(magnet.blocks)]  # not those inside blocks
+    return uniform.reshape(
+        len(uniform), len(magnet.blocks), magnet.dimension)[:, present(magnet)]
 
 
 def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
@@ -327,8 +324,9 @@ def _multipoles_of(magnet: Magnet, responses: _SlotResponses, order: Ints) -> Mu
     common = magnet.study.prior.common_mode_sd * np.einsum("ksi,si->k", carried, vectors)
     turns = np.einsum("ksi,sia->ksa", carried, rotation_roots(
         vectors, np.radians(magnet.study.prior.mounting_sd_deg)))
+    inside = responses.model.matrix[:, len(magnet.blocks) * magnet.dimension:]  # each of sd 1
     return responses.model.known(mean, np.hstack([
-        own, common[:, None], turns.reshape(len(mean), -1)]))
+        own, common[:, None], turns.reshape(len(mean), -1), inside]))
 
 
 def _with_places(magnet: Magnet, table: BlockTable, order: Ints) -> BlockTable:

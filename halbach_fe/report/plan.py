@@ -123,7 +123,8 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
 
     def by_slot(sd: Floats) -> Floats:
         """Return the rms over the blocks of each slot; NaN where all of them are missing."""
-        variance = (sd**2).reshape(len(slots), -1).sum(axis=1)
+        uniform = sd[:len(slots) * magnet.dimension]  # not the variations inside blocks
+        variance = (uniform**2).reshape(len(slots), -1).sum(axis=1)
         sums = np.array([variance[slots == place].sum() for place in places])
         return np.sqrt(np.where(sums > 0, sums, np.nan))
 

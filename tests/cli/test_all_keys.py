@@ -210,6 +210,7 @@ PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
 UNLIKE = "Make them types of their own"
 REFUSED: dict[tuple[str, str], str] = {
     ("layers-missing", "sort"): UNLIKE, ("flat-layers", "sort"): UNLIKE,
+    ("varying", "shim"): "0 for shimming",
     ("losses", "simulate-measurement"): "know no irreversible losses",
 }
 """What a command refuses, with words of its sentence, by study and command."""

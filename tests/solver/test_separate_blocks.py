@@ -10,7 +10,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.separate_blocks import (
     MANY_BLOCKS,
-    _field_in_vacuum,
+    field_in_vacuum,
     iron_alone,
     solve_separate,
 )
@@ -32,13 +32,13 @@ def test_many_blocks_are_summed_by_expansions(generator):
     def rms(field):
         return np.sqrt(np.mean(field**2)) / np.abs(exact).max()
 
-    assert 0 < rms(_field_in_vacuum(blocks)(points) - exact) < 3e-5
+    assert 0 < rms(field_in_vacuum(blocks)(points) - exact) < 3e-5
     # few blocks are exact
-    assert rms(_field_in_vacuum(blocks[:MANY_BLOCKS - 1])(points)
+    assert rms(field_in_vacuum(blocks[:MANY_BLOCKS - 1])(points)
                - field_of(blocks[:MANY_BLOCKS - 1], points)) == 0
     # negative control: one block of them turned the other way
     other = (replace(blocks[0], remanence=-blocks[0].remanence), *blocks[1:])
-    assert rms(_field_in_vacuum(other)(points) - exact) > 3e-5
+    assert rms(field_in_vacuum(other)(points) - exact) > 3e-5
 
 
 def test_iron_alone_is_nearly_the_change_by_iron(short_dipole, session):
