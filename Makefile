@@ -91,8 +91,9 @@ results/mri4all/measured/report.html: results/mri4all/registered/registration.ht
 study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
 
+# Each core has a worker already: more threads of the linear algebra would wait for each other.
 test: setup-test
-	.venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # What breaks a promise of tests/fuzz/contract.py is kept in build/fuzz; SEED=2 tries other files.
 SECONDS = 60

@@ -289,16 +289,18 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     # the prior width of the field, now that the instrument no longer counts as noise
     fit = model.fit(train, train_rows)
     train = _fitted(model, train_rows, fit, train)
-    spikes = _spikes(points, turned - model.readings(train), usable)
+    say("fitting all scan lines")
+    whole = _fitted(model, chosen, fit, train)
+    spikes = _spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
+                     usable)
     if rough.any() or spikes.any():
         broken["spike"] = (1 + np.flatnonzero(rough | spikes)).tolist()
     if spikes.any():
         usable, chosen = usable & ~spikes, chosen & ~spikes
         held_out = _held_out(lines, chosen)
         train = _fitted(model, chosen & ~held_out, fit, train)
+        whole = _fitted(model, chosen, fit, train)
     floor = turned[held_out] - model.readings(train, held_out)
-    say("fitting all scan lines")
-    whole = _fitted(model, chosen, fit, train)
     residual = turned - model.readings(whole)
     noise, displaced = _noise(charges.gradient(points[chosen], whole.amplitudes), residual[chosen])
     (as_given,) = fit_fields(charges, places, [readings])
@@ -332,8 +334,7 @@ def _rough_rows(
     found = np.zeros(len(points), bool)
     for _ in range(ROUGH_ROUNDS):
         rows = np.flatnonzero(usable & ~found)
-        count = min(NEIGHBOURS + 1, len(rows))
-        near = KDTree(points[rows]).query(points[rows], np.arange(2, count + 1))[1]
+        near = _neighbours(points[rows])
         residual = np.full_like(field, np.nan)
         for part in np.array_split(np.arange(len(rows)), max(1, len(rows) // 1000)):
             away = points[rows[near[part]]] - points[rows[part], None]
@@ -604,6 +605,16 @@ class _Model:
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
 
+    def expected(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
+        """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
+
+        Residuals are larger where the field is steep. Those of lines that are not fitted are no
+        measure of a single reading: at the edge of the map the field there is extrapolated.
+        """
+        gradient = self.charges.gradient(self.points, at.amplitudes)
+        noise, displaced = _noise(gradient[rows], (self.field - self.readings(at))[rows])
+        return np.sqrt(noise**2 + displaced**2 * np.sum(gradient**2, axis=2))
+
     def ideal(self, at: _Fitted) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
 
@@ -625,48 +636,106 @@ def _fitted(
     ``fit`` is that of a perfect instrument, and has the prior width of the amplitudes.
     """
     at = replace(start or model.start(fit), lag=model.lag_shows(rows))
-    readings, count = model.field[rows].ravel(), len(PRIOR_SD)
     width2 = fit.sigma**2 / fit.penalty
-
-    def projected(instrument: Floats, sigma: float) -> tuple[float, _Fitted, Floats, Floats]:
-        """Return chi-squared, the fit, its design and residual for an instrument."""
-        of = replace(at, instrument=instrument)
-        by_amplitude = model.by_amplitude(of, rows).reshape(len(readings), -1)
-        target = readings - model.offsets(of, rows).ravel()
-        information = by_amplitude.T @ by_amplitude
-        information[np.diag_indices(len(information))] += (
-            sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        amplitudes = linalg.cho_solve(linalg.cho_factor(information, lower=True),
-                                      by_amplitude.T @ target)
-        left = target - by_amplitude @ amplitudes
-        chi2 = (float(left @ left) / sigma**2 + float(amplitudes @ amplitudes) / width2
-                + float(instrument @ instrument))
-        return chi2, replace(of, amplitudes=amplitudes), by_amplitude, left
-
-    chi2, at, by_amplitude, left = projected(at.instrument, at.sigma)
+    state = _State.of(model, at, rows, width2)
     for _ in range(iterations):
-        design = np.hstack([by_amplitude, model.by_parameter(at, rows).reshape(-1, count)])
-        ratio = np.concatenate([np.full(len(model.charges), at.sigma**2 / width2),
-                                np.full(count, at.sigma**2)])
-        information = design.T @ design
-        inverse = np.linalg.inv(information + np.diag(ratio))
-        step = (inverse @ (design.T @ left - ratio * np.concatenate(
-            [at.amplitudes, at.instrument])))[-count:]
+        step, covariance, used = state.step()
         for halving in range(HALVINGS):
-            after, other, by_amplitude, left = projected(
-                at.instrument + step / 2**halving, at.sigma)
-            if after <= chi2:
+            after = _State.of(model, replace(
+                state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
+            if after.chi2 <= state.chi2:
                 break
         else:
-            return at
-        used = float(np.sum(inverse * information))
-        sigma = float(np.sqrt(left @ left / max(len(readings) - used, 1.0)))
-        at_rest = chi2 - after < AT_REST
-        at = replace(other, covariance=sigma**2 * inverse[-count:, -count:], sigma=sigma, used=used)
+            return state.at
+        sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
+        at_rest = state.chi2 - after.chi2 < AT_REST
+        state = after.with_noise(sigma, replace(
+            after.at, covariance=sigma**2 * covariance, used=used))
         if at_rest:
             break
-        chi2, at, by_amplitude, left = projected(at.instrument, at.sigma)
-    return at
+    return state.at
+
+
+@dataclass(frozen=True)
+class _State:
+    """The field of largest probability for an instrument and a noise.
+
+    Attributes
+    ----------
+    at : _Fitted
+    chi2 : float
+        With the prior of amplitudes and instrument.
+    left : ndarray, shape (m,), in T
+    by_amplitude : ndarray, shape (m, k)
+    information : ndarray, shape (k, k)
+        Of the amplitudes, without their prior and in units of 1 / sigma^2.
+    projected : ndarray, shape (k,)
+        Product of ``by_amplitude`` with the readings.
+    factor : tuple
+        Cholesky factor of the information with the prior.
+    """
+
+    model: _Model
+    rows: NDArray[np.bool_]
+    width2: float
+    at: _Fitted
+    chi2: float
+    left: Floats
+    by_amplitude: Floats
+    information: Floats
+    projected: Floats
+    factor: tuple[Floats, bool]
+
+    @classmethod
+    def of(cls, model: _Model, at: _Fitted, rows: NDArray[np.bool_], width2: float) -> _State:
+        """Fit the field for the instrument and the noise of ``at``."""
+        by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
+        target = (model.field[rows] - model.offsets(at, rows)).ravel()
+        return cls._solved(model, rows, width2, at, target, by_amplitude,
+                           by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
+
+    @classmethod
+    def _solved(
+        cls, model: _Model, rows: NDArray[np.bool_], width2: float, at: _Fitted, target: Floats,
+        by_amplitude: Floats, information: Floats, projected: Floats,
+    ) -> _State:
+        """Solve for the amplitudes."""
+        with_prior = information.copy()
+        with_prior[np.diag_indices(len(with_prior))] += (
+            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
+        factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
+        amplitudes = linalg.cho_solve(factor, projected)
+        left = target - by_amplitude @ amplitudes
+        chi2 = (float(left @ left) / at.sigma**2 + float(amplitudes @ amplitudes) / width2
+                + float(at.instrument @ at.instrument))
+        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left,
+                   by_amplitude, information, projected, factor)
+
+    def with_noise(self, sigma: float, at: _Fitted) -> _State:
+        """Return the state of the same instrument for another noise in T."""
+        target = self.left + self.by_amplitude @ self.at.amplitudes
+        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma), target,
+                            self.by_amplitude, self.information, self.projected)
+
+    def step(self) -> tuple[Floats, Floats, float]:
+        """Return the step (p,) of the instrument, its covariance / sigma^2, and `_Fitted.used`.
+
+        The amplitudes, which are the best for the present instrument, are eliminated from the
+        normal equations.
+        """
+        noise2, count = self.at.sigma**2, len(PRIOR_SD)
+        design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
+        mixed = self.by_amplitude.T @ design
+        solved = linalg.cho_solve(self.factor, mixed)
+        inverse = np.linalg.inv(design.T @ design - mixed.T @ solved + noise2 * np.eye(count))
+        step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
+        # traces of the blocks of the inverse of all normal equations
+        amplitudes, info = linalg.lapack.dpotri(self.factor[0], lower=1)
+        assert info == 0  # the factor is that of a Cholesky decomposition
+        by_amplitude = float(np.trace(amplitudes)) + float(np.sum((solved @ inverse) * solved))
+        used = (len(mixed) - noise2 / self.width2 * by_amplitude
+                + count - noise2 * float(np.trace(inverse)))
+        return step, inverse, used
 
 
 CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
@@ -722,13 +791,23 @@ def _spikes(
     """Return the usable rows whose residual (n, 3) is far larger than all, and those around."""
     rows = np.flatnonzero(usable)
     size = np.abs(residual[rows])
-    count = min(NEIGHBOURS + 1, len(rows))
-    near = KDTree(points[rows]).query(points[rows], np.arange(2, count + 1))[1]
+    near = _neighbours(points[rows])
     least = 1.4826 * np.maximum(over_neighbours * np.median(size[near], axis=1),
                                 SPIKE * np.median(size, axis=0))
     found = np.zeros(len(points), bool)
     found[rows] = (size > least).any(axis=1)
     return found
+
+
+def _neighbours(points: Floats) -> Ints:
+    """Return the numbers (n, k) of the nearest neighbours of points (n, 3).
+
+    Coordinates are rounded, so that which of equally distant points count does not depend on the
+    last digits of the file.
+    """
+    places = np.round(points / point_spacing(points), 6)
+    count = min(NEIGHBOURS + 1, len(points))
+    return np.asarray(KDTree(places).query(places, np.arange(2, count + 1))[1])
 
 
 def _windows(

@@ -210,3 +210,15 @@ def test_a_study_holds_out_the_lines_that_the_check_does(generator):
     circle = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     with pytest.raises(MeasurementError, match="scan_lines_every"):
         held_out_readings(fourier, observe(fourier, circle, np.ones((8, 3), bool)))
+
+
+def test_extrapolated_lines_are_no_spikes(generator):
+    """Near the magnets held-out lines at the map's edge are far off, and all their rows count.
+
+    A reading that is off by ten times as much as the noise there is found on such a line too.
+    """
+    points = 1.5 * GRID
+    field = source().getB(points) + NOISE_T * generator.standard_normal(points.shape)
+    assert check_map(field_map(points, field)).broken == {}
+    field[len(field) // 2, 1] += 3e-3
+    assert check_map(field_map(points, field)).broken == {"spike": [len(field) // 2 + 1]}
