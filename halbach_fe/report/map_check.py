@@ -105,7 +105,9 @@ def instrument_table(check: MapCheck) -> list[dict[str, str]]:
     """Return rows of text: every parameter of the instrument with its uncertainty."""
     return [{"parameter": term.name,
              "value": f"{term.value:.2f} ± {term.sd:.2f} {term.unit}" if term.determined else "–",
-             "": "found" if term.found else "" if term.determined else "this map cannot tell"}
+             "": "found" if term.found else "" if term.determined
+             else "this map cannot tell" if term.predictive
+             else "left out: scan lines are predicted as well without it"}
             for term in check.terms]
 
 
