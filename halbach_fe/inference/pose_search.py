@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.separate_blocks import field_in_vacuum
@@ -33,6 +33,15 @@ NEARLY_AS_GOOD = 1.5
 
 UNEXPLAINED = 0.5
 """Share of the field, in rms, that the nominal blocks may leave in the best pose."""
+
+SUSPICIOUS, MIRRORED = 0.03, 2.0
+"""Share of the field, in rms, from which the mirror image of the magnet is tried, and factor by
+which its best pose must be better for the map to be that of the mirror image. Errors of blocks
+leave 0.01 of the field."""
+
+MIRROR = np.array([1.0, 1.0, -1.0])
+"""Factors of the coordinates of a mirror image. A magnetic field is an axial vector: those of its
+components are the opposite."""
 
 SAME_M, SAME_RAD = 1e-3, 0.02
 """Candidates that differ by less are one: in m, and in rad."""
@@ -80,9 +89,36 @@ def coarse_poses(
     used = np.where(training, readings, 0.0)
     if not len(rows) or not used.any():
         raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
+    points = points - middle_of(points)
+    improved = _searched(magnet, points, used, training, rows)
+    best = improved[0][0]
+    size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
+    if best > SUSPICIOUS * size:
+        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training, rows)[0][0]
+        if mirrored < best / MIRRORED:
+            raise MeasurementError(must_be(
+                "map", "registration", "that of the study's magnet",
+                f"that of its mirror image, of which some pose leaves {mirrored / size:.1%} of the "
+                f"field unexplained, and of the magnet at least {best / size:.1%}",
+                "A position axis of the map counts backwards, or the study's angles do."))
+    if best > UNEXPLAINED * size:
+        raise MeasurementError(must_be(
+            "map", "registration", "one that some pose of the magnet explains",
+            f"{best / size:.0%} of its field unexplained in the best one",
+            "Check the axes and signs of its columns with halbach-fe check."))
+    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:MOST_POSES]
+
+
+def _searched(
+    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_], rows: Ints
+) -> list[tuple[float, Floats]]:
+    """Return the rms residuals in T of poses, and these, the best first.
+
+    Points (n, 3) in m are about their middle; ``rows`` are those with readings that may be used,
+    and ``used`` (n, 3) the readings, 0 where they may not.
+    """
     few, more = (rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
                  for count in (COARSE_POINTS, MIDDLE_POINTS))
-    points = points - middle_of(points)
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
     shifts = np.linspace(-reach, reach, steps)
@@ -115,15 +151,7 @@ def coarse_poses(
     if not improved:
         raise MeasurementError(must_be("map", "registration", "one that fits into the bore",
                                        "points inside blocks in every likely pose"))
-    improved.sort(key=lambda each: each[0])
-    best = improved[0][0]
-    size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
-    if best > UNEXPLAINED * size:
-        raise MeasurementError(must_be(
-            "map", "registration", "one that some pose of the magnet explains",
-            f"{best / size:.0%} of its field unexplained in the best one",
-            "Check the axes and signs of its columns with halbach-fe check."))
-    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:MOST_POSES]
+    return sorted(improved, key=lambda each: each[0])
 
 
 def _misfit(

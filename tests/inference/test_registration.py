@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.pose_search import right_angles
+from halbach_fe.inference.pose_search import coarse_poses, right_angles
 from halbach_fe.inference.registration import OpenKey, odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
@@ -59,13 +59,16 @@ def magnet():
     return build_magnet(parse_study(tomllib.loads(TEXT)))
 
 
-def truth(generator, magnitude=0.01, stretch=1.0):
-    """A magnet of magpylib with errors of its blocks, longer than the study says by a factor."""
+def truth(generator, magnitude=0.01, stretch=1.0, twist_deg=0.0):
+    """A magnet of magpylib with errors of its blocks.
+
+    It is longer than the study says by a factor, and its second ring is turned about z.
+    """
     sources = []
-    for z in (-0.015, 0.015):
+    for z, twist in ((-0.015, 0.0), (0.015, twist_deg)):
         for slot in range(8):
-            angle = 45.0 * slot
-            direction = np.radians(2 * angle) + 0.01 * generator.standard_normal()
+            angle = 45.0 * slot + twist
+            direction = np.radians(90.0 * slot + twist) + 0.01 * generator.standard_normal()
             polarization = 1.3 * (1 + magnitude * generator.standard_normal()) * np.array([
                 np.cos(direction), np.sin(direction), 0.01 * generator.standard_normal()])
             sources.append(magpylib.magnet.CylinderSegment(
@@ -126,6 +129,34 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     probabilities = odds(found)
     assert probabilities.sum() == pytest.approx(1.0)
     assert np.sort(probabilities)[-2] > 0.02
+
+
+def test_a_mirrored_magnet_is_refused(magnet, generator, tmp_path):
+    """A dipole whose field turns by 30 degrees along z is not its mirror image.
+
+    Straight dipoles are.
+    """
+    turned = build_magnet(parse_study(tomllib.loads(TEXT.replace("rings = 2\n", "") + """
+[[array.ring]]
+[[array.ring]]
+first_block_angle_deg = 30
+first_magnetization_angle_deg = 30
+""")))
+    shift = np.array([0.001, 0.0, -0.045])
+    straight, helical = truth(generator), truth(generator, twist_deg=30.0)
+    mirror = np.array([1.0, 1.0, -1.0])
+
+    def poses(study_magnet, field):
+        read = field + NOISE_T * generator.standard_normal(field.shape)
+        return coarse_poses(study_magnet, GRID, read, np.ones_like(GRID, bool))
+
+    def mirrored(source):
+        return -source.getB((GRID + shift) * mirror) * mirror
+
+    assert poses(turned, helical.getB(GRID + shift))
+    assert poses(magnet, mirrored(straight))
+    with pytest.raises(MeasurementError, match="mirror image"):
+        poses(turned, mirrored(helical))
 
 
 def test_open_keys_and_probe(magnet, generator, tmp_path):
