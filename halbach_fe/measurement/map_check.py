@@ -58,8 +58,9 @@ WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
 
-ITERATIONS, FEW_ITERATIONS = 12, 6
-"""Largest number of steps of the fit of field and instrument, and while orientations are tried."""
+ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
+"""Largest number of steps of the fit of field and instrument, while orientations are tried, and
+from a fit of nearly the same readings."""
 
 SPIKE = 12.0
 """A reading is a spike if its residual is larger than this multiple of the standard deviation of
@@ -664,7 +665,7 @@ def _confirmed(
     """
     def predicted(trial: _Model) -> tuple[float, _Fitted]:
         """Return the rms error in T of the rows that are left out, and the fit of the others."""
-        fitted = _fitted(trial, rows & ~left_out, fit, trial.allowed(start), FEW_ITERATIONS)
+        fitted = _fitted(trial, rows & ~left_out, fit, trial.allowed(start), NEXT_ITERATIONS)
         off = model.field[left_out] - trial.readings(fitted, left_out)
         return float(np.linalg.norm(_rms(off))), fitted
 

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, Union
+from collections.abc import Iterator
+from types import NoneType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from halbach_fe.core.errors import StudyError, must_be
 
@@ -67,6 +77,39 @@ Lines = Annotated[str, AfterValidator(_lines)]
 """Text of any number of lines, in which tabs are allowed too."""
 
 
+def _leaves(annotation: Any) -> set[Any]:
+    """Return the types of which an annotation consists."""
+    inner = get_args(annotation)
+    if not inner or get_origin(annotation) is Literal:
+        return {annotation}
+    if get_origin(annotation) is Annotated:
+        inner = inner[:1]
+    return set().union(*(_leaves(each) for each in inner if each is not ...))
+
+
+def _elements(value: Any) -> Iterator[Any]:
+    """Iterate over a value, or over the elements of lists of any depth."""
+    if isinstance(value, list | tuple):
+        for each in value:
+            yield from _elements(each)
+    else:
+        yield value
+
+
+def _as_toml(value: bool | str) -> str:
+    """Return true, false or text as a study file writes it."""
+    return str(value).lower() if isinstance(value, bool) else f'the text "{value}"'
+
+
+def _is_number(text: str) -> bool:
+    """Tell whether text reads as a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 class StudyModel(BaseModel):
     """Base of all tables of a study file: unknown keys are errors, and instances are immutable.
 
@@ -78,6 +121,18 @@ class StudyModel(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_number_from_words(cls, data: Any) -> Any:
+        """Refuse true, false and text for numbers, which pydantic would convert."""
+        for name, value in data.items() if isinstance(data, dict) else ():
+            field = cls.model_fields.get(name)
+            if field and _leaves(field.annotation) <= {int, float, NoneType}:
+                for each in _elements(value):
+                    if isinstance(each, bool) or (isinstance(each, str) and _is_number(each)):
+                        raise ValueError(f"`{name}` is a number, not {_as_toml(each)}")
+        return data
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with other values of some keys, validated like a table from a file.

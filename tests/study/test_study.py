@@ -308,3 +308,17 @@ def test_moment_in_wrong_unit_is_refused(short_dipole):
     study = short_dipole(array__remanence_T=None, array__block_moment_A_m2=330e3)
     with pytest.raises(StudyError, match="block_moment_A_m2"):
         build_magnet(study)
+
+
+@pytest.mark.parametrize(("key", "value", "said"), [
+    ("array__remanence_T", True, "`remanence_T` is a number, not true"),
+    ("array__blocks_per_ring", "16", "`blocks_per_ring` is a number, not the text"),
+    ("noise__position_sd_m", [True, 1e-5, 1e-5], "`position_sd_m` is a number, not true"),
+])
+def test_words_are_no_numbers(dipole, key, value, said):
+    """They would be converted to 1 T, or to 16 blocks."""
+    table, _, name = key.partition("__")
+    data = dipole().model_dump(mode="json", exclude_none=True)
+    data.setdefault(table, {})[name] = value
+    with pytest.raises(StudyError, match=said):
+        parse_study(data)
