@@ -36,6 +36,14 @@ from halbach_fe.measurement.instrument import (
     sensor_matrix,
     sensor_positions,
 )
+from halbach_fe.measurement.instrument_terms import (
+    DIFFERENCE_M,
+    STEADY,
+    by_terms,
+    field_at_sensors,
+    seen,
+    with_terms,
+)
 from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import Variations, study_prior
@@ -54,13 +62,6 @@ ITERATIONS = 12
 AT_REST, NO_BETTER = 0.02, 1e-3
 """A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
 if a step decreases chi-squared by a smaller part than the second."""
-
-DIFFERENCE_M, SMALL = 2e-4, 1e-5
-"""Steps of finite differences: for the gradient of the field, and for the instrument."""
-
-CLOSE_M = 3e-4
-"""Distance of the sensors from their mean up to which the field is linear between them: in a
-gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
 
 DEVIATION = 0.05
 """Deviations of the blocks relative to their magnetization. Their columns are kept as long as a
@@ -88,8 +89,6 @@ OFFSETS = slice(9, 12)
 
 PART_OF_SD = 0.1
 """Step of the finite differences by open keys, in prior standard deviations."""
-
-CROSSTALK = ("xy", "xz", "yx", "yz", "zx", "zy")
 
 
 @dataclass(frozen=True)
@@ -328,18 +327,9 @@ class _Fit:
 
     def instrument(self, pose: Floats, values: Floats) -> Instrument:
         """Return the instrument of a pose (6,) and of the other parameters."""
-        base = self.base
-        given = {str(name): value for name, value in base.crosstalk.items()}
-        crosstalk = {name: given.get(name, 0.0) + float(value)
-                     for name, value in zip(CROSSTALK, values[:6], strict=True)}
-        gain, offset = (tuple((np.array(own) + values[part]).tolist()) for own, part in (
-            (base.gain, slice(6, 9)), (base.offset_T, slice(9, 12))))
-        sensors = np.array(base.sensor_position_m) + values[12:PROBE].reshape(3, 3)
-        origin = pose[:3] - Rotation.from_rotvec(pose[3:]).apply(middle_of(self.points))
-        return base.with_(
-            translation_m=tuple(origin.tolist()), rotation_rad=tuple(pose[3:].tolist()),
-            crosstalk=crosstalk, gain=gain, offset_T=offset,
-            sensor_position_m=tuple(map(tuple, sensors.tolist())))
+        middle = middle_of(self.points)
+        return with_terms(self.base, middle, np.concatenate([
+            pose[:3] - middle, pose[3:], values[:PROBE], np.zeros(3)]))
 
     def study_of(self, pose: Floats, values: Floats) -> Study:
         """Return the study of a pose and of the other parameters."""
@@ -459,40 +449,15 @@ class _Fit:
         instrument = self.instrument(pose, values)
         sensors = sensor_positions(instrument, self.points)
         middle, count = sensors.mean(axis=1), len(self.points)
-        apart = np.abs(sensors - middle[:, None]).max() > CLOSE_M
-        places = sensors.reshape(-1, 3) if apart else middle
-        field = self._field(values)
-        steps = DIFFERENCE_M * np.eye(3)
-        fields = field(np.concatenate([places, *(
-            places + sign * step for step in steps for sign in (1, -1))]))
-        here, around = fields[:len(places)], fields[len(places):].reshape(3, 2, -1, 3)
-        gradient = np.moveaxis(around[:, 0] - around[:, 1], 0, -1) / (2 * DIFFERENCE_M)
-        if not apart:
-            here, gradient = np.repeat(here, 3, axis=0), np.repeat(gradient, 3, axis=0)
-            here = here + np.einsum("nck,nk->nc", gradient,
-                                    (sensors - middle[:, None]).reshape(-1, 3))
         matrix = sensor_matrix(instrument)
-
-        def seen(at_sensors: Floats, by: Floats = matrix) -> Floats:
-            """Return readings (n, 3) of B (3 n, 3) at the sensors."""
-            return np.einsum("ij,nij->ni", by, at_sensors.reshape(count, 3, 3))
-
-        residual = self.readings - seen(here) - values[OFFSETS]
-        columns = []
-        for number in range(6 + PROBE):
-            other_pose, other_values = pose, values.copy()
-            if number < 6:
-                other_pose = moved_by(pose, SMALL * np.eye(6)[number])
-            else:
-                other_values[number - 6] += SMALL
-            other = self.instrument(other_pose, other_values)
-            moved = (sensor_positions(other, self.points) - sensors).reshape(-1, 3)
-            there = here + np.einsum("nck,nk->nc", gradient, moved)
-            columns.append((seen(there, sensor_matrix(other)) - seen(here)
-                            + other_values[OFFSETS] - values[OFFSETS]) / SMALL)
+        here, gradient = field_at_sensors(self._field(values), sensors)
+        residual = self.readings - seen(matrix, here) - values[OFFSETS]
+        columns = list(np.moveaxis(by_terms(
+            instrument, self.points, middle_of(self.points), np.zeros(count), here, gradient,
+            STEADY), -1, 0))
         for change in self._by_open_keys(values, middle):
-            columns.append(seen(np.repeat(change, 3, axis=0)))
-        at_mean = gradient.reshape(count, 3, 3, 3).mean(axis=1)
+            columns.append(change @ matrix.T)
+        at_mean = gradient.mean(axis=1)
         sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
             "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
         return _State(residual, np.stack(columns, axis=-1),
