@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.pose_search import Field, coarse_poses, middle_of, moved_by, share_of
+from halbach_fe.inference.pose_search import Field, coarse_poses, moved_by, share_of
+from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,

@@ -1,7 +1,8 @@
 """The terms of an instrument as numbers that a fit can change: pose, and parameters of the probe.
 
 A vector (30,) holds the changes of all terms: shift of the map's middle and turn about it, along
-the magnet's axes, then crosstalk, gains, offsets, places of the sensors, and drift.
+the magnet's axes, then crosstalk, gains, offsets, places of the sensors, and drift. Of the places of
+the sensors only differences count: what all sensors have in common is a shift of the map.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ POSE, PROBE, STEADY = slice(0, 6), slice(6, 30), slice(0, 27)
 """Terms of the pose, of the probe, and all but those that change with time."""
 
 OFFSETS, SENSORS, DRIFTS = slice(15, 18), slice(18, 27), slice(27, 30)
+
+APART = np.eye(3) - 1 / 3
+"""Takes their mean from the places of three sensors."""
 
 SMALL = 1e-5
 """Step of finite differences."""
@@ -75,7 +79,7 @@ def with_terms(instrument: Instrument, middle: Floats, changes: Floats) -> Instr
     gain, offset, drift = (tuple((np.array(own) + changes[part]).tolist()) for own, part in (
         (instrument.gain, slice(12, 15)), (instrument.offset_T, OFFSETS),
         (instrument.drift_T, DRIFTS)))
-    sensors = np.array(instrument.sensor_position_m) + changes[SENSORS].reshape(3, 3)
+    sensors = np.array(instrument.sensor_position_m) + APART @ changes[SENSORS].reshape(3, 3)
     return instrument.with_(
         translation_m=tuple(origin.tolist()), rotation_rad=tuple(after.as_rotvec().tolist()),
         crosstalk=crosstalk, gain=gain, offset_T=offset, drift_T=drift,

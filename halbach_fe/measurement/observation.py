@@ -70,6 +70,11 @@ class Observation:
         """Distance in m of each reading's point, or radius of its circle, from the z axis."""
         return np.hypot(self.positions[:, 0], self.positions[:, 1])
 
+    @property
+    def places(self) -> Floats:
+        """Place (readings, 3) in m of each reading in the magnet: the first point it depends on."""
+        return self.points[self.operator.indices[self.operator.indptr[:-1]] // len(COMPONENTS)]
+
     def apply(self, fields: Floats) -> Floats:
         """Return the readings (..., readings) that the sensors give of fields B (..., n, 3) in T.
 
