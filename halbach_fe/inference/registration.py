@@ -51,7 +51,7 @@ from halbach_fe.response.block_variation import Variations, study_prior
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import field_function
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import root_matrix
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -173,6 +173,10 @@ class Registration:
         Log probability of the readings, up to a constant that all poses share.
     at_rest : bool
         Whether the fit came to rest.
+    blocks : Gaussian
+        Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
+        They serve to register another map of the same magnet: what permeable blocks answer to a
+        change of others is left out.
     """
 
     study: Study
@@ -186,6 +190,7 @@ class Registration:
     held_out_nominal_rms_T: Floats
     log_evidence: float
     at_rest: bool
+    blocks: Gaussian = dataclasses.field(repr=False)
 
     @property
     def instrument(self) -> Instrument:
@@ -196,6 +201,7 @@ class Registration:
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
     open_keys: Sequence[OpenKey] = (), say: Callable[[str], None] = lambda _: None,
+    blocks: Gaussian | None = None,
 ) -> list[Registration]:
     """Find the pose of a map in a magnet.
 
@@ -213,6 +219,8 @@ def register(
         Numbers of the study that are fitted too.
     say : callable, optional
         Called with a description of each step before it starts.
+    blocks : Gaussian, optional
+        `Registration.blocks` of another map, which replace the study's prior.
 
     Returns
     -------
@@ -226,7 +234,7 @@ def register(
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
     """
-    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys))
+    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys), blocks)
     say("searching the pose among rotations by right angles and shifts along the axis")
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training)
     starts = [pose for pose in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), pose)]
@@ -258,6 +266,8 @@ class _Fit:
     position_sd : ndarray, shape (3,), in m
     base : Instrument
         The study's instrument without its pose.
+    prior : Gaussian
+        Of all parameters of the blocks.
     derivatives : dict
         Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
     solved : dict
@@ -276,12 +286,13 @@ class _Fit:
     base: Instrument
     open: tuple[OpenKey, ...]
     variations: Variations | None
+    prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
-           open_keys: tuple[OpenKey, ...]) -> _Fit:
+           open_keys: tuple[OpenKey, ...], blocks: Gaussian | None) -> _Fit:
         study = magnet.study
         if magnet.dimension == 2:
             raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
@@ -310,9 +321,12 @@ class _Fit:
             study = study.with_(noise=None)
         sigma = np.ones(measured.size)
         sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
+        variations = Variations.of(magnet)
+        if blocks is None:
+            blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
-                   session, probe, base, open_keys, Variations.of(magnet))
+                   session, probe, base, open_keys, variations, blocks)
 
     @property
     def smallest_sigma(self) -> float:
@@ -371,14 +385,21 @@ class _Fit:
                 at_rest = True
                 break
         step, sd, chi2 = state.step(rows, values / prior_sd)
-        updated, log_evidence = state.updated(rows, values / prior_sd)
+        updated, log_evidence, mean, covariance = state.updated(rows, values / prior_sd)
         return Registration(
             self.study_of(pose, values), pose[:3], sd[:3], sd[3:6],
             {each.key: (value, error) for each, value, error in zip(
                 self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest)
+            log_evidence, at_rest, self._blocks(columns.directions, mean, covariance))
+
+    def _blocks(self, directions: Floats, mean: Floats, covariance: Floats) -> Gaussian:
+        """Return the updated blocks from mean (k,) and covariance (k, k) of their combinations."""
+        root = root_matrix(self.prior.root)
+        variances, axes = np.linalg.eigh(covariance)
+        return Gaussian(self.prior.mean + root @ (directions @ mean), CovarianceFactor(
+            root, directions @ axes, np.sqrt(np.clip(variances, 0.0, 1.0))))
 
     def is_possible(self, values: Floats, pose: Floats | None = None) -> bool:
         """Tell whether a valid study has these values, and all readings lie in air at a pose."""
@@ -405,15 +426,17 @@ class _Fit:
         variations = self.variations
         if variations is not None:
             fields.append(variations.fields(middle))
-        prior = study_prior(self.magnet, len(variations.names) if variations is not None else 0)
-        root = root_matrix(prior.root)
+        root = root_matrix(self.prior.root)
         whole = np.concatenate(fields, axis=2)
+        nominal = np.zeros(whole.shape[-1])
+        nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
         flat = whole.reshape(-1, whole.shape[-1])
+        shift = (flat @ (self.prior.mean - nominal)).reshape(-1, 3)
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
-        return _BlockColumns(middle, columns @ directions[:, kept])
+        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept])
 
     def _magnet(self, values: Floats) -> Magnet:
         """Return the magnet with the values of the open keys."""
@@ -452,7 +475,7 @@ class _Fit:
         middle, count = sensors.mean(axis=1), len(self.points)
         matrix = sensor_matrix(instrument)
         here, gradient = field_at_sensors(self._field(values), sensors)
-        residual = self.readings - seen(matrix, here) - values[OFFSETS]
+        residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
         columns = list(np.moveaxis(by_terms(
             instrument, self.points, middle_of(self.points), np.zeros(count), here, gradient,
             STEADY), -1, 0))
@@ -475,11 +498,17 @@ class _BlockColumns:
     ----------
     places : ndarray, shape (n, 3), in m
     fields : ndarray, shape (n, 3, k), in T
-        B per prior standard deviation of the magnetizations.
+        B per prior standard deviation of k combinations of the magnetizations.
+    shift : ndarray, shape (n, 3), in T
+        B of the prior's mean less that of the nominal magnet.
+    directions : ndarray, shape (columns of the prior's root, k)
+        The combinations.
     """
 
     places: Floats
     fields: Floats
+    shift: Floats
+    directions: Floats
 
 
 @dataclass(frozen=True)
@@ -541,8 +570,10 @@ class _State:
         """Return chi-squared with the magnetizations integrated out, see `step`."""
         return self.step(rows, scaled)[2]
 
-    def updated(self, rows: NDArray[np.bool_], scaled: Floats) -> tuple[Floats, float]:
-        """Return the residual (n, 3) in T of the updated blocks, and the log evidence."""
+    def updated(
+        self, rows: NDArray[np.bool_], scaled: Floats
+    ) -> tuple[Floats, float, Floats, Floats]:
+        """Return residual (n, 3) in T and log evidence, and mean and covariance of the blocks."""
         residual, derivative, blocks = self._whitened(rows)
         design = np.hstack([blocks, derivative[:, :6], derivative[:, 6:] * self.prior_sd])
         inner = design.T @ design
@@ -558,7 +589,8 @@ class _State:
         left = residual - design @ solution
         chi2 = float(left @ left + np.sum((keep * (solution + start))**2))
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
-            np.log(self.sigma.ravel()[rows]).sum())
+            np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
+                factor, np.eye(len(inner)))[:count, :count]
 
 
 def each_value(fit: _Fit, values: Floats) -> list[float]:

@@ -296,8 +296,8 @@ class InferenceResult(ShownInNotebook):
             np.array(self.observation.labels), *self.observation.positions.T,
             np.array(self.maps), np.array(self.regions), self.held_out.astype(int),
             np.array(self.parts), self.readings, self.noise.sd, self.response.error, prior.mean,
-            prior.sd, posterior.mean, posterior.sd, self.standardized(prior), self.standardized(posterior)),
-            strict=True))
+            prior.sd, posterior.mean, posterior.sd, self.standardized(prior),
+            self.standardized(posterior)), strict=True))
         return xr.Dataset({name: ("reading", value) for name, value in columns.items()})
 
     @cached_property

@@ -15,6 +15,7 @@ from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes
 from halbach_fe.measurement.observation import study_for_validation_map
+from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.model import Study
 
 ONLY_MAP, VALIDATION_MAP = "map", "held-out map"
@@ -159,6 +160,15 @@ def refuse_several_maps(study: Study, verb: str) -> None:
             "`maps`", f"study {study.name}", f"left out, since {verb} takes a single map",
             f"a list of {len(study.maps)}",
             "Give it a study of one of the maps, with that map's instrument."))
+
+
+def refuse_open_instruments(study: Study, verb: str) -> None:
+    """Raise a StudyError if terms of an instrument are to be estimated, where that cannot be."""
+    whole = [study.of_map(number) for number in range(len(study.maps))] or [study]
+    if any(one.instrument_sd != InstrumentSd() for one in whole):
+        raise StudyError(must_be(
+            "`instrument_sd`", f"study {study.name}", f"left out, for {verb}", "a table",
+            "State the instrument that halbach-fe infer found (study.updated.toml) without it."))
 
 
 def _middle(study: Study, data: xr.Dataset) -> Floats:

@@ -1,8 +1,8 @@
 """The terms of an instrument as numbers that a fit can change: pose, and parameters of the probe.
 
 A vector (30,) holds the changes of all terms: shift of the map's middle and turn about it, along
-the magnet's axes, then crosstalk, gains, offsets, places of the sensors, and drift. Of the places of
-the sensors only differences count: what all sensors have in common is a shift of the map.
+the magnet's axes, then crosstalk, gains, offsets, places of the sensors, and drift. Of the places
+of the sensors only differences count: what all sensors have in common is a shift of the map.
 """
 
 from __future__ import annotations

@@ -119,6 +119,9 @@ class Study(StudyModel):
             if twice:
                 raise ValueError(f"every map needs a {key} of its own, but two of them have "
                                  f"'{twice[0]}'")
+        uncertain = [self.instrument_sd, *(one.instrument_sd for one in self.maps)]
+        if self.dimension == 2 and any(sd not in (None, InstrumentSd()) for sd in uncertain):
+            raise ValueError("instrument_sd needs a 3D study")
         first: dict[str, Study] = {}
         for number, one in enumerate(self.maps):
             own = self.of_map(number)  # which validates each map with the rest of the study
