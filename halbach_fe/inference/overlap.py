@@ -44,12 +44,12 @@ def overlaps(
     """
     maps, training = np.array(readings.maps), readings.training
     held_out = np.array(readings.parts) == HELD_OUT
-    places = readings.observation.places
+    places, stated = readings.observation.places, readings.observation.positions
     near: dict[tuple[str, str], np.ndarray] = {}
     for name, by in permutations(dict.fromkeys(maps[training].tolist()), 2):
-        theirs = places[maps == by]
-        distance = KDTree(theirs).query(places)[0]
-        chosen = (maps == name) & (distance <= NEAR * point_spacing(theirs))
+        theirs = maps == by
+        spacing = point_spacing(np.unique(stated[theirs], axis=0))  # three readings to a point
+        chosen = (maps == name) & (KDTree(places[theirs]).query(places)[0] <= NEAR * spacing)
         if (chosen & held_out).any():
             chosen &= held_out
         if chosen.any():

@@ -130,7 +130,7 @@ class Overlap:
             return (f"{where} and more than {self.limit:.2g} is rare): they are not of the same "
                     "magnet in the same state, or the pose, probe or noise of one of them is not "
                     "what the study says.")
-        if self.chi2 < TOO_NEAR:
+        if self.chi2 < min(TOO_NEAR, 2 - self.limit):
             return f"{where}): the noise of these maps is stated too large."
         return ""
 

@@ -89,6 +89,7 @@ def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
         ("fringe", "body"), ("body", "fringe")}
     for each in result.overlaps:
         assert each.held_out
+        assert each.readings > 40
         assert each.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / each.readings))
     assert {score.region for score in result.scores} == {"body", "fringe"}
     for score in result.scores:
