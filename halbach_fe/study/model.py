@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
@@ -124,7 +124,11 @@ class Study(StudyModel):
             raise ValueError("instrument_sd needs a 3D study")
         first: dict[str, Study] = {}
         for number, one in enumerate(self.maps):
-            own = self.of_map(number)  # which validates each map with the rest of the study
+            try:
+                own = self.of_map(number)
+            except ValidationError as error:
+                reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+                raise ValueError(f"map '{one.name}' does not fit the study: {reason}") from None
             if one.probe is None:
                 continue
             other = first.setdefault(one.probe, own)
@@ -140,7 +144,8 @@ class Study(StudyModel):
         one = self.maps[number]
         own = {key: getattr(one, key) for key in (
             "instrument", "instrument_sd", "noise", "inference") if getattr(one, key) is not None}
-        return self.with_(maps=(), **own)
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self).model_validate(values | own | {"maps": ()})
 
 
 def is_nonlinear(study: Study) -> bool:
