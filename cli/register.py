@@ -114,4 +114,4 @@ def _print(found: Sequence[Registration], *before: str) -> None:
 
     for sentence in sentences(found, *before):
         common.say(sentence)
-    common.print_table(pose_table(found), "Where the map lies in the magnet")
+    common.print_table(pose_table(found, *before), "Where the map lies in the magnet")

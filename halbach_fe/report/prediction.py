@@ -21,6 +21,7 @@ from halbach_fe.inference.result import (
     InferenceResult,
     Prediction,
 )
+from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, stacked_axes
 
 MARKERS: dict[str, dict[str, Any]] = {
@@ -99,8 +100,9 @@ def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:
 def main_line(result: InferenceResult, name: str | None = None) -> ReadingLine:
     """Return the line of readings through the strongest reading, of a map or by default of all.
 
-    It has the readings of the same map with the same label and radius. Where several of them have
-    the same z, it has the one nearest to the strongest reading in x and y.
+    It has the readings with the same label and radius; of several maps, those of one map near the
+    same line along z. Where several of them have the same z, it has the one nearest to the
+    strongest reading in x and y.
     """
     place, axis = axis_of_readings(result)
     maps = np.array(result.maps)
@@ -110,8 +112,12 @@ def main_line(result: InferenceResult, name: str | None = None) -> ReadingLine:
     if axis == "harmonic":
         labels, what = np.array([label[0] for label in labels]), what[0]
     radii, positions = result.observation.radii, result.observation.positions
-    mine = (maps == maps[strongest]) if result.is_campaign else True
-    own = np.flatnonzero((labels == what) & np.isclose(radii, radii[strongest], 0, 1e-4) & mine)
+    near = np.isclose(radii, radii[strongest], 0, 1e-4)
+    if result.is_campaign:  # stages may be inclined, so that lines are not at one radius
+        mine = maps == maps[strongest]
+        spacing = point_spacing(np.unique(positions[mine], axis=0))
+        near = mine & (np.hypot(*(positions - positions[strongest])[:, :2].T) < spacing / 4)
+    own = np.flatnonzero((labels == what) & near)
     away = (np.hypot(*(positions[own] - positions[strongest])[:, :2].T) if axis.startswith("z")
             else np.zeros(len(own)))
     order = np.lexsort((away, place[own].round(9)))

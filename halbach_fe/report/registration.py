@@ -67,7 +67,9 @@ def _mT(rms: np.ndarray) -> str:  # noqa: N802 - a unit
     return f"{1e3 * float(np.sqrt(np.nanmean(rms**2))):.3g} mT rms"
 
 
-def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
+def pose_table(
+    found: Sequence[Registration], before: str = NOMINAL
+) -> list[dict[str, str]]:
     """Return rows of text, one per pose."""
     rows = []
     for each, probability in zip(found, odds(found), strict=True):
@@ -78,7 +80,8 @@ def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
             "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
             "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
                                           each.instrument.rotation_rad),
-            "nominal": _mT(each.nominal_rms_T), "updated": _mT(each.rms_T)})
+            "nominal" if before == NOMINAL else "before": _mT(each.nominal_rms_T),
+            "updated": _mT(each.rms_T)})
     return rows
 
 
@@ -160,7 +163,7 @@ def _write_page(
         "The readings along the magnet's axis and in its cross-section, where the registration "
         "puts them"))}
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, found=sentences(found, before), poses=pose_table(found),
+               provenance, found=sentences(found, before), poses=pose_table(found, before),
                name=study.name, probe=probe_table(best.instrument), map=name)
 
 
