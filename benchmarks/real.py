@@ -1,7 +1,8 @@
 """Measured magnets, from the raw map to the updated model, on lines of the scan that were held out.
 
 Every fifth line is set aside before anything is fitted: by the check, the registration and the
-update alike. The floor is that of Maxwell's check, which assumes no magnet.
+update alike. The floor is that of Maxwell's check, which assumes no magnet. A magnet with two maps
+is updated by the first alone, and then by both.
 """
 
 from __future__ import annotations
@@ -12,26 +13,57 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 
 from benchmarks.note import Note
 from halbach_fe.cli import common, main
 from halbach_fe.core.errors import HalbachError
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import read_study
 
 STUDIES = Path(__file__).parents[1] / "studies"
-EMPHATIC = "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
+BODY = "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
+FRINGE = "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],-"
 MRI = "-,dx[mm],dy[mm],dz[mm],Bx[G],By[G],Bz[G],-,-"
 WITHIN = 1.96
 """Standard deviations of the interval that holds 95 %."""
 
 
 def emphatic(note: Note) -> None:
-    """Note the figures of the spectrometer dipole."""
-    _magnet(note, "real", "emphatic", "body_scan.csv", EMPHATIC, "oriented_map.csv")
+    """Note the figures of the spectrometer dipole, of its first map and of both."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        measured = STUDIES / "emphatic" / "measured"
+        raw = {"body": "body_scan.csv", "fringe": "small_aperture_fringe.csv"}
+        study = read_study(measured / "study.toml")
+        for (name, file), columns in zip(raw.items(), (BODY, FRINGE), strict=True):
+            _checked(measured / file, columns, folder / name)
+        listed = tuple(one.with_(file=f"{one.name}/check/oriented_map.csv") for one in study.maps)
+        _write(study.with_(maps=listed), folder / "study.toml")
+        _do("register", folder / "study.toml", "-o", folder / "pose")
+        registered = folder / "pose" / "study.registered.toml"
+        _write(read_study(registered).of_map(0).with_(instrument_sd={}), folder / "body.toml")
+        _do("infer", folder / "body.toml", "-o", folder / "inferred", "--measurements",
+            folder / "body" / "check" / "oriented_map.csv")
+        _note_figures(note, "real", raw["body"], folder / "body", folder / "pose" / "body",
+                      folder / "inferred")
+        _do("infer", registered, "-o", folder / "both")
+        _note_second(note, "real", raw["fringe"], folder / "fringe", folder / "both")
 
 
 def mri(note: Note) -> None:
     """Note the figures of the magnet for MRI."""
-    _magnet(note, "real_mri", "mri4all", "cube_10cm_11_steps.csv", MRI, "corrected_map.csv")
+    raw, measured = "cube_10cm_11_steps.csv", STUDIES / "mri4all" / "measured"
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        _checked(measured / raw, MRI, folder)
+        given = folder / "check" / "corrected_map.csv"
+        _do("register", measured / "study.toml", "--measurements", given, "-o", folder / "pose")
+        _do("infer", folder / "pose" / "study.registered.toml", "--measurements", given,
+            "-o", folder / "inferred")
+        _note_figures(note, "real_mri", raw, folder, folder / "pose", folder / "inferred")
+        rows, readings, mean = _held_out(folder / "inferred")
+        _note_deviation(note, "real_mri", rows, readings, mean)
 
 
 def _do(*arguments: str | Path) -> None:
@@ -40,43 +72,92 @@ def _do(*arguments: str | Path) -> None:
         raise HalbachError(f"halbach-fe {arguments[0]} failed; its message is above.")
 
 
-def _magnet(note: Note, name: str, study: str, raw: str, columns: str, checked: str) -> None:
-    """Take the map of one magnet through all steps, and note its figures under a name."""
-    measured = STUDIES / study / "measured"
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        common.say(f"{name}: {raw}")
-        _do("import-map", measured / raw, "-o", folder / "map.csv", f"--columns={columns}")
-        _do("check", folder / "map.csv", "-o", folder / "check")
-        given = folder / "check" / checked
-        _do("register", measured / "study.toml", "--measurements", given, "-o", folder / "pose")
-        registered = folder / "pose" / "study.registered.toml"
-        _do("infer", registered, "--measurements", given, "-o", folder / "inferred")
-        check = json.loads((folder / "check" / "check.json").read_text())
-        pose = json.loads((folder / "pose" / "registration.json").read_text())["poses"][0]
-        scores = json.loads((folder / "inferred" / "summary.json").read_text())["scores"]
-        with (folder / "inferred" / "prediction.csv").open() as file:
-            rows = [row for row in csv.DictReader(file) if row["held_out"] == "1"]
-    floor = check["floor_rms_T"]
-    readings, mean, score = (np.array([float(row[key]) for row in rows]) for key in (
-        "measured_T", "posterior_mean_T", "standardized_residual"))
-    rms = {component: float(np.sqrt(np.mean((readings - mean)[
-        [row["label"] == f"B{component}" for row in rows]]**2))) for component in "xyz"}
-    posterior = float(np.sqrt(np.mean(np.square(list(rms.values())))))
-    nominal = float(np.sqrt(np.mean(np.square(pose["held_out_nominal_rms_T"]))))
+def _checked(raw: Path, columns: str, folder: Path) -> None:
+    """Import and check a map."""
+    common.say(raw.name)
+    folder.mkdir(exist_ok=True)
+    _do("import-map", raw, "-o", folder / "map.csv", f"--columns={columns}")
+    _do("check", folder / "map.csv", "-o", folder / "check")
+
+
+def _write(study: Study, path: Path) -> None:
+    """Write a study file."""
+    path.write_text(tomlkit.dumps(study.model_dump(mode="json", exclude_defaults=True)))
+
+
+def _held_out(
+    inferred: Path, of_map: str | None = None
+) -> tuple[list[dict[str, str]], np.ndarray, np.ndarray]:
+    """Return the rows of held-out readings of an update, the readings and their predictions."""
+    with (inferred / "prediction.csv").open() as file:
+        rows = [row for row in csv.DictReader(file)
+                if row["held_out"] == "1" and of_map in (None, row["map"])]
+    readings, mean = (np.array([float(row[key]) for row in rows]) for key in (
+        "measured_T", "posterior_mean_T"))
+    return rows, readings, mean
+
+
+def _rms(rows: list[dict[str, str]], residual: np.ndarray) -> float:
+    """Return the rms over the three components of the rms residual of each."""
+    labels = np.array([row["label"] for row in rows])
+    return float(np.sqrt(np.mean([np.mean(residual[labels == f"B{component}"]**2)
+                                  for component in "xyz"])))
+
+
+def _within(rows: list[dict[str, str]]) -> float:
+    """Return the share of readings within their 95 % band."""
+    return float(np.mean([abs(float(row["standardized_residual"])) <= WITHIN for row in rows]))
+
+
+def _chi2(inferred: Path, region: str | None = None) -> float:
+    """Return chi-squared per held-out reading of an update, of all or of one region."""
+    scores = [each for each in json.loads((inferred / "summary.json").read_text())["scores"]
+              if each["part"] == "held out" and region in (None, each["region"])]
+    return float(np.average([each["chi2_posterior"] for each in scores],
+                            weights=[each["readings"] for each in scores]))
+
+
+def _note_figures(
+    note: Note, name: str, raw: str, checked: Path, pose: Path, inferred: Path
+) -> None:
+    """Note what a check, a registration and an update say of one map, under a name."""
+    floor = json.loads((checked / "check" / "check.json").read_text())["floor_rms_T"]
+    best = json.loads((pose / "registration.json").read_text())["poses"][0]
+    rows, readings, mean = _held_out(inferred)
+    posterior = _rms(rows, readings - mean)
+    nominal = float(np.sqrt(np.mean(np.square(best["held_out_nominal_rms_T"]))))
     against = f"{len(rows)} readings of every fifth scan line of {raw}, held out"
     note(f"{name}.floor_mT", 1e3 * floor, "mT", f"{against}; rms over the components")
     note(f"{name}.posterior_mT", 1e3 * posterior, "mT", "the same lines, updated magnet")
     note(f"{name}.posterior_over_floor", posterior / floor, "ratio", "asked: 1.3 at most")
     note(f"{name}.nominal_mT", 1e3 * nominal, "mT", "nominal magnet after registration only")
     note(f"{name}.gain", nominal / posterior, "ratio", "nominal over posterior")
-    note(f"{name}.coverage95", float(np.mean(np.abs(score) <= WITHIN)), "ratio", against)
-    held_out = [each for each in scores if each["part"] == "held out"]
-    note(f"{name}.heldout_chi2", float(np.average(
-        [each["chi2_posterior"] for each in held_out],
-        weights=[each["readings"] for each in held_out])), "per reading", against)
-    if name == "real_mri":
-        _note_deviation(note, name, rows, readings, mean)
+    note(f"{name}.coverage95", _within(rows), "ratio", against)
+    note(f"{name}.heldout_chi2", _chi2(inferred), "per reading", against)
+
+
+def _note_second(note: Note, name: str, raw: str, checked: Path, both: Path) -> None:
+    """Note what an update by two maps says of the second one, ``fringe``."""
+    summary = json.loads((both / "summary.json").read_text())
+    terms = summary["instrument_terms"]
+    sd = max(terms[f"fringe.translation_{axis}_m"]["sd"] for axis in "xyz")
+    note(f"{name}.second_map_pose_sd_mm", 1e3 * sd, "mm",
+         f"largest over the axes, of the middle of {raw}")
+    (overlap,) = [each for each in summary["overlaps"]
+                  if (each["name"], each["by"]) == ("fringe", "body")]
+    note(f"{name}.overlap_chi2", overlap["chi2"], "per reading",
+         f"{overlap['readings']} held-out readings of {raw} within the first map, by an update "
+         "with the first map only")
+    floor = json.loads((checked / "check" / "check.json").read_text())["floor_rms_T"]
+    rows, readings, mean = _held_out(both, "fringe")
+    note(f"{name}.second_map_floor_mT", 1e3 * floor, "mT",
+         f"{len(rows)} held-out readings of {raw}")
+    note(f"{name}.second_map_posterior_mT", 1e3 * _rms(rows, readings - mean), "mT",
+         "the same lines, updated by both maps")
+    note(f"{name}.second_map_coverage95", _within(rows), "ratio", "the same lines")
+    for region in ("body", "fringe"):
+        note(f"{name}.both_maps_heldout_chi2_{region}", _chi2(both, region), "per reading",
+             f"held-out lines of map {region}, updated by both maps")
 
 
 def _note_deviation(

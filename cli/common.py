@@ -33,6 +33,8 @@ from halbach_fe.core.errors import (
     OUT_OF_MEMORY,
     HalbachError,
     HalbachWarning,
+    StudyError,
+    must_be,
     printable,
 )
 
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from halbach_fe.response.resource_estimate import Estimate
     from halbach_fe.solver.getdp_cache import Cache
     from halbach_fe.solver.session import Session
+    from halbach_fe.study.model import Study
 
 BLAS_BUFFER_BYTES = 128 * 2**20
 """What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
@@ -184,10 +187,11 @@ def reference(arguments: argparse.Namespace) -> MultipoleReference:
                               arguments.at_z_m)
 
 
-def add_measurement_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --measurements and --blocks."""
-    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
-                        help="measured field map (CSV or HDF5)")
+def add_measurement_arguments(parser: argparse.ArgumentParser, several: bool = False) -> None:
+    """Add --measurements and --blocks; ``several`` maps may be listed by the study instead."""
+    parser.add_argument("--measurements", type=Path, required=not several, metavar="MAP",
+                        help="measured field map (CSV or HDF5)"
+                        + (", unless the study lists maps" if several else ""))
     parser.add_argument("--blocks", type=Path, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
@@ -204,13 +208,51 @@ def measurements(
     arguments: argparse.Namespace,
 ) -> tuple[xr.Dataset, BlockTable | None, xr.Dataset | None]:
     """Read the map, the block table and the held-out map; None stands for a file not given."""
+    from halbach_fe.measurement.field_map import read_map
+
+    return read_map(arguments.measurements), *blocks_and_held_out(arguments)
+
+
+def blocks_and_held_out(
+    arguments: argparse.Namespace,
+) -> tuple[BlockTable | None, xr.Dataset | None]:
+    """Read the block table and the held-out map; None stands for a file not given."""
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.field_map import read_map
 
     held_out = getattr(arguments, "held_out", None)
-    return (read_map(arguments.measurements),
-            read_blocks(arguments.blocks) if arguments.blocks else None,
+    return (read_blocks(arguments.blocks) if arguments.blocks else None,
             read_map(held_out) if held_out else None)
+
+
+def read_measurements(
+    arguments: argparse.Namespace, study: Study
+) -> xr.Dataset | dict[str, xr.Dataset]:
+    """Read the map of --measurements, or all maps that the study lists, by name.
+
+    Raises
+    ------
+    StudyError
+        If both or neither are given.
+    """
+    from halbach_fe.measurement.campaign import read_maps
+    from halbach_fe.measurement.field_map import read_map
+
+    if bool(study.maps) == (arguments.measurements is not None):
+        raise StudyError(must_be(
+            "--measurements", "the command line", "given, or maps listed by the study",
+            "both" if study.maps else "neither",
+            "Leave --measurements out." if study.maps else "Add --measurements, or [[maps]]."))
+    if study.maps:
+        return read_maps(study, arguments.study.parent)
+    return read_map(arguments.measurements)
+
+
+def map_files(arguments: argparse.Namespace, study: Study) -> dict[str, Path | None]:
+    """Return the files of the maps by their description in the provenance of a page."""
+    if not study.maps:
+        return {"measurements": arguments.measurements}
+    return {f"map {one.name}": arguments.study.parent / one.file for one in study.maps}
 
 
 def add_seed_argument(parser: argparse.ArgumentParser) -> None:

@@ -2,7 +2,10 @@
 
 Writes posterior.h5, prediction.csv, summary.json, report.html and its figures, and, if the map has
 full circles, multipoles.csv. `halbach-fe multipoles` computes the multipoles from posterior.h5 for
-any map.
+any map. If the study lists maps, all of them update the magnet together, and test each other where
+they overlap. Terms of instruments of which the study states a standard deviation are estimated with
+the magnetizations; study.updated.toml, the study's own file, then has the instruments that were
+found.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
     common.add_dry_run_argument(parser)
-    common.add_measurement_arguments(parser)
+    common.add_measurement_arguments(parser, several=True)
     common.add_held_out_argument(parser)
     parser.add_argument("--samples", type=common.positive, metavar="N",
                         help="for iron with an H(B) curve: sample the non-linear posterior by four "
@@ -31,10 +34,13 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer, observation_of
     from halbach_fe.inference.storage import inference_summary, write_inference
+    from halbach_fe.measurement.campaign import refuse_open_instruments
     from halbach_fe.study.reader import read_study
 
-    magnet = build_magnet(read_study(arguments.study))
-    data, blocks, validation_map = common.measurements(arguments)
+    study = read_study(arguments.study)
+    magnet = build_magnet(study)
+    data = common.read_measurements(arguments, study)
+    blocks, validation_map = common.blocks_and_held_out(arguments)
     if arguments.samples and not magnet.is_nonlinear:
         raise StudyError(
             f"Input --samples must go with iron that has an H(B) curve; study {magnet.name} is "
@@ -43,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         from halbach_fe.inference.mcmc import check_sampling
 
         check_sampling(magnet)
+        refuse_open_instruments(study, "--samples")
     if arguments.dry_run:
         from halbach_fe.response.resource_estimate import estimate_infer
 
@@ -65,18 +72,23 @@ def run(arguments: argparse.Namespace) -> int:
             write_sampled(sampled, arguments.output)
     if result.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
+    from halbach_fe.report.campaign_inference import overlap_table, term_table, write_updated_study
     from halbach_fe.report.inference import score_table, write_inference_report
 
     write_inference(result, arguments.output)
     write_inference_report(result, arguments.output, provenance={
         "GetDP": session.getdp.version, **common.digests({
-            "study file": arguments.study, "measurements": arguments.measurements,
+            "study file": arguments.study, **common.map_files(arguments, study),
             "held-out map": arguments.held_out, "blocks": arguments.blocks})})
+    if result.terms is not None:
+        write_updated_study(arguments.study, result, arguments.output)
     if arguments.json:
         common.print_json(inference_summary(result))
     else:
         if result.disagreement:
             common.say(f"Model and measurement disagree. {result.disagreement}")
         common.print_table(score_table(result), "Median relative error, before and after")
+        common.print_table(term_table(result), "The instruments, estimated with the blocks")
+        common.print_table(overlap_table(result), "Maps where they overlap")
         common.say(f"Report: {arguments.output / 'report.html'}")
     return 0

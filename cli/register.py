@@ -4,13 +4,16 @@ Needs no first guess: every rotation by right angles and every place along the a
 pose and probe are fitted together with the blocks. Numbers that a drawing leaves open can be fitted
 too. Writes study.registered.toml (the study's own file with the instrument and these numbers),
 registration.json, registration.html and its figure. A symmetric magnet allows several poses, all of
-which are reported with their odds; the file has the most probable one.
+which are reported with their odds; the file has the most probable one. If the study lists maps,
+they are registered one after the other, each in the magnet as those before it have updated it, and
+each gets a folder with its own page.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,14 +21,17 @@ from halbach_fe.cli import common
 from halbach_fe.core.numbers import parse_number
 
 if TYPE_CHECKING:
-    from halbach_fe.inference.registration import OpenKey
+    import xarray as xr
+
+    from halbach_fe.inference.registration import OpenKey, Registration
+    from halbach_fe.study.model import Study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
-                        help="measured field map (CSV or HDF5)")
+    parser.add_argument("--measurements", type=Path, metavar="MAP",
+                        help="measured field map (CSV or HDF5), unless the study lists maps")
     parser.add_argument("--fit", type=_open_key, action="append", default=[], metavar="KEY=SD",
                         help="a number of the study that is open, with its standard deviation, "
                         "such as array.remanence_T=0.02; can be given several times")
@@ -49,28 +55,63 @@ def run(arguments: argparse.Namespace) -> int:
     """Register the map, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.registration import register
-    from halbach_fe.measurement.field_map import read_map
-    from halbach_fe.report.registration import (
-        pose_table,
-        registration_summary,
-        sentences,
-        write_registration,
-    )
+    from halbach_fe.report.registration import registration_summary, write_registration
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
+    data = common.read_measurements(arguments, study)
     text = arguments.study.read_text(encoding="utf-8")
-    data = read_map(arguments.measurements)
+    say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
+    if isinstance(data, dict):
+        return _run_campaign(arguments, study, text, data, say)
     with common.session(arguments) as session:
-        found = register(build_magnet(study), data, session, open_keys=arguments.fit,
-                         say=(lambda _: None) if arguments.json else common.say)
+        found = register(build_magnet(study), data, session, open_keys=arguments.fit, say=say)
     write_registration(study, text, data, found, arguments.output, common.digests({
         "study file": arguments.study, "measurements": arguments.measurements}))
     if arguments.json:
         common.print_json(registration_summary(found))
         return 0
-    for sentence in sentences(found):
-        common.say(sentence)
-    common.print_table(pose_table(found), "Where the map lies in the magnet")
+    _print(found)
     common.say(f"Report: {arguments.output / 'registration.html'}")
     return 0
+
+
+def _run_campaign(
+    arguments: argparse.Namespace, study: Study, text: str, data: dict[str, xr.Dataset],
+    say: Callable[[str], None],
+) -> int:
+    """Register all maps that the study lists."""
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.campaign_registration import register_maps, registered_study
+    from halbach_fe.measurement.campaign import maps_of, with_paths_from
+    from halbach_fe.report.registration import (
+        UPDATED,
+        registration_summary,
+        write_campaign_registration,
+    )
+
+    maps = maps_of(study, data)
+    with common.session(arguments) as session:
+        found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say)
+    registered = with_paths_from(registered_study(study, maps, found), arguments.study.parent,
+                                 arguments.output)
+    write_campaign_registration(registered, text, maps, found, arguments.output, common.digests(
+        {"study file": arguments.study} | common.map_files(arguments, study)))
+    if arguments.json:
+        common.print_json({"maps": {name: registration_summary(poses)
+                                    for name, poses in found.items()}})
+        return 0
+    for number, (name, poses) in enumerate(found.items()):
+        common.say(f"Map {name}:")
+        _print(poses, *([UPDATED] if number else []))
+        common.say(f"Report: {arguments.output / name / 'registration.html'}")
+    return 0
+
+
+def _print(found: Sequence[Registration], *before: str) -> None:
+    """Print what was found about one map."""
+    from halbach_fe.report.registration import pose_table, sentences
+
+    for sentence in sentences(found, *before):
+        common.say(sentence)
+    common.print_table(pose_table(found, *before), "Where the map lies in the magnet")

@@ -43,6 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
+    from halbach_fe.measurement.campaign import refuse_several_maps
     from halbach_fe.report.shimming import move_table, shim_summary, write_shim
     from halbach_fe.response.multipoles import text_table
     from halbach_fe.study.reader import read_study
@@ -52,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
                          "replaced; instead --replace is missing. Add --replace.")
     magnet = build_magnet(read_study(arguments.study))
     check_shimming(magnet.study)
+    refuse_several_maps(magnet.study, "shim")
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     with common.session(arguments) as session:

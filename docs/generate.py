@@ -11,10 +11,11 @@ from halbach_fe.study.model import Study
 
 MODULES = (
     "study.reader", "study.model", "study.array", "study.free_blocks", "study.iron", "study.magnet",
-    "study.measurement", "study.solver", "study.inference",
+    "study.measurement", "study.maps", "study.solver", "study.inference",
     "geometry.magnet", "stats.gaussian", "stats.noise", "stats.linear_gaussian",
     "stats.pcn", "solver.exact_block_field", "solver.ring_harmonics_2d",
-    "measurement.field_map", "measurement.block_table", "measurement.observation",
+    "measurement.field_map", "measurement.block_table", "measurement.campaign",
+    "measurement.observation",
     "response.matrix", "inference.infer", "inference.result",
     "diagnosis.diagnose", "diagnosis.result", "diagnosis.evidence", "diagnosis.model_selection",
     "diagnosis.effects.base")

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from halbach_fe.inference.result import InferenceResult as InferenceResult
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
     from halbach_fe.measurement.block_table import read_blocks as read_blocks
+    from halbach_fe.measurement.campaign import read_maps as read_maps
     from halbach_fe.measurement.field_map import read_map as read_map
     from halbach_fe.measurement.map_check import MapCheck as MapCheck
     from halbach_fe.measurement.map_check import check_map as check_map
@@ -57,7 +58,8 @@ if TYPE_CHECKING:
 
 _HOME = {
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
-    "read_map": "measurement.field_map", "read_blocks": "measurement.block_table",
+    "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
+    "read_blocks": "measurement.block_table",
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "plan": "api", "shim": "api",

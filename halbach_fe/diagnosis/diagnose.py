@@ -51,6 +51,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_several_maps
 from halbach_fe.measurement.instrument import map_time
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
@@ -100,6 +101,8 @@ def diagnose(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
+    refuse_several_maps(study, "a diagnosis")
+    refuse_open_instruments(study, "a diagnosis, which finds errors of instruments itself")
     effects = catalogue() if effects is None else effects
     gross_errors, corrected, start = _correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:

@@ -3,37 +3,24 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.inference.result import (
-    ALL_READINGS,
-    HELD_OUT,
-    HELD_OUT_MAP,
-    TRAINING,
-    InferenceResult,
-    Prediction,
-)
+from halbach_fe.inference.instrument_fit import Beside, OpenTerms, joined, of_the_first
+from halbach_fe.inference.overlap import overlaps
+from halbach_fe.inference.readings import read_campaign
+from halbach_fe.inference.result import InferenceResult, InstrumentTerms, Prediction
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, remove_nonlinear_part
-from halbach_fe.measurement.observation import (
-    Observation,
-    concatenate,
-    excluded_components,
-    held_out_readings,
-    observe,
-    study_for_validation_map,
-)
-from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
+from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import study_prior, with_variations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
@@ -41,13 +28,17 @@ from halbach_fe.solver.formulation_choice import choose_route, solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import predict
-from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study
 
 LINEAR_ENOUGH = 0.3
 """Error that the linearization of the iron may cause in a reading, relative to its error bar; a
 larger error causes a warning."""
+
+ROUNDS, AT_REST = 5, 0.3
+"""Largest number of updates about terms of the instrument, and change of each of them in its
+standard deviations up to which they are at rest."""
 
 LEFT_OUT = 0.02
 """Relative change of a posterior variance (1 % of a standard deviation) that discarded information
@@ -55,17 +46,19 @@ may cause; a larger change causes a warning."""
 
 
 def infer(
-    magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
-    prior: Gaussian | None = None, linearized_only: bool = False,
-    validation_map: xr.Dataset | None = None,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
+    blocks: BlockTable | None = None, prior: Gaussian | None = None,
+    linearized_only: bool = False, validation_map: xr.Dataset | None = None,
 ) -> InferenceResult:
     """Update the block magnetizations of a study with a measured map.
 
     Parameters
     ----------
     magnet : Magnet
-    data : Dataset
-        The measured map, see `halbach_fe.read_map`.
+    data : Dataset or dict of str to Dataset
+        The measured map, see `halbach_fe.read_map`; or all maps that the study lists, see
+        `halbach_fe.read_maps`. Terms of their instruments of which the study states a standard
+        deviation are estimated with the magnetizations.
     session : Session
         Its folder receives the mesh, the run folders and the response matrix.
     blocks : BlockTable, optional
@@ -107,50 +100,88 @@ def infer(
     >>> bool(block["posterior_sd"] < block["prior_sd"])
     True
     """
-    study = magnet.study
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
-    observation, noise, readings, parts = _read_maps(magnet, data, validation_map)
-    training = np.array(parts) == TRAINING
-    regions = (ALL_READINGS,) * len(observation)
-    if study.noise is not None and study.noise.regions:
-        names = [region.name for region in study.noise.regions]
-        regions = tuple(names[i] for i in noise_regions(
-            study.noise, observation.positions[:, 2], observation.components))
-    try:
-        model = response_matrix(magnet, observation, session)
-    except PointsOutsideError as error:
-        raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
-    varying = len(model.parameters) - len(magnet.parameter_names)
-    prior_used = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
-                           else study_prior(magnet, varying))
-    errors = noise.with_independent_errors(model.error)
-    update = linear_gaussian.update(
-        model.matrix, (readings - model.offset)[training], errors.subset(training), prior_used,
-        np.flatnonzero(training))
-    posterior = update.distribution
+    maps = maps_of(magnet.study, data, validation_map)
+    open_terms = OpenTerms.of(maps)
+    total, at_rest = np.zeros(len(open_terms)), not len(open_terms)
+    for _ in range(ROUNDS):
+        readings = read_campaign(magnet, maps)
+        training = readings.training
+        try:
+            model = response_matrix(magnet, readings.observation, session)
+        except PointsOutsideError as error:
+            raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
+        varying = len(model.parameters) - len(magnet.parameter_names)
+        magnet_prior = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
+                                 else study_prior(magnet, varying))
+        matrix: Rows = model.matrix
+        whole_prior = magnet_prior
+        if len(open_terms):
+            matrix = Beside(model.matrix, open_terms.columns(
+                magnet, maps, readings, session.within("instrument")))
+            whole_prior = joined(magnet_prior, -total, open_terms.sd)
+        residual = readings.values - model.offset
+        errors = readings.noise.with_independent_errors(model.error)
+        update = linear_gaussian.update(
+            matrix, residual[training], errors.subset(training), whole_prior,
+            np.flatnonzero(training))
+        whole = update.distribution
+        change = whole.mean[len(model.parameters):]
+        sd = whole.sd_of(np.hstack([np.zeros((len(change), len(model.parameters))),
+                                    open_terms.counted]))
+        total, at_rest = total + change, bool(
+            (np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
+        maps = open_terms.applied(maps, change) if len(open_terms) else maps
+        if at_rest:
+            break
+    else:
+        warnings.warn(
+            f"The terms of the instruments of study {magnet.name} have not come to rest after "
+            f"{ROUNDS} updates: their error bars may be too small.", HalbachWarning, stacklevel=2)
     if update.discarded_information > LEFT_OUT:
         warnings.warn(
-            f"Study {study.name} has so many parameters and readings that some combinations of "
+            f"Study {magnet.name} has so many parameters and readings that some combinations of "
             "readings were discarded, which may change a posterior variance by a fraction of up to "
             f"{update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
+    posterior = whole
+    if len(open_terms):
+        magnet_prior, posterior = of_the_first([whole_prior, whole], len(model.parameters))
     if magnet.is_nonlinear and not linearized_only:
-        _check_linearization(magnet, observation, session, model, posterior.mean, errors.sd)
+        _check_linearization(magnet, readings.observation, session, model, posterior.mean,
+                             errors.sd)
     return InferenceResult(
-        magnet=magnet, observation=observation, readings=readings, noise=noise, parts=parts,
-        regions=regions, response=model, prior=prior_used, posterior=posterior,
-        prediction_prior=_predict(model, prior_used),
-        prediction_posterior=_predict(model, posterior),
+        magnet=magnet.with_study(_with_instruments(magnet.study, maps)),
+        observation=readings.observation, readings=readings.values, noise=readings.noise,
+        parts=readings.parts, regions=readings.regions, maps=readings.maps, response=model,
+        prior=magnet_prior, posterior=posterior,
+        prediction_prior=_predict(matrix, model.offset, whole_prior),
+        prediction_posterior=_predict(matrix, model.offset, whole),
         prior_conflict=update.prior_conflict, parameters_learnt=update.parameters_learnt,
         log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=of_blocks.count if of_blocks and not prior else None,
-        left_out=update.discarded_information)
+        left_out=update.discarded_information,
+        terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
+                              at_rest)
+        if len(open_terms) else None,
+        overlaps=overlaps(matrix, residual, errors, whole_prior, readings))
+
+
+def _with_instruments(study: Study, maps: Sequence[Map]) -> Study:
+    """Return a study with the instruments that were found."""
+    own = [one for one in maps if not one.is_validation]
+    if not study.maps:
+        return study.with_(instrument=own[0].study.instrument)
+    return study.with_(maps=tuple(
+        each.with_(instrument=one.study.instrument)
+        if one.study.instrument != study.of_map(number).instrument else each
+        for number, (each, one) in enumerate(zip(study.maps, own, strict=True))))
 
 
 def observation_of(
-    magnet: Magnet, data: xr.Dataset, blocks: BlockTable | None = None,
-    validation_map: xr.Dataset | None = None,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset],
+    blocks: BlockTable | None = None, validation_map: xr.Dataset | None = None,
 ) -> Observation:
     """Return the observation of all readings of `infer`, with the same checks of its inputs.
 
@@ -159,68 +190,20 @@ def observation_of(
     """
     if blocks is not None:
         prior_from_blocks(magnet, blocks)
-    noise = magnet.study.noise
-    if noise is not None:
-        magnet = magnet.with_(noise=noise.with_(position_sd_m=None) if noise.regions else None)
-    return _read_maps(magnet, data, validation_map)[0]
+    maps = maps_of(magnet.study, data, validation_map)
+    quick = []
+    for one in maps:
+        noise = one.study.noise
+        if noise is not None:
+            noise = noise.with_(position_sd_m=None) if noise.regions else None
+        quick.append(replace(one, study=one.study.with_(noise=noise)))
+    return read_campaign(magnet, quick).observation
 
 
-def _read_maps(
-    magnet: Magnet, data: xr.Dataset, validation_map: xr.Dataset | None
-) -> tuple[Observation, NoiseCovariance, Floats, tuple[str, ...]]:
-    """Return the observation, noise, readings in T, and parts of a map and a validation map.
-
-    The part of a reading is `TRAINING`, `HELD_OUT` or, in the validation map, `HELD_OUT_MAP`.
-    """
-    observation, noise, readings = _read_map(magnet, data,
-                                             excluded_components(magnet.study, data.sizes["point"]))
-    held_out = held_out_readings(magnet.study, observation)
-    parts = tuple(np.where(held_out, HELD_OUT, TRAINING).tolist())
-    if validation_map is not None:
-        validation, validation_noise, validation_readings = _read_map(
-            magnet.with_study(study_for_validation_map(magnet.study, validation_map)),
-            validation_map, np.zeros((validation_map.sizes["point"], 3), bool), "held-out map")
-        observation = concatenate(observation, validation)
-        noise = noise.stacked_with(validation_noise)
-        readings = np.concatenate([readings, validation_readings])
-        parts += (HELD_OUT_MAP,) * len(validation)
-    heights = observation.points[:, 2]
-    if magnet.dimension == 2 and np.ptp(heights) > 0:
-        raise MeasurementError(must_be(
-            "points", "map", "in one plane for a 2D study",
-            f"z from {heights.min():g} to {heights.max():g} m",
-            "Use a 3D study, or one circle of the map."))
-    return observation, noise, readings, parts
-
-
-def _read_map(
-    magnet: Magnet, data: xr.Dataset, left_out: NDArray[np.bool_], where: str = "map"
-) -> tuple[Observation, NoiseCovariance, Floats]:
-    """Return the study's observation of a map, its noise, and its readings in T.
-
-    ``left_out`` (n, 3) marks the components of the map that are not used.
-    """
-    data = in_si_and_magnet_axes(magnet.study.instrument, data)
-    observation = observe(
-        magnet.study, points_of(data), ~np.isnan(data["B_T"].values) & ~left_out, where)
-    inside = magnet.contains(observation.points)
-    if inside.any():
-        first = int(np.argmax(inside))
-        x, y, z = observation.points[first]
-        sensors = len(inside) // data.sizes["point"]
-        raise MeasurementError(must_be(
-            f"reading {first // sensors + 1}", where, "at a point in air",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
-            f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
-            "Check the study's radii and the map's axes and units."))
-    return (observation, reading_noise(magnet, observation, data),
-            observation.read(np.nan_to_num(remove_nonlinear_part(magnet.study.instrument, data))))
-
-
-def _predict(model: Response, parameters: Gaussian) -> Prediction:
-    """Return the prediction of all readings from a distribution of the magnetizations in A/m."""
-    mean, sd = predict(model.matrix, parameters)
-    return Prediction(model.offset + mean, sd, lambda rows: model.matrix[rows] @ parameters.root,
+def _predict(matrix: Rows, offset: Floats, parameters: Gaussian) -> Prediction:
+    """Return the prediction of all readings from a distribution of all parameters."""
+    mean, sd = predict(matrix, parameters)
+    return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
                       parameters.root.shape[1])
 
 

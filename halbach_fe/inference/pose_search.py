@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
 COARSE_POINTS, MIDDLE_POINTS = 60, 150
@@ -201,11 +202,6 @@ def _improved(
     turn = Rotation.from_rotvec(pose[3:])
     inside = magnet.contains(turn.apply(points) + pose[:3])
     return (None if inside.any() else misfit), pose
-
-
-def middle_of(points: Floats) -> Floats:
-    """Return the middle (3,) in m of the box about points (n, 3)."""
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 def _same(first: Floats, second: Floats) -> bool:

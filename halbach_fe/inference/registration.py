@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.pose_search import Field, coarse_poses, middle_of, moved_by, share_of
+from halbach_fe.inference.pose_search import Field, coarse_poses, moved_by, share_of
+from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
@@ -36,13 +37,21 @@ from halbach_fe.measurement.instrument import (
     sensor_matrix,
     sensor_positions,
 )
+from halbach_fe.measurement.instrument_terms import (
+    DIFFERENCE_M,
+    STEADY,
+    by_terms,
+    field_at_sensors,
+    seen,
+    with_terms,
+)
 from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import Variations, study_prior
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import field_function
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import root_matrix
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -54,13 +63,6 @@ ITERATIONS = 12
 AT_REST, NO_BETTER = 0.02, 1e-3
 """A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
 if a step decreases chi-squared by a smaller part than the second."""
-
-DIFFERENCE_M, SMALL = 2e-4, 1e-5
-"""Steps of finite differences: for the gradient of the field, and for the instrument."""
-
-CLOSE_M = 3e-4
-"""Distance of the sensors from their mean up to which the field is linear between them: in a
-gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
 
 DEVIATION = 0.05
 """Deviations of the blocks relative to their magnetization. Their columns are kept as long as a
@@ -88,8 +90,6 @@ OFFSETS = slice(9, 12)
 
 PART_OF_SD = 0.1
 """Step of the finite differences by open keys, in prior standard deviations."""
-
-CROSSTALK = ("xy", "xz", "yx", "yz", "zx", "zy")
 
 
 @dataclass(frozen=True)
@@ -173,6 +173,10 @@ class Registration:
         Log probability of the readings, up to a constant that all poses share.
     at_rest : bool
         Whether the fit came to rest.
+    blocks : Gaussian
+        Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
+        They serve to register another map of the same magnet: what permeable blocks answer to a
+        change of others is left out.
     """
 
     study: Study
@@ -186,6 +190,7 @@ class Registration:
     held_out_nominal_rms_T: Floats
     log_evidence: float
     at_rest: bool
+    blocks: Gaussian = dataclasses.field(repr=False)
 
     @property
     def instrument(self) -> Instrument:
@@ -196,6 +201,7 @@ class Registration:
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
     open_keys: Sequence[OpenKey] = (), say: Callable[[str], None] = lambda _: None,
+    blocks: Gaussian | None = None,
 ) -> list[Registration]:
     """Find the pose of a map in a magnet.
 
@@ -213,6 +219,8 @@ def register(
         Numbers of the study that are fitted too.
     say : callable, optional
         Called with a description of each step before it starts.
+    blocks : Gaussian, optional
+        `Registration.blocks` of another map, which replace the study's prior.
 
     Returns
     -------
@@ -226,7 +234,7 @@ def register(
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
     """
-    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys))
+    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys), blocks)
     say("searching the pose among rotations by right angles and shifts along the axis")
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training)
     starts = [pose for pose in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), pose)]
@@ -258,6 +266,8 @@ class _Fit:
     position_sd : ndarray, shape (3,), in m
     base : Instrument
         The study's instrument without its pose.
+    prior : Gaussian
+        Of all parameters of the blocks.
     derivatives : dict
         Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
     solved : dict
@@ -276,12 +286,13 @@ class _Fit:
     base: Instrument
     open: tuple[OpenKey, ...]
     variations: Variations | None
+    prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
-           open_keys: tuple[OpenKey, ...]) -> _Fit:
+           open_keys: tuple[OpenKey, ...], blocks: Gaussian | None) -> _Fit:
         study = magnet.study
         if magnet.dimension == 2:
             raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
@@ -310,9 +321,12 @@ class _Fit:
             study = study.with_(noise=None)
         sigma = np.ones(measured.size)
         sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
+        variations = Variations.of(magnet)
+        if blocks is None:
+            blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
-                   session, probe, base, open_keys, Variations.of(magnet))
+                   session, probe, base, open_keys, variations, blocks)
 
     @property
     def smallest_sigma(self) -> float:
@@ -328,18 +342,9 @@ class _Fit:
 
     def instrument(self, pose: Floats, values: Floats) -> Instrument:
         """Return the instrument of a pose (6,) and of the other parameters."""
-        base = self.base
-        given = {str(name): value for name, value in base.crosstalk.items()}
-        crosstalk = {name: given.get(name, 0.0) + float(value)
-                     for name, value in zip(CROSSTALK, values[:6], strict=True)}
-        gain, offset = (tuple((np.array(own) + values[part]).tolist()) for own, part in (
-            (base.gain, slice(6, 9)), (base.offset_T, slice(9, 12))))
-        sensors = np.array(base.sensor_position_m) + values[12:PROBE].reshape(3, 3)
-        origin = pose[:3] - Rotation.from_rotvec(pose[3:]).apply(middle_of(self.points))
-        return base.with_(
-            translation_m=tuple(origin.tolist()), rotation_rad=tuple(pose[3:].tolist()),
-            crosstalk=crosstalk, gain=gain, offset_T=offset,
-            sensor_position_m=tuple(map(tuple, sensors.tolist())))
+        middle = middle_of(self.points)
+        return with_terms(self.base, middle, np.concatenate([
+            pose[:3] - middle, pose[3:], values[:PROBE], np.zeros(3)]))
 
     def study_of(self, pose: Floats, values: Floats) -> Study:
         """Return the study of a pose and of the other parameters."""
@@ -380,14 +385,21 @@ class _Fit:
                 at_rest = True
                 break
         step, sd, chi2 = state.step(rows, values / prior_sd)
-        updated, log_evidence = state.updated(rows, values / prior_sd)
+        updated, log_evidence, mean, covariance = state.updated(rows, values / prior_sd)
         return Registration(
             self.study_of(pose, values), pose[:3], sd[:3], sd[3:6],
             {each.key: (value, error) for each, value, error in zip(
                 self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest)
+            log_evidence, at_rest, self._blocks(columns.directions, mean, covariance))
+
+    def _blocks(self, directions: Floats, mean: Floats, covariance: Floats) -> Gaussian:
+        """Return the updated blocks from mean (k,) and covariance (k, k) of their combinations."""
+        root = root_matrix(self.prior.root)
+        variances, axes = np.linalg.eigh(covariance)
+        return Gaussian(self.prior.mean + root @ (directions @ mean), CovarianceFactor(
+            root, directions @ axes, np.sqrt(np.clip(variances, 0.0, 1.0))))
 
     def is_possible(self, values: Floats, pose: Floats | None = None) -> bool:
         """Tell whether a valid study has these values, and all readings lie in air at a pose."""
@@ -414,15 +426,17 @@ class _Fit:
         variations = self.variations
         if variations is not None:
             fields.append(variations.fields(middle))
-        prior = study_prior(self.magnet, len(variations.names) if variations is not None else 0)
-        root = root_matrix(prior.root)
+        root = root_matrix(self.prior.root)
         whole = np.concatenate(fields, axis=2)
+        nominal = np.zeros(whole.shape[-1])
+        nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
         flat = whole.reshape(-1, whole.shape[-1])
+        shift = (flat @ (self.prior.mean - nominal)).reshape(-1, 3)
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
-        return _BlockColumns(middle, columns @ directions[:, kept])
+        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept])
 
     def _magnet(self, values: Floats) -> Magnet:
         """Return the magnet with the values of the open keys."""
@@ -459,40 +473,15 @@ class _Fit:
         instrument = self.instrument(pose, values)
         sensors = sensor_positions(instrument, self.points)
         middle, count = sensors.mean(axis=1), len(self.points)
-        apart = np.abs(sensors - middle[:, None]).max() > CLOSE_M
-        places = sensors.reshape(-1, 3) if apart else middle
-        field = self._field(values)
-        steps = DIFFERENCE_M * np.eye(3)
-        fields = field(np.concatenate([places, *(
-            places + sign * step for step in steps for sign in (1, -1))]))
-        here, around = fields[:len(places)], fields[len(places):].reshape(3, 2, -1, 3)
-        gradient = np.moveaxis(around[:, 0] - around[:, 1], 0, -1) / (2 * DIFFERENCE_M)
-        if not apart:
-            here, gradient = np.repeat(here, 3, axis=0), np.repeat(gradient, 3, axis=0)
-            here = here + np.einsum("nck,nk->nc", gradient,
-                                    (sensors - middle[:, None]).reshape(-1, 3))
         matrix = sensor_matrix(instrument)
-
-        def seen(at_sensors: Floats, by: Floats = matrix) -> Floats:
-            """Return readings (n, 3) of B (3 n, 3) at the sensors."""
-            return np.einsum("ij,nij->ni", by, at_sensors.reshape(count, 3, 3))
-
-        residual = self.readings - seen(here) - values[OFFSETS]
-        columns = []
-        for number in range(6 + PROBE):
-            other_pose, other_values = pose, values.copy()
-            if number < 6:
-                other_pose = moved_by(pose, SMALL * np.eye(6)[number])
-            else:
-                other_values[number - 6] += SMALL
-            other = self.instrument(other_pose, other_values)
-            moved = (sensor_positions(other, self.points) - sensors).reshape(-1, 3)
-            there = here + np.einsum("nck,nk->nc", gradient, moved)
-            columns.append((seen(there, sensor_matrix(other)) - seen(here)
-                            + other_values[OFFSETS] - values[OFFSETS]) / SMALL)
+        here, gradient = field_at_sensors(self._field(values), sensors)
+        residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
+        columns = list(np.moveaxis(by_terms(
+            instrument, self.points, middle_of(self.points), np.zeros(count), here, gradient,
+            STEADY), -1, 0))
         for change in self._by_open_keys(values, middle):
-            columns.append(seen(np.repeat(change, 3, axis=0)))
-        at_mean = gradient.reshape(count, 3, 3, 3).mean(axis=1)
+            columns.append(change @ matrix.T)
+        at_mean = gradient.mean(axis=1)
         sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
             "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
         return _State(residual, np.stack(columns, axis=-1),
@@ -509,11 +498,17 @@ class _BlockColumns:
     ----------
     places : ndarray, shape (n, 3), in m
     fields : ndarray, shape (n, 3, k), in T
-        B per prior standard deviation of the magnetizations.
+        B per prior standard deviation of k combinations of the magnetizations.
+    shift : ndarray, shape (n, 3), in T
+        B of the prior's mean less that of the nominal magnet.
+    directions : ndarray, shape (columns of the prior's root, k)
+        The combinations.
     """
 
     places: Floats
     fields: Floats
+    shift: Floats
+    directions: Floats
 
 
 @dataclass(frozen=True)
@@ -575,8 +570,10 @@ class _State:
         """Return chi-squared with the magnetizations integrated out, see `step`."""
         return self.step(rows, scaled)[2]
 
-    def updated(self, rows: NDArray[np.bool_], scaled: Floats) -> tuple[Floats, float]:
-        """Return the residual (n, 3) in T of the updated blocks, and the log evidence."""
+    def updated(
+        self, rows: NDArray[np.bool_], scaled: Floats
+    ) -> tuple[Floats, float, Floats, Floats]:
+        """Return residual (n, 3) in T and log evidence, and mean and covariance of the blocks."""
         residual, derivative, blocks = self._whitened(rows)
         design = np.hstack([blocks, derivative[:, :6], derivative[:, 6:] * self.prior_sd])
         inner = design.T @ design
@@ -592,7 +589,8 @@ class _State:
         left = residual - design @ solution
         chi2 = float(left @ left + np.sum((keep * (solution + start))**2))
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
-            np.log(self.sigma.ravel()[rows]).sum())
+            np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
+                factor, np.eye(len(inner)))[:count, :count]
 
 
 def each_value(fit: _Fit, values: Floats) -> list[float]:

@@ -37,7 +37,7 @@ COVERAGE_Z = 1.959964
 
 
 PREDICTION_COLUMNS = (
-    "label", "x_m", "y_m", "z_m", "region", "held_out", "part", "measured_T", "sigma_T",
+    "label", "x_m", "y_m", "z_m", "map", "region", "held_out", "part", "measured_T", "sigma_T",
     "solver_error_T", "prior_mean_T", "prior_sd_T", "posterior_mean_T", "posterior_sd_T",
     "standardized_residual_prior", "standardized_residual")
 """Columns of prediction.csv, one row per reading."""
@@ -66,6 +66,73 @@ class Prediction:
     sd: Floats
     root: Callable[[Ints], Floats]
     columns: int
+
+
+@dataclass(frozen=True)
+class InstrumentTerms:
+    """Terms of the instruments that were estimated together with the magnetizations.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Such as ``fringe.translation_x_m``, after the name of a map or a probe.
+    change, sd, prior_sd : ndarray, shape (terms,)
+        Change from what the study says, and standard deviations after and before.
+    at_rest : bool
+        Whether the last update changed no term by more than a part of its standard deviation.
+    """
+
+    names: tuple[str, ...]
+    change: Floats
+    sd: Floats
+    prior_sd: Floats
+    at_rest: bool
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How one map agrees with what an update by another map alone predicts.
+
+    Attributes
+    ----------
+    name, by : str
+        The map that is predicted, and the map whose update predicts it.
+    readings : int
+        Number of readings of ``name`` within the region of ``by``: those that are held out, or all
+        of them if none is.
+    held_out : bool
+        Whether these readings are held out of the common update too.
+    rms_T : float
+        Rms difference from the prediction.
+    chi2 : float
+        Chi-squared per reading, by the covariance of prediction, noise and instruments.
+    """
+
+    name: str
+    by: str
+    readings: int
+    held_out: bool
+    rms_T: float
+    chi2: float
+
+    @property
+    def limit(self) -> float:
+        """Limit of ``chi2`` beyond which chance is no explanation: five sd above 1."""
+        return 1 + 5 * float(np.sqrt(2 / self.readings))
+
+    @property
+    def disagreement(self) -> str:
+        """A sentence if the two maps do not agree, else an empty string."""
+        where = (f"Where they overlap, map {self.name} is {1e3 * self.rms_T:.3g} mT rms off what "
+                 f"map {self.by} predicts (chi² per reading is {self.chi2:.3g}, where 1 is "
+                 "expected")
+        if self.chi2 > self.limit:
+            return (f"{where} and more than {self.limit:.2g} is rare): they are not of the same "
+                    "magnet in the same state, or the pose, probe or noise of one of them is not "
+                    "what the study says.")
+        if self.chi2 < min(TOO_NEAR, 2 - self.limit):
+            return f"{where}): the noise of these maps is stated too large."
+        return ""
 
 
 @dataclass(frozen=True)
@@ -122,7 +189,9 @@ class InferenceResult(ShownInNotebook):
         Part of each reading: ``training``, ``held out`` or, if the reading is from a validation
         map, ``held-out map``.
     regions : tuple of str
-        Noise region of each reading.
+        Noise region of each reading; among several maps with the name of its map.
+    maps : tuple of str
+        Map of each reading, see `halbach_fe.measurement.campaign.Map`.
     response : Response
         The linear model of the readings.
     prior, posterior : Gaussian
@@ -144,6 +213,10 @@ class InferenceResult(ShownInNotebook):
     left_out : float
         Upper bound of the relative change of a posterior variance by discarded information, see
         `halbach_fe.stats.linear_gaussian.LinearPosterior`.
+    terms : InstrumentTerms or None
+        Terms of the instruments that were estimated with the magnetizations; None if all are known.
+    overlaps : tuple of Overlap
+        How maps agree where they overlap.
 
     Examples
     --------
@@ -162,6 +235,7 @@ class InferenceResult(ShownInNotebook):
     noise: NoiseCovariance
     parts: tuple[str, ...]
     regions: tuple[str, ...]
+    maps: tuple[str, ...]
     response: Response
     prior: Gaussian
     posterior: Gaussian
@@ -173,6 +247,14 @@ class InferenceResult(ShownInNotebook):
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: int | None = None
     left_out: float = 0.0
+    terms: InstrumentTerms | None = None
+    overlaps: tuple[Overlap, ...] = ()
+
+    @property
+    def is_campaign(self) -> bool:
+        """Whether several maps updated the model."""
+        return len({name for name, part in zip(self.maps, self.parts, strict=True)
+                    if part != HELD_OUT_MAP}) > 1
 
     @property
     def study(self) -> Study:
@@ -212,10 +294,10 @@ class InferenceResult(ShownInNotebook):
         prior, posterior = self.prediction_prior, self.prediction_posterior
         columns = dict(zip(PREDICTION_COLUMNS, (
             np.array(self.observation.labels), *self.observation.positions.T,
-            np.array(self.regions), self.held_out.astype(int), np.array(self.parts),
-            self.readings, self.noise.sd, self.response.error, prior.mean, prior.sd,
-            posterior.mean, posterior.sd, self.standardized(prior), self.standardized(posterior)),
-            strict=True))
+            np.array(self.maps), np.array(self.regions), self.held_out.astype(int),
+            np.array(self.parts), self.readings, self.noise.sd, self.response.error, prior.mean,
+            prior.sd, posterior.mean, posterior.sd, self.standardized(prior),
+            self.standardized(posterior)), strict=True))
         return xr.Dataset({name: ("reading", value) for name, value in columns.items()})
 
     @cached_property
@@ -244,7 +326,7 @@ class InferenceResult(ShownInNotebook):
             for name, prediction in predictions.items()}
         return tuple(
             self._score(region, part, chosen, errors)
-            for region in dict.fromkeys(names or [ALL_READINGS])
+            for region in dict.fromkeys([*names, *self.regions])
             for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)
             if (chosen := self.chosen(region, part)).any())
 
@@ -259,6 +341,12 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def disagreement(self) -> str:
+        """Sentences if prior, model and maps cannot all be right, else an empty string."""
+        found = [self._conflict, *(each.disagreement for each in self.overlaps)]
+        return " ".join(sentence for sentence in found if sentence)
+
+    @property
+    def _conflict(self) -> str:
         """A sentence if prior, model and readings cannot all be right, else an empty string."""
         chi2 = self.prior_conflict
         if chi2 < TOO_NEAR:

@@ -145,5 +145,13 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
                                  update.contraction.round(6).tolist()],
         "largest_shift_A_per_m": float(np.abs(shift).max()),
         "common_shift": float(shift @ update.prior.mean / (update.prior.mean @ update.prior.mean)),
+        "instrument_terms": None if update.terms is None else {
+            name: {"change": float(change), "sd": float(sd), "prior_sd": float(prior_sd)}
+            for name, change, sd, prior_sd in zip(
+                update.terms.names, update.terms.change, update.terms.sd, update.terms.prior_sd,
+                strict=True)},
+        "instrument_at_rest": None if update.terms is None else update.terms.at_rest,
+        "overlaps": [asdict(each) | {"disagreement": each.disagreement}
+                     for each in update.overlaps],
         "scores": [asdict(score) for score in update.scores],
     }

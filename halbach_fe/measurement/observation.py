@@ -70,6 +70,11 @@ class Observation:
         """Distance in m of each reading's point, or radius of its circle, from the z axis."""
         return np.hypot(self.positions[:, 0], self.positions[:, 1])
 
+    @property
+    def places(self) -> Floats:
+        """Place (readings, 3) in m of each reading in the magnet: the first point it depends on."""
+        return self.points[self.operator.indices[self.operator.indptr[:-1]] // len(COMPONENTS)]
+
     def apply(self, fields: Floats) -> Floats:
         """Return the readings (..., readings) that the sensors give of fields B (..., n, 3) in T.
 
@@ -115,10 +120,9 @@ class Observation:
         point of a flux density, and the amplitude ``hypot(A_k, B_k)`` of the harmonic of a Fourier
         coefficient.
         """
-        sensors = 3 * len(self.points) // self.analysis.shape[1]  # per point of the map
         single = np.diff(self.analysis.indptr) == 1  # flux densities depend on one component
-        point = self.analysis.indices[self.analysis.indptr[:-1]] // len(COMPONENTS)
-        result = np.linalg.norm(field, axis=1)[::sensors][point]
+        sensor = self.operator.indices[self.operator.indptr[:-1]] // len(COMPONENTS)
+        result = np.linalg.norm(field, axis=1)[sensor]
         if not single.all():
             harmonics = max(int(label[1:])
                             for label, flux_density in zip(self.labels, single, strict=True)

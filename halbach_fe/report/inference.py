@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.campaign_inference import maps_figure, overlap_table, term_table
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
@@ -73,10 +74,15 @@ def write_inference_report(
     """
     unseen = ("of the held-out readings for prior and posterior" if result.held_out.any()
               else "of the training readings for the prior (nothing was held out)")
-    figures = {
-        "profile.png": (prediction_profile_figure(result), "Readings with the predictions of "
-                        "prior and posterior, and the residuals of the posterior, along the line "
-                        "of the strongest reading"),
+    profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
+               "posterior, along the line of the strongest reading")
+    profiles = {"profile.png": (prediction_profile_figure(result), profile)}
+    if result.is_campaign:
+        profiles = {"maps.png": (maps_figure(result), "Where the maps lie in the magnet")}
+        profiles |= {f"profile-{name}.png": (
+            prediction_profile_figure(result, name), f"Map {name}. {profile}")
+            for name in dict.fromkeys(result.maps)}
+    figures = profiles | {
         "relative_error.png": (relative_error_figure(result, published), "Relative error "
                                "of the predictions of prior and posterior along the same line"),
         "residuals.png": (standardized_residuals_figure(result), "Standardized residuals of "
@@ -96,7 +102,8 @@ def write_inference_report(
     }
     multipoles: list[MultipoleTable] = [
         (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
-        for model in circle_models(result.magnet, result.observation, result.response)]
+        for model in ([] if result.is_campaign else circle_models(
+            result.magnet, result.observation, result.response))]
     if multipoles:
         write_multipole_csv(result.study, multipoles, folder / "multipoles.csv")
     write_page(
@@ -104,6 +111,7 @@ def write_inference_report(
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
         rows=score_table(result, published), assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet), conflict=result.disagreement,
+        terms=term_table(result), overlaps=overlap_table(result),
         view=view_of_inference(result))
 
 

@@ -21,6 +21,7 @@ from halbach_fe.inference.result import (
     InferenceResult,
     Prediction,
 )
+from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, stacked_axes
 
 MARKERS: dict[str, dict[str, Any]] = {
@@ -84,9 +85,11 @@ def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:
     """Return the abscissae of all readings in a figure, and the label of that axis.
 
     The abscissa is z; for readings in a single plane the angle about z; and for Fourier
-    coefficients in a single plane their order.
+    coefficients in a single plane their order. Positions are those that the map states; of several
+    maps, those in the magnet.
     """
-    x, y, z = result.observation.positions.T
+    x, y, z = (result.observation.places if result.is_campaign
+               else result.observation.positions).T
     if np.ptp(z) > 0:
         return z, "z in m"
     if any(result.observation.components):
@@ -94,19 +97,27 @@ def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:
     return np.array([float(label[1:]) for label in result.observation.labels]), "harmonic"
 
 
-def main_line(result: InferenceResult) -> ReadingLine:
-    """Return the line of readings through the strongest reading.
+def main_line(result: InferenceResult, name: str | None = None) -> ReadingLine:
+    """Return the line of readings through the strongest reading, of a map or by default of all.
 
-    It has the readings with the same label and radius. Where several of them have the same z, it
-    has the one nearest to the strongest reading in x and y.
+    It has the readings with the same label and radius; of several maps, those of one map near the
+    same line along z. Where several of them have the same z, it has the one nearest to the
+    strongest reading in x and y.
     """
     place, axis = axis_of_readings(result)
-    strongest = int(np.argmax(np.abs(result.readings)))
+    maps = np.array(result.maps)
+    strongest = int(np.argmax(np.where(
+        (maps == name) | (name is None), np.abs(result.readings), -1.0)))
     labels, what = np.array(result.observation.labels), result.observation.labels[strongest]
     if axis == "harmonic":
         labels, what = np.array([label[0] for label in labels]), what[0]
     radii, positions = result.observation.radii, result.observation.positions
-    own = np.flatnonzero((labels == what) & np.isclose(radii, radii[strongest], 0, 1e-4))
+    near = np.isclose(radii, radii[strongest], 0, 1e-4)
+    if result.is_campaign:  # stages may be inclined, so that lines are not at one radius
+        mine = maps == maps[strongest]
+        spacing = point_spacing(np.unique(positions[mine], axis=0))
+        near = mine & (np.hypot(*(positions - positions[strongest])[:, :2].T) < spacing / 4)
+    own = np.flatnonzero((labels == what) & near)
     away = (np.hypot(*(positions[own] - positions[strongest])[:, :2].T) if axis.startswith("z")
             else np.zeros(len(own)))
     order = np.lexsort((away, place[own].round(9)))
@@ -116,9 +127,9 @@ def main_line(result: InferenceResult) -> ReadingLine:
                        place[index], axis)
 
 
-def prediction_profile_figure(result: InferenceResult) -> Figure:
+def prediction_profile_figure(result: InferenceResult, name: str | None = None) -> Figure:
     """Draw readings and predictions along the main line, and the residuals of the posterior."""
-    line = main_line(result)
+    line = main_line(result, name)
     index = line.index
     figure, (top, bottom) = stacked_axes(2, [2, 1])
     measured = result.readings[index]

@@ -12,13 +12,16 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
 from halbach_fe.inference.registration import Registration, axes_of_map, odds
+from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, save, write_page
-from halbach_fe.study.edit_file import edited_text, write_edited
+from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
+
+STUDY_FILE = "study.registered.toml"
 
 NOTE = "found by halbach-fe register"
 
@@ -26,7 +29,12 @@ EQUALLY_GOOD = 0.05
 """Odds from which a second pose is reported as a possible one."""
 
 
-def sentences(found: Sequence[Registration]) -> list[str]:
+NOMINAL = "nominal magnet"
+UPDATED = "magnet as the maps before have updated it"
+"""What the readings are compared with before they update the blocks."""
+
+
+def sentences(found: Sequence[Registration], before: str = NOMINAL) -> list[str]:
     """Return what was found, the answer first."""
     best, probability = found[0], odds(found)
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
@@ -42,7 +50,7 @@ def sentences(found: Sequence[Registration]) -> list[str]:
             f"odds of {', '.join(f'{value:.0f}' for value in others)} % beside "
             f"{100 * probability[0]:.0f} %: the magnet looks the same from there.")
     answer.append(
-        f"The nominal magnet there is {_mT(best.nominal_rms_T)} off the readings that were fitted, "
+        f"The {before} is there {_mT(best.nominal_rms_T)} off the readings that were fitted, "
         f"with updated blocks {_mT(best.rms_T)}"
         + (f"; the lines that were held out are {_mT(best.held_out_nominal_rms_T)} and "
            f"{_mT(best.held_out_rms_T)} off." if np.isfinite(best.held_out_rms_T).any() else "."))
@@ -59,7 +67,9 @@ def _mT(rms: np.ndarray) -> str:  # noqa: N802 - a unit
     return f"{1e3 * float(np.sqrt(np.nanmean(rms**2))):.3g} mT rms"
 
 
-def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
+def pose_table(
+    found: Sequence[Registration], before: str = NOMINAL
+) -> list[dict[str, str]]:
     """Return rows of text, one per pose."""
     rows = []
     for each, probability in zip(found, odds(found), strict=True):
@@ -70,7 +80,8 @@ def pose_table(found: Sequence[Registration]) -> list[dict[str, str]]:
             "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
             "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
                                           each.instrument.rotation_rad),
-            "nominal": _mT(each.nominal_rms_T), "updated": _mT(each.rms_T)})
+            "nominal" if before == NOMINAL else "before": _mT(each.nominal_rms_T),
+            "updated": _mT(each.rms_T)})
     return rows
 
 
@@ -112,17 +123,48 @@ def write_registration(
     provenance: Mapping[str, str],
 ) -> None:
     """Write study.registered.toml, registration.json, registration.html and its figure."""
+    steps = [(found[0].study, NOTE)]
+    write_edited(folder / STUDY_FILE, text, steps)
+    _write_page(study, data, found, folder, provenance, NOMINAL)
+
+
+def write_campaign_registration(
+    study: Study, text: str, maps: Sequence[Map], found: Mapping[str, Sequence[Registration]],
+    folder: Path, provenance: Mapping[str, str],
+) -> None:
+    """Write study.registered.toml, and a folder with the page of every map.
+
+    Parameters
+    ----------
+    study : Study
+        The study with the poses that were found, and with paths of the maps from ``folder``.
+    text : str
+        Text of the study's file before.
+    maps : sequence of Map
+    found : mapping of str to sequence of Registration
+    folder : Path
+    provenance : mapping of str to str
+    """
+    write_edited(folder / STUDY_FILE, text, [(study, NOTE)])
+    for number, one in enumerate(maps):
+        _write_page(one.study, one.data, found[one.name], folder / one.name, provenance,
+                    UPDATED if number else NOMINAL, one.name)
+
+
+def _write_page(
+    study: Study, data: xr.Dataset, found: Sequence[Registration], folder: Path,
+    provenance: Mapping[str, str], before: str, name: str = "",
+) -> None:
+    """Write registration.json, registration.html and its figure, of one map."""
     best = found[0]
-    steps = [(best.study, NOTE)]
-    write_edited(folder / "study.registered.toml", text, steps)
     write_text(folder / "registration.json",
                json.dumps(registration_summary(found), indent=1, allow_nan=False) + "\n")
     figures = {"registration.png": (_where(best, data), (
         "The readings along the magnet's axis and in its cross-section, where the registration "
         "puts them"))}
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, found=sentences(found), poses=pose_table(found), name=study.name,
-               probe=probe_table(best.instrument), changed=edited_text(text, steps) != text)
+               provenance, found=sentences(found, before), poses=pose_table(found, before),
+               name=study.name, probe=probe_table(best.instrument), map=name)
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:

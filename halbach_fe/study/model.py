@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
@@ -21,6 +21,7 @@ from halbach_fe.study.array import Array
 from halbach_fe.study.inference import Inference, Plan, Prior
 from halbach_fe.study.iron import Iron, IronMaterial, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
+from halbach_fe.study.maps import PROBE_KEYS, InstrumentSd, MapSettings
 from halbach_fe.study.material_keys import STRENGTHS, grade_of
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
@@ -43,6 +44,8 @@ class Study(StudyModel):
     iron: Iron | None = None
     external: External = External()
     instrument: Instrument = Instrument()
+    instrument_sd: InstrumentSd = InstrumentSd()
+    maps: tuple[MapSettings, ...] = ()
     mesh: MeshSettings
     open_boundary: OpenBoundary = OpenBoundary()
     solver: SolverSettings = SolverSettings()
@@ -88,6 +91,7 @@ class Study(StudyModel):
                              "of the method reaction: leave solver.route and solver.method out")
         if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
             raise ValueError("prior.variation_sd needs a 3D study without iron")
+        self._check_maps()
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
             "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),
@@ -106,6 +110,42 @@ class Study(StudyModel):
                 raise ValueError(f"mesh.{name} ({size}) must not be larger than the array "
                                  f"({self.array.outer_radius_m}); is it in millimetres?")
         return self
+
+    def _check_maps(self) -> None:
+        """Check that the maps of a campaign differ, and that those of one probe agree on it."""
+        for key in ("name", "file"):
+            given = [getattr(one, key) for one in self.maps]
+            twice = [value for value in given if given.count(value) > 1]
+            if twice:
+                raise ValueError(f"every map needs a {key} of its own, but two of them have "
+                                 f"'{twice[0]}'")
+        uncertain = [self.instrument_sd, *(one.instrument_sd for one in self.maps)]
+        if self.dimension == 2 and any(sd not in (None, InstrumentSd()) for sd in uncertain):
+            raise ValueError("instrument_sd needs a 3D study")
+        first: dict[str, Study] = {}
+        for number, one in enumerate(self.maps):
+            try:
+                own = self.of_map(number)
+            except ValidationError as error:
+                reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+                raise ValueError(f"map '{one.name}' does not fit the study: {reason}") from None
+            if one.probe is None:
+                continue
+            other = first.setdefault(one.probe, own)
+            for key in PROBE_KEYS:
+                for table in ("instrument", "instrument_sd"):
+                    if getattr(getattr(own, table), key) != getattr(getattr(other, table), key):
+                        raise ValueError(
+                            f"maps of one probe must state the same {table}.{key}, but those of "
+                            f"probe '{one.probe}' do not")
+
+    def of_map(self, number: int) -> Study:
+        """Return the study of one of the maps alone, with the map's own tables."""
+        one = self.maps[number]
+        own = {key: getattr(one, key) for key in (
+            "instrument", "instrument_sd", "noise", "inference") if getattr(one, key) is not None}
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self).model_validate(values | own | {"maps": ()})
 
 
 def is_nonlinear(study: Study) -> bool:

@@ -132,6 +132,10 @@ def simulate_campaign(
             "`demagnetization.irreversible`", f"study {study.name}",
             "left out of a simulated measurement", "true",
             "The programs that simulate the truth know no irreversible losses."))
+    if study.maps:
+        raise StudyError(must_be(
+            "`maps`", f"study {study.name}", "left out of a simulated measurement, which is of one "
+            "map", f"a list of {len(study.maps)}"))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
     # separate streams of random numbers: a further draw from one does not change the others

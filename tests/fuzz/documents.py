@@ -55,6 +55,20 @@ length_unit_m = 0.001
 field_axes = ["y", "-x", "z"]
 crosstalk = { xy = 0.01 }
 
+[instrument_sd]
+translation_m = 1e-3
+gain = 0.01
+
+[[maps]]
+name = "body"
+file = "body.csv"
+probe = "hall"
+
+[[maps]]
+name = "end"
+file = "end.csv"
+noise = { position_sd_m = 1e-5 }
+
 [mesh]
 block_size_m = 0.03
 growth = 2.0

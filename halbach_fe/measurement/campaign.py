@@ -1,0 +1,175 @@
+"""The maps of a campaign: one magnet, many maps, each with an instrument of its own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.measurement.field_map import points_of, read_map
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes
+from halbach_fe.measurement.observation import study_for_validation_map
+from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.model import Study
+
+ONLY_MAP, VALIDATION_MAP = "map", "held-out map"
+"""Names of the map of a study that lists none, and of another map that is only predicted."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map, and what the study says about it.
+
+    Attributes
+    ----------
+    name : str
+    data : Dataset
+    study : Study
+        The study of this map alone.
+    middle_m : ndarray, shape (3,)
+        Middle of its points in the coordinates that the map states, which the uncertain pose
+        shifts and turns about.
+    probe : str
+        Name of its probe. Maps of one probe share its terms.
+    pose : str
+        Name of the map whose pose it shares, mostly its own.
+    is_validation : bool
+        Whether it is predicted but does not update the model.
+    """
+
+    name: str
+    data: xr.Dataset
+    study: Study
+    middle_m: Floats
+    probe: str
+    pose: str
+    is_validation: bool = False
+
+
+def middle_of(points: Floats) -> Floats:
+    """Return the middle (3,) in m of the box about points (n, 3)."""
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def read_maps(study: Study, folder: str | Path = ".") -> dict[str, xr.Dataset]:
+    """Read the maps that a study lists.
+
+    Parameters
+    ----------
+    study : Study
+    folder : str or Path
+        Folder of the study file, from which the paths of the maps start.
+
+    Returns
+    -------
+    dict of str to Dataset
+        The maps by their names, each as `read_map` returns it.
+
+    Raises
+    ------
+    MeasurementError
+        If a file cannot be read as a map, or two files hold the same readings.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> study = hf.read_study("dipole.toml").with_(maps=[
+    ...     {"name": "body", "file": "map.csv"}])
+    >>> list(hf.read_maps(study))
+    ['body']
+    """
+    found: dict[str, xr.Dataset] = {}
+    for one in study.maps:
+        data = read_map(Path(folder) / one.file)
+        for name, other in found.items():
+            if np.array_equal(points_of(data), points_of(other)) and np.array_equal(
+                    data["B_T"].values, other["B_T"].values, equal_nan=True):
+                raise MeasurementError(must_be(
+                    f"`maps` '{one.name}' and '{name}'", f"study {study.name}",
+                    "different maps, as the same readings must not count twice",
+                    "files with the same readings", "Remove one of them."))
+        found[one.name] = data
+    return found
+
+
+def maps_of(
+    study: Study, data: xr.Dataset | Mapping[str, xr.Dataset],
+    validation_map: xr.Dataset | None = None
+) -> list[Map]:
+    """Return the maps of a study, each with the part of the study that holds for it.
+
+    Parameters
+    ----------
+    study : Study
+    data : Dataset or dict of str to Dataset
+        The only map of a study that lists none, or the maps that it lists, by name.
+    validation_map : Dataset, optional
+        Another map, which is only predicted. It has the study's own instrument.
+
+    Raises
+    ------
+    StudyError
+        If the study lists maps but a single one is given, or the other way round.
+    """
+    if isinstance(data, xr.Dataset):
+        if study.maps:
+            raise StudyError(must_be(
+                "`maps`", f"study {study.name}", "left out, or the only maps of the campaign",
+                "a list, and another map beside it",
+                "Read the listed maps (in Python by read_maps), or remove the list."))
+        found = [Map(ONLY_MAP, data, study, _middle(study, data), ONLY_MAP, ONLY_MAP)]
+    else:
+        if list(data) != [one.name for one in study.maps] or not data:
+            raise StudyError(must_be(
+                "`maps`", f"study {study.name}", "those that are given, by name",
+                f"{', '.join(one.name for one in study.maps) or 'none'} for "
+                f"{', '.join(data) or 'none'}", "Read them by read_maps."))
+        found = []
+        for number, one in enumerate(study.maps):
+            own = study.of_map(number)
+            found.append(Map(one.name, data[one.name], own, _middle(own, data[one.name]),
+                             one.probe or one.name, one.name))
+    if validation_map is not None:
+        own = study_for_validation_map(study.with_(maps=()), validation_map)
+        first = found[0]
+        shared = not study.maps  # with the only map; among several it has an instrument of its own
+        found.append(Map(
+            VALIDATION_MAP, validation_map, own,
+            first.middle_m if shared else _middle(own, validation_map),
+            first.probe if shared else VALIDATION_MAP, first.pose if shared else VALIDATION_MAP,
+            is_validation=True))
+    return found
+
+
+def with_paths_from(study: Study, before: Path, after: Path) -> Study:
+    """Return a study whose maps are found from another folder than before."""
+    return study.with_(maps=tuple(
+        one.with_(file=os.path.relpath(before / one.file, after)) for one in study.maps))
+
+
+def refuse_several_maps(study: Study, verb: str) -> None:
+    """Raise a StudyError if a study lists maps, for what works with a single map only."""
+    if study.maps:
+        raise StudyError(must_be(
+            "`maps`", f"study {study.name}", f"left out, since {verb} takes a single map",
+            f"a list of {len(study.maps)}",
+            "Give it a study of one of the maps, with that map's instrument."))
+
+
+def refuse_open_instruments(study: Study, verb: str) -> None:
+    """Raise a StudyError if terms of an instrument are to be estimated, where that cannot be."""
+    whole = [study.of_map(number) for number in range(len(study.maps))] or [study]
+    if any(one.instrument_sd != InstrumentSd() for one in whole):
+        raise StudyError(must_be(
+            "`instrument_sd`", f"study {study.name}", f"left out, for {verb}", "a table",
+            "State the instrument that halbach-fe infer found (study.updated.toml) without it."))
+
+
+def _middle(study: Study, data: xr.Dataset) -> Floats:
+    return middle_of(points_of(in_si_and_magnet_axes(study.instrument, data)))

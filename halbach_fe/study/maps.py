@@ -1,0 +1,63 @@
+"""Keys of a study that list the maps of a campaign, and what of an instrument is uncertain."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from halbach_fe.study.inference import Inference
+from halbach_fe.study.measurement import Instrument, NoiseSettings
+from halbach_fe.study.types import Line, PositionSd, StudyModel
+
+SmallSd = Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False)]
+
+PROBE_KEYS = ("crosstalk", "gain", "offset_T", "sensor_position_m", "drift_T")
+"""Keys of an instrument that belong to its probe, and may be shared by several maps. All others
+belong to a map: its pose and its stage."""
+
+
+class InstrumentSd(StudyModel):
+    """Prior standard deviations of the terms of the instrument that are estimated with the blocks.
+
+    A term of which 0 is stated (the default) is exactly what ``instrument`` says. The others are
+    parameters of the update, like the magnetizations, and widen the error bars of these.
+    ``translation_m`` is the standard deviation of the place of the map's middle along each axis of
+    the magnet, ``rotation_rad`` that of the turn of the map about each axis through its middle. The
+    others are those of each component of the instrument's keys of the same name. State what was
+    known without the map: 1e-3 and 0.01 for a pose that `halbach-fe register` found, so that the
+    same readings are not counted twice.
+    """
+
+    translation_m: PositionSd = 0.0
+    rotation_rad: SmallSd = 0.0
+    crosstalk: SmallSd = 0.0
+    gain: SmallSd = 0.0
+    offset_T: SmallSd = 0.0
+    sensor_position_m: PositionSd = 0.0
+    drift_T: SmallSd = 0.0
+
+
+class MapSettings(StudyModel):
+    """One of several maps of the magnet.
+
+    ``file`` is its path from the folder of the study file. ``instrument``, ``instrument_sd``,
+    ``noise`` and ``inference`` replace the study's tables of the same name as a whole for this map;
+    where they are left out, those of the study hold. Maps that name the same ``probe`` share its
+    terms (crosstalk, gain, offset, drift and places of the sensors), which are then estimated from
+    all of them together; otherwise every map has a probe of its own.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
+    file: Annotated[Line, Field(min_length=1, max_length=4096)]
+    probe: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
+    instrument: Instrument | None = None
+    instrument_sd: InstrumentSd | None = None
+    noise: NoiseSettings | None = None
+    inference: Inference | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> MapSettings:
+        if "\0" in self.file:
+            raise ValueError("file must be a path")
+        return self

@@ -1,0 +1,279 @@
+"""Two maps of one magnet that magpylib computed, each with a probe and a pose of its own."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.geometry.array_layout import position_angle_deg
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.campaign import maps_of, read_maps
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.observation import concatenate, observe
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.reader import parse_study, read_study
+from tests.inference.test_registration import TEXT, session, truth
+
+NOISE_T = 2e-5
+BODY, FRINGE = (np.stack(np.meshgrid(
+    0.005 * np.arange(-2, 3), 0.005 * np.arange(-2, 3), z, indexing="ij"),
+    axis=-1).reshape(-1, 3) for z in (0.006 * np.arange(-6, 7), 0.006 * np.arange(4, 14)))
+"""Points in the magnet: through the bore of 60 mm, and from within it to 50 mm before it."""
+
+POSES = {"body": (Rotation.from_rotvec([0.004, -0.003, 0.006]), np.array([3e-4, -2e-4, 5e-4])),
+         "fringe": (Rotation.from_rotvec([-0.005, 0.004, 0.002]), np.array([-4e-4, 3e-4, 0.0503]))}
+"""A stage has coordinates s; the place in the magnet is turn s + shift."""
+
+MIXING = np.eye(3) + np.array([[0, 0.004, 0], [0, 0.003, -0.005], [0.002, 0, 0]])
+"""Crosstalk, and 0.3 % more gain of By."""
+
+
+def reading(magnet_of, generator, name, mixing=None, noise=NOISE_T):
+    """A map of a magnet by magpylib, in the coordinates of its stage."""
+    points, (turn, shift) = {"body": BODY, "fringe": FRINGE}[name], POSES[name]
+    matrix = turn.as_matrix()
+    field = magnet_of.getB(points) @ matrix @ (np.eye(3) if mixing is None else mixing).T
+    return field_map((points - shift) @ matrix,
+                     field + noise * generator.standard_normal(field.shape))
+
+
+def two_maps(generator, magnet_of=None, other=None, mixing=None):
+    """Maps of a magnet, the second one perhaps of another."""
+    magnet_of = magnet_of or truth(generator)
+    return {"body": reading(magnet_of, generator, "body", mixing),
+            "fringe": reading(other or magnet_of, generator, "fringe", mixing)}
+
+
+def campaign_study(probe=None, **uncertain):
+    """The study of both maps: of their stages a millimetre is known."""
+    known = {"translation_m": 1e-3, "rotation_rad": 0.01}
+    maps = [{"name": "body", "file": "body.csv"},
+            {"name": "fringe", "file": "fringe.csv",
+             "instrument": {"translation_m": [0, 0, 0.05]}}]
+    return parse_study(tomllib.loads(TEXT) | {"instrument_sd": known | uncertain, "maps": [
+        one | ({"probe": probe} if probe else {}) for one in maps]})
+
+
+def terms(result):
+    """Change and standard deviation of each term."""
+    return dict(zip(result.terms.names, zip(result.terms.change, result.terms.sd, strict=True),
+                    strict=True))
+
+
+def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
+    result = infer(build_magnet(campaign_study()), two_maps(generator), session(tmp_path))
+    assert result.terms.at_rest
+    found = terms(result)
+    for name, points, start in (("body", BODY, [0, 0, 0]), ("fringe", FRINGE, [0, 0, 0.05])):
+        turn, shift = POSES[name]
+        stated = (points - shift) @ turn.as_matrix()
+        middle = (stated.min(axis=0) + stated.max(axis=0)) / 2
+        right = turn.apply(middle) + shift - middle - start
+        for number, axis in enumerate("xyz"):
+            value, sd = found[f"{name}.translation_{axis}_m"]
+            assert value == pytest.approx(right[number], abs=4 * sd)
+            assert sd < 1e-4
+            value, sd = found[f"{name}.rotation_{axis}_rad"]
+            assert value == pytest.approx(turn.as_rotvec()[number], abs=4 * sd)
+    assert not result.disagreement
+    assert {(each.name, each.by) for each in result.overlaps} == {
+        ("fringe", "body"), ("body", "fringe")}
+    for each in result.overlaps:
+        assert each.held_out
+        assert each.readings > 40
+        assert each.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / each.readings))
+    assert {score.region for score in result.scores} == {"body", "fringe"}
+    for score in result.scores:
+        if score.part == "held out":
+            assert score.chi2_posterior == pytest.approx(1.0, abs=5 * np.sqrt(2 / score.readings))
+    # the study that is returned has the poses that were found
+    fringe = result.study.maps[1].instrument
+    assert Rotation.from_rotvec(fringe.rotation_rad).as_matrix() == pytest.approx(
+        POSES["fringe"][0].as_matrix(), abs=1e-3)
+
+
+def test_both_maps_say_more_than_one_and_cover_the_truth(generator, tmp_path):
+    magnet_of = truth(generator)
+    maps, study = two_maps(generator, magnet_of), campaign_study()
+    magnet = build_magnet(study)
+    both = infer(magnet, maps, session(tmp_path / "both"))
+    right = np.empty_like(both.posterior.mean).reshape(-1, 3)
+    for number, block in enumerate(magnet.blocks):
+        centre = np.mean([block.z_min, block.z_max])
+        angle = position_angle_deg(study.array, block.slot)
+        (source,) = [each for each in magnet_of.sources if np.isclose(each.position[2], centre)
+                     and abs((np.mean(each.dimension[3:]) - angle + 180) % 360 - 180) < 1]
+        right[number] = source.polarization / MU_0
+    score = (both.posterior.mean - right.ravel()) / both.posterior.sd
+    # 48 correlated values: the rms of as many normal ones is 1 ± 0.1
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    for number, name in enumerate(maps):
+        one = infer(magnet.with_study(study.of_map(number)), maps[name],
+                    session(tmp_path / name))
+        assert (both.posterior.sd <= one.posterior.sd * (1 + 1e-6)).all()
+        assert both.posterior.sd.mean() < 0.95 * one.posterior.sd.mean()
+        assert not one.is_campaign
+        assert not one.overlaps
+
+
+def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
+    maps = two_maps(generator, mixing=MIXING)
+    open_terms = {"crosstalk": 0.02, "gain": 0.003}
+    shared = infer(build_magnet(campaign_study("hall", **open_terms)), maps,
+                   session(tmp_path / "shared"))
+    apart = infer(build_magnet(campaign_study(**open_terms)), maps, session(tmp_path / "apart"))
+    one, two = terms(shared), terms(apart)
+    assert "fringe.crosstalk_yz" in two
+    assert "fringe.crosstalk_yz" not in one
+    for pair in ("xy", "xz", "yx", "yz", "zx", "zy"):
+        value, sd = one[f"hall.crosstalk_{pair}"]
+        row, column = ("xyz".index(letter) for letter in pair)
+        assert value == pytest.approx(MIXING[row, column], abs=4 * sd)
+        alone = [two[f"{name}.crosstalk_{pair}"][1] for name in maps]
+        assert sd <= min(alone) * 1.001
+    assert not shared.disagreement
+    for each in (*shared.overlaps, *apart.overlaps):
+        assert each.chi2 < each.limit
+    # control: with a probe that is known for exact, the maps do not fit
+    closed = infer(build_magnet(campaign_study()), maps, session(tmp_path / "closed"))
+    assert closed.prior_conflict > closed.conflict_limit
+
+
+def test_a_map_of_another_magnet_is_told(generator, tmp_path):
+    """Control: the second map is of a magnet whose blocks have other errors."""
+    maps = two_maps(generator, truth(generator), truth(generator))
+    result = infer(build_magnet(campaign_study()), maps, session(tmp_path))
+    for each in result.overlaps:
+        assert each.chi2 > 10 * each.limit
+        assert "not of the same magnet" in each.disagreement
+    assert "not of the same magnet" in result.disagreement
+
+
+def test_a_sensor_out_of_place_in_one_map_only(generator):
+    """Readings of both know their own sensors: the magnitude of the field is taken there."""
+    study = campaign_study().with_(maps=())
+    probe = Instrument(sensor_position_m=((0, 0, 1e-3), (0, 0, 0), (0, 0, -1e-3)))
+    apart = study.with_(instrument=probe)
+    every = np.ones((10, 3), bool)
+    one, two = observe(apart, BODY[:10], every), observe(study, FRINGE[:10], every)
+    fields = [generator.standard_normal(each.points.shape) for each in (one, two)]
+    both = concatenate(one, two)
+    assert both.magnitude(np.vstack(fields)) == pytest.approx(
+        np.linalg.norm(np.vstack([fields[0], np.repeat(fields[1], 3, axis=0)]), axis=1))
+    assert both.places[:3] == pytest.approx(BODY[0] + np.outer([1e-3, 0, -1e-3], [0, 0, 1]))
+
+
+def campaign_file(folder, maps, extra=""):
+    """A study file that lists two maps, which are written beside it."""
+    for name, data in maps.items():
+        write_map(data, folder / f"{name}.csv")
+    path = folder / "campaign.toml"
+    path.write_text(f"""{TEXT}
+[instrument_sd]
+translation_m = 1e-3
+rotation_rad = 0.01
+
+[[maps]]
+name = "body"
+file = "body.csv"        # the bore
+{extra}
+[[maps]]
+name = "fringe"
+file = "fringe.csv"
+""")
+    return path
+
+
+def test_maps_are_registered_and_update_the_magnet_together(generator, tmp_path, capsys):
+    path = campaign_file(tmp_path, two_maps(generator))
+    registered = tmp_path / "out" / "study.registered.toml"
+    assert main(["register", str(path), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "Map fringe:" in said
+    assert "as the maps before have updated it" in said
+    for name in ("body", "fringe"):
+        page = (tmp_path / "out" / name / "registration.html").read_text()
+        assert f"Where does map {name} lie" in page
+    study = read_study(registered)
+    assert "# the bore" in registered.read_text()  # comments stay
+    assert list(read_maps(study, registered.parent)) == ["body", "fringe"]
+    # the magnet looks almost the same from both ends, but the maps must agree on one
+    (turn, shift), (_, other) = POSES.values()
+    one, two = (each.instrument for each in study.maps)
+    apart = np.array(two.translation_m) - one.translation_m
+    assert Rotation.from_rotvec(one.rotation_rad).inv().apply(apart) == pytest.approx(
+        turn.inv().apply(other - shift), abs=5e-4)
+    assert main(["infer", str(registered), "-o", str(tmp_path / "inferred")]) == 0
+    assert "they agree" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "inferred" / "summary.json").read_text())
+    assert not summary["disagreement"]
+    assert summary["instrument_at_rest"]
+    page = (tmp_path / "inferred" / "report.html").read_text()
+    for text in ("Do the maps agree?", "The instruments", "Map fringe."):
+        assert text in page
+    updated = tmp_path / "inferred" / "study.updated.toml"
+    again = infer(build_magnet(read_study(updated)), read_maps(read_study(updated), updated.parent),
+                  session(tmp_path / "again"))
+    assert (np.abs(again.terms.change) < 0.3 * again.terms.sd).all()
+    assert main(["multipoles", str(path), "--posterior", str(tmp_path / "inferred/posterior.h5"),
+                 "-o", str(tmp_path / "multipoles")]) == 0
+
+
+@pytest.mark.parametrize(("extra", "sentence"), [
+    ("colour = 1", "must be a known key"),
+    ("probe = 'hall'", None),
+])
+def test_keys_of_maps(generator, tmp_path, extra, sentence):
+    path = campaign_file(tmp_path, two_maps(generator), extra)
+    if sentence is None:
+        assert read_study(path).maps[0].probe == "hall"
+        return
+    with pytest.raises(StudyError, match=sentence):
+        read_study(path)
+
+
+def test_bad_campaigns_get_a_sentence(generator, tmp_path, capsys):
+    maps = two_maps(generator)
+    path = campaign_file(tmp_path, maps)
+    study = read_study(path)
+    write_map(maps["body"], tmp_path / "fringe.csv")
+    with pytest.raises(MeasurementError, match="same readings"):
+        read_maps(study, tmp_path)
+    (tmp_path / "fringe.csv").unlink()
+    with pytest.raises(MeasurementError, match=r"fringe\.csv"):
+        read_maps(study, tmp_path)
+    assert main(["infer", str(path), "-o", str(tmp_path / "x")]) == 4
+    assert not (tmp_path / "x").exists()
+    twice = path.read_text().replace('file = "fringe.csv"', 'file = "body.csv"')
+    with pytest.raises(StudyError, match="a file of its own"):
+        parse_study(tomllib.loads(twice))
+    assert main(["infer", str(path), "--measurements", str(tmp_path / "body.csv"),
+                 "-o", str(tmp_path / "x")]) == 3
+    assert "Leave --measurements out" in capsys.readouterr().err
+    (tmp_path / "single.toml").write_text(TEXT)
+    assert main(["infer", str(tmp_path / "single.toml"), "-o", str(tmp_path / "x")]) == 3
+    assert "Add --measurements" in capsys.readouterr().err
+    with pytest.raises(StudyError, match="takes a single map"):
+        diagnose(study, maps["body"], session(tmp_path / "d"))
+    with pytest.raises(StudyError, match="finds errors of instruments itself"):
+        diagnose(study.with_(maps=()), maps["body"], session(tmp_path / "d"))
+    with pytest.raises(StudyError, match="those that are given, by name"):
+        maps_of(study, {"body": maps["body"]})
+    with pytest.raises(StudyError, match=r"the same instrument\.gain"):
+        parse_study(tomllib.loads(TEXT) | {"maps": [
+            {"name": "one", "file": "1.csv", "probe": "p"},
+            {"name": "two", "file": "2.csv", "probe": "p",
+             "instrument": {"gain": [0.01, 0, 0]}}]})
+    with pytest.raises(StudyError, match="3D"):
+        flat = tomllib.loads(TEXT) | {"dimension": 2, "instrument_sd": {"gain": 0.01}}
+        flat["array"] = {key: value for key, value in flat["array"].items() if key != "rings"}
+        parse_study(flat)
