@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -197,10 +198,19 @@ def _rounded(value: float, sd: float) -> str:
 
 
 def place_in_words(place: Place) -> str:
-    """Describe a place in words."""
-    parts = [f"{noun} {number}" for noun, number in (("ring", place.ring), ("slot", place.slot))
-             if number]
-    return ", ".join(parts) or place.name
+    """Describe a place in words; of two blocks, both."""
+    numbers = [(place.ring, place.slot), *([place.other] if any(place.other) else [])]
+    blocks = [block_in_words(ring, slot, label) for (ring, slot), label in zip_longest(
+        numbers, place.labels, fillvalue="")]
+    return " and ".join(filter(None, blocks)) or place.name
+
+
+def block_in_words(ring: int, slot: int, label: str = "") -> str:
+    """Describe a block by its own label, or else by ring and slot; 0 stands for all of them."""
+    if label and label != f"r{ring:02d}s{slot:02d}":
+        return f"block {label}"
+    return ", ".join(f"{noun} {number}" for noun, number in (("ring", ring), ("slot", slot))
+                     if number)
 
 
 @dataclass(frozen=True)
