@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
+from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.study.types import COMPONENTS
 
 if TYPE_CHECKING:
     from halbach_fe.diagnosis.effects.base import Effect
@@ -24,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     common.add_measurement_arguments(parser)
     common.add_held_out_argument(parser)
+    parser.add_argument("--check", type=Path, metavar="JSON",
+                        help="check.json of halbach-fe check for this map, whose model-free "
+                        "floor is shown beside the results")
     parser.add_argument("--effects", type=effects_of, metavar="NAME,NAME...",
                         help="candidate effects (default: all effects of the catalogue)")
 
@@ -43,6 +50,25 @@ def effects_of(text: str) -> list[Effect]:
     return [effect_by_name[name] for name in dict.fromkeys(text.split(","))]
 
 
+def floor_of(path: Path) -> dict[str, float]:
+    """Return the model-free floor in T by component from a check.json.
+
+    Raises
+    ------
+    MeasurementError
+        If the file is not one of `halbach-fe check`.
+    """
+    try:
+        floor = [float(value) for value in json.loads(path.read_text("utf-8"))["floor_T"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        floor = []
+    if len(floor) != len(COMPONENTS) or not all(map(math.isfinite, floor)):
+        raise MeasurementError(must_be(
+            "file --check", str(path), "a check.json that `halbach-fe check` wrote",
+            "a file without a floor of three components"))
+    return {f"B{name}": value for name, value in zip(COMPONENTS, floor, strict=True)}
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose, write the results, print a summary."""
     from halbach_fe.diagnosis.diagnose import diagnose
@@ -54,9 +80,10 @@ def run(arguments: argparse.Namespace) -> int:
     study = read_study(arguments.study)
     text = arguments.study.read_text(encoding="utf-8")
     data, blocks, validation_map = common.measurements(arguments)
+    floor = floor_of(arguments.check) if arguments.check else None
     with common.session(arguments) as session:
         diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
-                             common.say)
+                             common.say, floor_T=floor)
         separating = separations(diagnosis, data, session, arguments.effects)
     write_diagnosis(diagnosis, separating, study, text, arguments.output)
     if arguments.json:
@@ -68,10 +95,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_diagnosis(diagnosis: Diagnosis, folder: Path) -> None:
     """Print the verdict, the missing effects, and the scores before and after."""
-    from halbach_fe.report.diagnosis import change_table, found_table, verdict
+    from halbach_fe.report.diagnosis import change_table, found_table, residual_table, verdict
 
     common.say(" ".join(verdict(diagnosis)))
     if diagnosis.found_anything:
         common.print_table(found_table(diagnosis), "Missing from the study")
     common.print_table(change_table(diagnosis), "The model before and after")
+    common.print_table(residual_table(diagnosis), "Rms difference of model and readings")
     common.say(f"Report: {folder / 'diagnosis.html'}")

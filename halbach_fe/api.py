@@ -73,7 +73,7 @@ class MultipoleTables(ShownInNotebook):
 def diagnose(
     magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[str] | None = None, validation_map: xr.Dataset | None = None,
-    say: Say = lambda text: None,
+    say: Say = lambda text: None, floor_T: dict[str, float] | None = None,
 ) -> Diagnosis:
     """Find which effects the study lacks to explain a measured map, and add them to the model.
 
@@ -93,6 +93,9 @@ def diagnose(
         Another map, which is predicted but does not update the model.
     say : callable, optional
         Called with a line of text about each step, to report progress.
+    floor_T : dict of str to float, optional
+        The model-free floor of the map by component (``Bx``), see `halbach_fe.check_map`; it is
+        shown beside the results.
 
     Returns
     -------
@@ -124,7 +127,8 @@ def diagnose(
                                      f"Did you mean {near[0]}?" if near else ""))
     chosen = (None if effects is None
               else [effect_by_name[name] for name in dict.fromkeys(effects)])
-    return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say)
+    return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say,
+                                   floor_T=floor_T)
 
 
 def multipoles(

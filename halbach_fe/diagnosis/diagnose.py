@@ -23,19 +23,21 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.diagnosis.equal_positions import possible_positions
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect, probabilities
+from halbach_fe.diagnosis.model_selection import probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     estimate_position_noise,
     has_settled,
     with_position_noise,
 )
-from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.search import (
     NominalSolver,
     Say,
@@ -71,6 +73,7 @@ def diagnose(
     study: Study, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
     say: Say = lambda text: None, solver: NominalSolver | None = None,
+    floor_T: dict[str, float] | None = None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain a map.
 
@@ -91,6 +94,8 @@ def diagnose(
         Called with a line of text on each step, to report progress.
     solver : NominalSolver, optional
         Several diagnoses may share one, so that equal magnets are solved once.
+    floor_T : dict of str to float, optional
+        The model-free floor of the map by component, to be reported with the results.
 
     Returns
     -------
@@ -104,7 +109,7 @@ def diagnose(
     refuse_several_maps(study, "a diagnosis")
     refuse_open_instruments(study, "a diagnosis, which finds errors of instruments itself")
     effects = catalogue() if effects is None else effects
-    gross_errors, corrected, start = _correct_map_errors(study, data, blocks, effects)
+    gross_errors, corrected, starts = _correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:
         say(f"gross error: {error.convention.text}")
     if blocks is not None and corrected.array.blocks_by_ring != study.array.blocks_by_ring:
@@ -114,25 +119,31 @@ def diagnose(
     solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
     times = np.concatenate([map_time(each) for each in (data, validation_map) if each is not None])
     first: tuple[InferenceResult, Search] | None = None
-    identified, position_noise, converged = start, None, True
+    position_noise, converged = None, True
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
 
-    def updated(name: str) -> InferenceResult:
+    def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
         changed = with_position_noise(apply_effects(corrected, identified), position_noise)
         return infer(build_magnet(changed), data, _subsession(session, name), blocks,
                      validation_map=validation_map)
 
+    if len(starts) > 1:
+        say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
+    start, positions = possible_positions(
+        starts, {effect.name: effect for effect in effects}, updated, times)
+    identified = start
+
     for number in range(MAX_ROUNDS):
         names = ", ".join(effect.selection.candidate.name for effect in identified)
         say(f"round {number + 1}: the model with {names or 'no effect added'}")
-        update = updated(f"round-{number + 1}")
+        update = updated(identified, f"round-{number + 1}")
         if number == 0:
             outliers = outliers_of(update)
         if number == 0 and outliers:
             say(f"outliers: {len(outliers)} readings are excluded")
             corrected = excluding(corrected, outliers)
-            update = updated("without-outliers")
+            update = updated(identified, "without-outliers")
         prior_mean = (first[0] if first else update).prior.mean
         search = score_hypotheses(
             corrected, start, update, prior_mean, times, solver, effects, identified, signatures,
@@ -153,12 +164,19 @@ def diagnose(
         found = identify_effects(corrected, search, update.observation.map_points)
         converged = _has_converged(identified, found)
         if converged:
+            # the model has the old amplitudes; their sd and evidence are those of this round
+            present = {effect.hypothesis: effect.values for effect in identified}
+            identified = tuple(replace(effect, values=present[effect.hypothesis])
+                               for effect in found)
             break
         identified = found
     assert first is not None
     unknown = None if solver_error else find_unknown_cause(search, update, identified)
     if unknown is not None and unknown.alone:
         identified, position_noise, (update, search) = start, None, first
+    numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
+    in_model = [column for number in numbers for column in search.candidates[number].columns]
+    limits = detection_limits(update, times, search.columns[:, in_model])
     return Diagnosis(
         corrected_study=corrected, before=first[0], after=update, identified=identified,
         unknown=unknown,
@@ -169,12 +187,13 @@ def diagnose(
         loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
         gross_errors=gross_errors, outliers=outliers, position_noise=position_noise,
-        solver_error=solver_error, converged=converged)
+        solver_error=solver_error, converged=converged, positions=positions,
+        limits=limits, floor_T=floor_T)
 
 
 def _correct_map_errors(
     study: Study, data: xr.Dataset, blocks: BlockTable | None, effects: Sequence[Effect]
-) -> tuple[tuple[GrossError, ...], Study, tuple[IdentifiedEffect, ...]]:
+) -> tuple[tuple[GrossError, ...], Study, tuple[dict[str, tuple[float, ...]], ...]]:
     """Find the gross errors of a map and correct the study for them.
 
     Returns
@@ -182,24 +201,21 @@ def _correct_map_errors(
     errors : tuple of GrossError
     study : Study
         The study whose instrument or magnet is corrected for these errors.
-    start : tuple of IdentifiedEffect
-        Effects from which the search starts. An error of the points' positions that is also an
-        effect of the catalogue (`wrong_radius`, `wrong_line`) is not corrected in the study but
-        returned here, so that the search refines its amplitude.
+    starts : tuple of dict
+        Amplitudes of effects from which the search starts, one dictionary for each position of the
+        map that may be equal to the others by symmetry. An error of the points' positions that is
+        also an effect of the catalogue (`wrong_radius`, `wrong_line`) is not corrected in the study
+        but returned here, so that the search refines its amplitude.
     """
     found = find_gross_errors(study, data, blocks)
-    catalogued = {effect.name: effect for effect in effects}
-    start: tuple[IdentifiedEffect, ...] = ()
-    if found and found[-1].start and found[-1].start.keys() <= catalogued.keys():
-        start = tuple(
-            IdentifiedEffect(
-                Hypothesis(catalogued[name], Place()), np.array(values), np.zeros(len(values)),
-                SelectedEffect(Candidate(name, "", ()), 0.0, 0.0, ()))
-            for name, values in found[-1].start.items())
+    names = {effect.name for effect in effects}
+    starts: tuple[dict[str, tuple[float, ...]], ...] = ()
+    if found and found[-1].starts and found[-1].starts[0].keys() <= names:
+        starts = tuple(each for each in found[-1].starts if each.keys() <= names)
         found = found[:-1]
     for error in found:
         study = error.apply(study)
-    return found, study, start
+    return found, study, starts
 
 
 def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:

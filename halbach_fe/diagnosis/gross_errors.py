@@ -8,15 +8,18 @@ common factor near 1 is fitted, which absorbs iron, permeability and temperature
 The misfit that tolerances of blocks and effects of usual size cause is known. A gross error is
 reported only if the misfit is far larger, and if correcting the error removes nearly all of it.
 Errors that are equivalent by the magnet's symmetry are reported together: if both ends of the
-magnet are alike, a reversed z axis is equivalent to a wrong sign of Bz. Measured blocks break the
-symmetry, and then decide between such errors.
+magnet are alike, a reversed z axis is equivalent to a wrong sign of Bz, and a displacement to
+either side of the axis may be the same. Measured blocks break the symmetry, and then decide between
+such errors. A block that is missing or upside down is no gross error; it is taken into account
+where it would be mistaken for one.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import xarray as xr
@@ -39,6 +42,7 @@ from halbach_fe.diagnosis.map_conventions import (
 )
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
@@ -79,6 +83,16 @@ of 2."""
 
 MAX_REMAINING_MISFIT = 0.05
 """Largest misfit that may remain after the correction, relative to the map's rms."""
+
+MAX_OF_A_BLOCK = 0.5
+"""Largest misfit relative to the map's rms at which a missing or upside-down block is tried beside
+an error: two of eight blocks of the only ring."""
+
+MAX_TRIED_WITH_A_BLOCK = 4
+"""Largest number of conventions that are tried with every block missing and upside down."""
+
+WRONG_BLOCK_FACTORS = (1.0, 2.0)
+"""Multiple of a block's field that is lacking if it is missing, and if it is upside down."""
 
 INDISTINGUISHABLE_MISFIT_RATIO = 1.2
 """Ratio of misfits below which the map does not distinguish two errors."""
@@ -135,18 +149,15 @@ class GrossError:
         return self.convention.names
 
     @property
-    def start(self) -> dict[str, tuple[float, ...]]:
+    def starts(self) -> tuple[dict[str, tuple[float, ...]], ...]:
         """Amplitudes by name of the catalogue's effects that are equivalent to this error.
 
-        It is empty if other errors are involved. The search for effects starts from these
-        amplitudes, which are too large for a linear signature to find.
+        Those of the alternatives follow, such as a displacement to the other side. The tuple is
+        empty if other errors are involved. The search for effects starts from these amplitudes,
+        which are too large for a linear signature to find.
         """
-        rest = replace(self.convention, offset_m=0.0, shift_m=(0.0, 0.0, 0.0))
-        if rest.errors:
-            return {}
-        offset, shift = (self.convention.offset_m,), self.convention.shift_m
-        return {name: values for name, values in (("wrong_radius", offset), ("wrong_line", shift))
-                if any(values)}
+        found = [_start_of(each) for each in (self.convention, *self.alternatives)]
+        return tuple(start for start in found if start) if found[0] else ()
 
     def apply(self, study: Study) -> Study:
         """Return the study that reads the map by the corrected convention."""
@@ -237,23 +248,68 @@ class _Search:
         if before.relative < MIN_MISFIT_OF_WRONG_UNIT:
             self.lengths = self.flux_densities = (1.0,)
         combined = before.relative > MIN_MISFIT_OF_SEVERAL_ERRORS
+        without_error = self.with_a_wrong_block(MapConvention())
         for level in range(1, MAX_ERRORS + 1 if combined else 2):
             for conventions in (self.conventions(level), self.elsewhere(level)):
                 tried = [(self.misfit(each), each) for each in conventions]
                 good = [trial for trial in tried if self.explains(before, *trial)]
+                good = good or self.beside_a_wrong_block(before, tried)
                 if good:
                     break
             if good:
+                if self.explains(before, without_error, MapConvention()) and (
+                        without_error.standard <= INDISTINGUISHABLE_MISFIT_RATIO * min(
+                            misfit.standard for misfit, _ in good)):
+                    return None  # a single block is the simpler cause
                 equivalent = _best(good)
                 if self.table and len(equivalent) > 1:
                     equivalent = _best([
                         (self.misfit(each, measured_blocks=True), each) for _, each in equivalent])
-                (after, convention), *others = sorted(equivalent, key=lambda trial: rank(trial[1]))
+                (_, convention), *others = sorted(
+                    equivalent, key=lambda trial: (rank(trial[1]), trial[0].standard))
                 if _small(convention):
                     return None
-                return GrossError(convention, tuple(each for _, each in others),
-                                  before.relative, after.relative)
+                return GrossError(convention, self.distinct(convention, [
+                    each for _, each in others]), before.relative,
+                    self.misfit(convention).relative)
         return None
+
+    def beside_a_wrong_block(
+        self, before: _Misfit, tried: Sequence[tuple[_Misfit, MapConvention]]
+    ) -> list[tuple[_Misfit, MapConvention]]:
+        """Return the conventions that explain the map if one block is missing or upside down.
+
+        The block is then left to the catalogue of effects. Without this, the fewest further errors
+        would be looked for that happen to imitate the block, such as another number of rings.
+        """
+        near = sorted((trial for trial in tried if trial[0].relative <= MAX_OF_A_BLOCK),
+                      key=lambda trial: trial[0].standard)[:MAX_TRIED_WITH_A_BLOCK]
+        found = [(self.with_a_wrong_block(convention), convention) for _, convention in near]
+        return [trial for trial in found if self.explains(before, *trial)]
+
+    def distinct(
+        self, convention: MapConvention, others: Sequence[MapConvention]
+    ) -> tuple[MapConvention, ...]:
+        """Return those of the other conventions that read the map differently, or another magnet.
+
+        With a single radius, for example, a factor of the radius and an offset are the same.
+        """
+        found = [convention]
+        for other in others:
+            if not any(self.same(other, each) for each in found):
+                found.append(other)
+        return tuple(found[1:])
+
+    def same(self, first: MapConvention, second: MapConvention) -> bool:
+        """Tell whether two conventions read the same positions and values for the same magnet."""
+        if first.magnet != second.magnet:
+            return False
+        one, other = (each.apply(self.study).instrument for each in (first, second))
+        values, changed = (to_magnet_axes(used.field_axes, self.values) * used.flux_density_unit_T
+                           for used in (one, other))
+        moved = _probe_points(one, self.points) - _probe_points(other, self.points)
+        return bool(np.array_equal(values, changed, equal_nan=True)
+                    and np.linalg.norm(moved, axis=1).max() < MIN_SHIFT_M)
 
     def explains(self, before: _Misfit, after: _Misfit, convention: MapConvention) -> bool:
         """Tell whether a convention removes nearly all of the misfit and fits a valid study."""
@@ -298,15 +354,16 @@ class _Search:
         size = build_magnet(self.study).bore_radius
         for unit in self.lengths if level > 1 else (1.0,):
             source = MapConvention(length_unit=unit)
-            families = [[replace(source, offset_m=size * offset) for offset in RADIUS_OFFSETS
-                         if unit * smallest + size * offset > 0]]
+            families: list[list[MapConvention]] = []  # points on the axis have no radius
             if circles:
-                families.append([replace(source, radius=factor) for factor in RADIUS_FACTORS])
+                families = [[replace(source, offset_m=size * offset) for offset in RADIUS_OFFSETS
+                             if unit * smallest + size * offset > 0],
+                            [replace(source, radius=factor) for factor in RADIUS_FACTORS]]
             for family in families:
                 tried = [each for start in family for each in self.of_source(start, level)]
                 best = min(tried, key=lambda each: self.misfit(each).standard, default=None)
                 if best:
-                    yield from self.decided(self.refined(best))
+                    yield self.refined(best)
         if level == 1:
             yield from self.shifted()
 
@@ -343,21 +400,34 @@ class _Search:
             own = self.residual(convention(shift))
             return np.full(self.present, 1e3) if own is None else own[0]
 
-        best = min(starts, key=lambda shift: self.misfit(convention(shift)).standard)
-        found = least_squares(residual, best, x_scale=size, diff_step=1e-4, max_nfev=8).x
-        yield from self.decided(convention(found))
+        def improved(moved: MapConvention) -> MapConvention:
+            return convention(least_squares(residual, np.array(moved.shift_m), x_scale=size,
+                                            diff_step=1e-4, max_nfev=8).x)
 
-    def decided(self, moved: MapConvention) -> Iterator[MapConvention]:
-        """Yield a convention with displaced points, unless the opposite displacement fits as well.
+        rated = sorted(starts, key=lambda shift: self.misfit(convention(shift)).standard)
+        # the field may change as much from the axis along x as along y
+        for along in (0, 1):
+            best = next(shift for shift in rated
+                        if not shift[:2].any() or np.argmax(np.abs(shift[:2])) == along)
+            yield from self.mirrored(improved(convention(best)), improved)
 
-        The opposite displacement always fits as well from the axis of a symmetric magnet. The
-        direction is then undetermined, and a displacement would explain any map.
+    def mirrored(
+        self, moved: MapConvention, improved: Callable[[MapConvention], MapConvention]
+    ) -> Iterator[MapConvention]:
+        """Yield a convention with displaced points, and its mirror images that fit as well.
+
+        From the axis of a symmetric magnet a displacement to either side fits equally well. Nothing
+        in the map tells the sides apart, so that all of them are possible. ``improved`` takes a
+        convention and returns the best one near it.
         """
-        x, y, z = (-component for component in moved.shift_m)
-        opposite = replace(moved, offset_m=-moved.offset_m, shift_m=(x, y, z))
+        yield moved
         limit = INDISTINGUISHABLE_MISFIT_RATIO * self.misfit(moved).standard
-        if opposite == moved or self.misfit(opposite).standard > limit:
-            yield moved
+        for signs in product((1.0, -1.0), repeat=3):
+            x, y, z = np.multiply(moved.shift_m, signs).tolist()
+            if min(signs) < 0 and max(map(abs, (x, y, z))) > MIN_SHIFT_M:
+                image = improved(replace(moved, shift_m=(x, y, z)))
+                if self.misfit(image).standard <= limit:
+                    yield image
 
     def misfit(self, convention: MapConvention, measured_blocks: bool = False) -> _Misfit:
         """Return the misfit of a map read by a convention.
@@ -369,6 +439,29 @@ class _Search:
             return INFINITE_MISFIT
         residual, relative = found
         return _Misfit(float(np.sqrt(np.mean(residual**2))), relative)
+
+    def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
+        """Return the smallest misfit with one block missing or upside down."""
+        turned = convention.magnet if convention.magnet in self.turned else None
+        nominal = self.nominal(replace(
+            convention, fields=IDENTITY_AXES, flux_density_unit=1.0,
+            magnet=None if turned else convention.magnet))
+        if nominal is None:
+            return INFINITE_MISFIT
+        turn = turned.turn_rad if turned and turned.turn_rad else 0.0
+        study = (replace(convention, magnet=None) if turned else convention).apply(self.study)
+        points, sensors = _probe_points(study.instrument, self.points), sensor_matrix(
+            study.instrument).T
+        whole, best = nominal.field(turn), INFINITE_MISFIT
+        blocks = self.blocks[None if turned else convention.magnet]
+        for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
+            own = unit @ (rotation_about_z(turn) @ block.easy_axis) * block.remanence @ sensors
+            for factor in WRONG_BLOCK_FACTORS if block.remanence else ():
+                found = self.compared(convention, whole - factor * own, nominal.variance)
+                if found is not None:
+                    misfit = _Misfit(float(np.sqrt(np.mean(found[0]**2))), found[1])
+                    best = min(best, misfit, key=lambda each: each.standard)
+        return best
 
     def residual(
         self, convention: MapConvention, measured_blocks: bool = False
@@ -386,6 +479,12 @@ class _Search:
         field = nominal.field(turned.turn_rad if turned and turned.turn_rad else 0.0)
         if measured_blocks:
             field = self.of_measured_blocks(convention, field)
+        return self.compared(convention, field, nominal.variance)
+
+    def compared(
+        self, convention: MapConvention, field: Floats, variance: Floats
+    ) -> tuple[Floats, float] | None:
+        """Compare the map with a field (n, 3) in T of given variance, see `residual`."""
         old = self.study.instrument
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
@@ -393,7 +492,7 @@ class _Search:
         if not used.any() or 2 * used.sum() < self.present:
             return None
         whole = max(_size(shown), 1e-300)
-        sd = np.sqrt(nominal.variance[used] + (EFFECT_FIELD_SD * max(whole, _size(field))) ** 2)
+        sd = np.sqrt(variance[used] + (EFFECT_FIELD_SD * max(whole, _size(field))) ** 2)
         shown, field = shown[used], field[used]
         weighted = field / sd
         scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
@@ -481,6 +580,15 @@ class _Nominal:
     def field(self, turn: float) -> Floats:
         """Return B (n, 3) in T with the magnetization of all blocks turned by an angle in rad."""
         return np.cos(turn) * self.blocks + np.sin(turn) * self.across + self.external
+
+
+def _start_of(convention: MapConvention) -> dict[str, tuple[float, ...]]:
+    """Return amplitudes of the effects that a convention amounts to; empty if there are none."""
+    if replace(convention, offset_m=0.0, shift_m=(0.0, 0.0, 0.0)).errors:
+        return {}
+    offset, shift = (convention.offset_m,), convention.shift_m
+    return {name: values for name, values in (("wrong_radius", offset), ("wrong_line", shift))
+            if any(values)}
 
 
 def _small(convention: MapConvention) -> bool:

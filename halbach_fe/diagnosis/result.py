@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
@@ -104,6 +106,46 @@ class UnknownCause:
 
 
 @dataclass(frozen=True)
+class PossiblePosition:
+    """A displacement of the map that the readings do not exclude.
+
+    Attributes
+    ----------
+    amplitudes : dict of str to tuple of float
+        Amplitudes by name of the effects that amount to it, such as ``wrong_line``.
+    probability : float
+        Among the positions that the readings do not exclude.
+    """
+
+    amplitudes: dict[str, tuple[float, ...]]
+    probability: float
+
+
+@dataclass(frozen=True)
+class DetectionLimits:
+    """The smallest changes of single blocks that a map would have shown.
+
+    Attributes
+    ----------
+    blocks : tuple of str
+        Names of the blocks that are magnetized.
+    loss : ndarray, shape (blocks,)
+        Part of the magnetization whose loss would have been named; above 1, if not even the
+        missing block would have been.
+    displacement_m : ndarray, shape (blocks,)
+        Displacement in the direction in which it is least visible.
+    """
+
+    blocks: tuple[str, ...]
+    loss: Floats
+    displacement_m: Floats
+
+    def worst(self, limits: Floats) -> str:
+        """Return the name of the block with the largest of some limits (blocks,)."""
+        return self.blocks[int(np.argmax(limits))]
+
+
+@dataclass(frozen=True)
 class Diagnosis(ShownInNotebook):
     """The result of a diagnosis.
 
@@ -140,6 +182,14 @@ class Diagnosis(ShownInNotebook):
         The solver's own error, if it explains the misfit. The search for effects is then skipped.
     converged : bool
         Whether the last round changed neither the effects nor their amplitudes.
+    positions : tuple of PossiblePosition
+        Displacements of the map that the magnet's symmetry hardly distinguishes, if there are
+        several; the effects are those of the first.
+    limits : DetectionLimits or None
+        The smallest changes of single blocks that the map would have shown; None if no block is
+        magnetized.
+    floor_T : dict of str to float, or None
+        The model-free floor of the map by component (``Bx``), if Maxwell's check of it is known.
 
     Examples
     --------
@@ -169,6 +219,9 @@ class Diagnosis(ShownInNotebook):
     position_noise: PositionNoise | None = None
     solver_error: SolverErrorExplanation | None = None
     converged: bool = True
+    positions: tuple[PossiblePosition, ...] = ()
+    limits: DetectionLimits | None = None
+    floor_T: dict[str, float] | None = None
 
     @property
     def study(self) -> Study:

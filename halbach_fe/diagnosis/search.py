@@ -136,18 +136,7 @@ def score_hypotheses(
     progress : callable, optional
         Called with the numbers of finished and of all hypotheses.
     """
-    rows = np.flatnonzero(~update.held_out)
-    noise = update.errors.subset(rows)
-
-    def whitened(readings: Floats) -> Floats:
-        """Return the whitened training readings (rows, ...) of all readings (..., readings)."""
-        return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
-
-    response = noise.whiten(update.response.matrix[rows])
-    marginal = Marginal.of(with_fewer_columns(np.hstack([
-        response @ update.prior.root, whitened(_solver_error(update))])))
-    training = whitened(update.readings - update.response.offset
-                        - update.response.matrix @ update.prior.mean)
+    whitened, response, marginal, training = marginal_of(update)
     residual = training
     study = apply_effects(corrected, start)
 
@@ -207,6 +196,36 @@ def score_hypotheses(
     stacked = np.hstack([columns[number] for number in chosen])
     return Search(tuple(shortlisted[number] for number in chosen), tuple(compared),
                   marginal.evidence(stacked, residual), stacked, residual, marginal, training)
+
+
+def marginal_of(
+    update: InferenceResult
+) -> tuple[Callable[[Floats], Floats], Floats, Marginal, Floats]:
+    """Return the training readings of an inference with blocks and solver error integrated out.
+
+    Returns
+    -------
+    whitened : callable
+        Takes all readings (..., readings) in T and returns the whitened training readings
+        (rows, ...).
+    response : ndarray, shape (rows, parameters)
+        Whitened response of the training readings to the magnetizations.
+    marginal : Marginal
+    residual : ndarray, shape (rows,)
+        Whitened residual of the training readings from the prior mean.
+    """
+    rows = np.flatnonzero(~update.held_out)
+    noise = update.errors.subset(rows)
+
+    def whitened(readings: Floats) -> Floats:
+        return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
+
+    response = noise.whiten(update.response.matrix[rows])
+    marginal = Marginal.of(with_fewer_columns(np.hstack([
+        response @ update.prior.root, whitened(_solver_error(update))])))
+    residual = whitened(update.readings - update.response.offset
+                        - update.response.matrix @ update.prior.mean)
+    return whitened, response, marginal, residual
 
 
 def _solver_error(update: InferenceResult) -> Floats:

@@ -19,7 +19,14 @@ from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.model_selection import Candidate
-from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect, UnknownCause
+from halbach_fe.diagnosis.result import (
+    DetectionLimits,
+    Diagnosis,
+    Hypothesis,
+    IdentifiedEffect,
+    PossiblePosition,
+    UnknownCause,
+)
 from halbach_fe.inference.result import (
     ALL_READINGS,
     COVERAGE_Z,
@@ -42,6 +49,12 @@ DISPLAY_UNITS = {
 EMPTY_CELL = "–"
 """Text of a table's cell without an entry."""
 
+MOST_DISPLACED_MM = 10.0
+"""Largest displacement of a block that reports state; signatures are linear up to a few mm."""
+
+OUTWARDS = {"wrong_radius": "farther out"}
+"""Direction of displacements with one amplitude."""
+
 MAX_LISTED_ROWS = 10
 """Largest number of outliers that a report lists. The summary has all of them."""
 
@@ -61,8 +74,9 @@ class RegionFit:
     chi2_per_reading : float
         Chi-squared per reading by the full covariance of prediction and noise. The prediction is
         the prior one for training readings, and the posterior one for held-out readings.
-    median_relative_error : float or None
-        Median relative error of the posterior prediction; None if all readings are 0.
+    rms_T : dict of str to float
+        Rms difference of the posterior prediction from the readings, by component (``Bx``) or kind
+        of Fourier coefficient.
     coverage95 : float
         Fraction of the readings within the 95 % band of their prediction. Training readings are
         compared with their leave-one-out prediction.
@@ -72,7 +86,7 @@ class RegionFit:
     part: str
     readings: int
     chi2_per_reading: float
-    median_relative_error: float | None
+    rms_T: dict[str, float]
     coverage95: float
 
 
@@ -84,7 +98,7 @@ def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[Region
     parts, regions = np.array(update.parts), np.array(update.regions)
     training = parts == TRAINING
     found = [RegionFit(ALL_READINGS, TRAINING, int(training.sum()), update.prior_conflict,
-                   _median(update, training), float(np.mean(np.abs(loo_residuals) <= COVERAGE_Z)))]
+                   _rms(update, training), float(np.mean(np.abs(loo_residuals) <= COVERAGE_Z)))]
     names = list(dict.fromkeys(update.regions))
     for part in (HELD_OUT, HELD_OUT_MAP):
         for region in [ALL_READINGS, *(names if len(names) > 1 else [])]:
@@ -93,16 +107,25 @@ def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[Region
                 found.append(RegionFit(
                     region, part, int(chosen.sum()),
                     float(np.mean(update.whitened(update.prediction_posterior, chosen) ** 2)),
-                    _median(update, chosen), float(np.mean(np.abs(update.standardized(
+                    _rms(update, chosen), float(np.mean(np.abs(update.standardized(
                         update.prediction_posterior)[chosen]) <= COVERAGE_Z))))
     return found
 
 
-def _median(update: InferenceResult,
-            chosen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> float | None:
-    """Return the median relative error of the posterior prediction; None if all readings are 0."""
-    errors = update.relative_error(update.prediction_posterior)[chosen]
-    return None if np.isnan(errors).all() else float(np.nanmedian(errors))
+def _rms(
+    update: InferenceResult, chosen: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> dict[str, float]:
+    """Return the rms difference in T of prediction and readings by component."""
+    residual = (update.readings - update.prediction_posterior.mean)[chosen]
+    kinds = np.array(["".join(letter for letter in label if not letter.isdigit())
+                      for label in update.observation.labels])[chosen]
+    return {kind: float(np.sqrt(np.mean(residual[kinds == kind]**2)))
+            for kind in dict.fromkeys(kinds.tolist())}
+
+
+def main_field_T(diagnosis: Diagnosis) -> float:  # noqa: N802 - a unit
+    """Return the largest reading that the diagnosed model predicts, in T."""
+    return float(np.abs(diagnosis.after.prediction_posterior.mean).max())
 
 
 def write_summary(
@@ -197,10 +220,20 @@ def _rounded(value: float, sd: float) -> str:
 
 
 def place_in_words(place: Place) -> str:
-    """Describe a place in words."""
-    parts = [f"{noun} {number}" for noun, number in (("ring", place.ring), ("slot", place.slot))
-             if number]
-    return ", ".join(parts) or place.name
+    """Describe a place in words; of two blocks, both."""
+    numbers = [(place.ring, place.slot), *([place.other] if any(place.other) else [])]
+    labels = place.labels or ("",) * len(numbers)
+    blocks = [block_in_words(ring, slot, label)
+              for (ring, slot), label in zip(numbers, labels, strict=True)]
+    return " and ".join(filter(None, blocks)) or place.name
+
+
+def block_in_words(ring: int, slot: int, label: str = "") -> str:
+    """Describe a block by its own label, or else by ring and slot; 0 stands for all of them."""
+    if label and label != f"r{ring:02d}s{slot:02d}":
+        return f"block {label}"
+    return ", ".join(f"{noun} {number}" for noun, number in (("ring", ring), ("slot", slot))
+                     if number)
 
 
 @dataclass(frozen=True)
@@ -234,7 +267,8 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
     """Return gross errors, outliers, the solver's error and position noise as text."""
     found = []
     for error in diagnosis.gross_errors:
-        instead = [" and ".join(other.names) for other in error.alternatives]
+        instead = [" and ".join(other.names) if other.names != error.names else other.text
+                   for other in error.alternatives]
         found.append(OtherFinding(
             " and ".join(error.names), error.convention.text, "gross error",
             f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
@@ -269,6 +303,15 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
     return found
 
 
+def position_in_words(position: PossiblePosition) -> str:
+    """Describe a displacement of the map with its odds."""
+    parts = []
+    for name, values in position.amplitudes.items():
+        lengths = ", ".join(f"{1e3 * value:.1f}" for value in values).replace("-", "−")
+        parts.append(f"({lengths}) mm" if len(values) > 1 else f"{lengths} mm {OUTWARDS[name]}")
+    return f"{' and '.join(parts)} ({100 * position.probability:.0f} %)"
+
+
 def rivals(identified: IdentifiedEffect) -> list[tuple[Candidate, float]]:
     """Return the other effects that the readings cannot distinguish, each at its best place.
 
@@ -296,14 +339,17 @@ def diagnosis_summary(
         "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
         "named" if diagnosis.found_anything else "nothing",
         "gross": [_gross(error) for error in diagnosis.gross_errors],
+        "positions": [asdict(position) for position in diagnosis.positions],
         "outliers": [asdict(outlier) for outlier in diagnosis.outliers],
         "effects": [_entry(effect) for effect in diagnosis.identified],
+        "limits": _limits_entry(diagnosis.limits) if diagnosis.limits else None,
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
         "vibration": asdict(diagnosis.position_noise) if diagnosis.position_noise else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),
                    "after": _groups(diagnosis.groups_after)},
+        "main_field_T": main_field_T(diagnosis), "floor_T": diagnosis.floor_T,
         "scores": {"before": [asdict(fit) for fit in region_scores(
                        diagnosis.before, diagnosis.loo_residuals_before)],
                    "after": [asdict(fit) for fit in region_scores(
@@ -329,6 +375,32 @@ def _unknown_entry(unknown: UnknownCause) -> dict[str, object]:
     """Return the JSON entry of an unknown cause; its key ``as_well`` is the field ``ambiguous``."""
     return {"as_well" if name == "ambiguous" else name: value
             for name, value in asdict(unknown).items()}
+
+
+def _limits_entry(limits: DetectionLimits) -> dict[str, object]:
+    """Return the JSON entry of the smallest changes of a block; null for one without a limit."""
+    def entry(values: Floats) -> dict[str, object]:
+        middle, largest = (float(value) if np.isfinite(value) else None
+                           for value in (np.median(values), values.max()))
+        return {"median": middle, "worst": largest, "worst_block": limits.worst(values)}
+
+    return {"loss": entry(limits.loss), "displacement_m": entry(limits.displacement_m)}
+
+
+def limits_in_words(limits: DetectionLimits) -> str:
+    """Say in a sentence which changes of a block the map would have shown."""
+    def amount(value: float, unit: str, most: float) -> str:
+        return f"{value:.2g} {unit}" if value < most else f"more than {most:g} {unit}"
+
+    parts = []
+    for values, unit, most in ((100 * limits.loss, "%", 100.0),
+                               (1e3 * limits.displacement_m, "mm", MOST_DISPLACED_MM)):
+        parts.append((amount(float(np.median(values)), unit, most),
+                      amount(float(values.max()), unit, most), limits.worst(values)))
+    (loss, most_loss, weak), (moved, most_moved, far) = parts
+    return (f"It would have shown the loss of {loss} of a block's magnetization (median; "
+            f"{most_loss} of block {weak}, which shows least), or its displacement by {moved} in "
+            f"any direction ({most_moved} of block {far}).")
 
 
 def _entry(identified: IdentifiedEffect) -> dict[str, object]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.loo_residuals import DISCOVERIES, ResidualGroup
@@ -20,8 +22,11 @@ from halbach_fe.diagnosis.summary import (
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
+    limits_in_words,
+    main_field_T,
     other_findings,
     place_in_words,
+    position_in_words,
     region_scores,
     rivals,
 )
@@ -51,6 +56,9 @@ FIGURES = {
                        "prior by ring and slot, along and across the easy axis and along the "
                        "magnet")}
 """Function that draws each figure of the page, and its caption."""
+
+SMALL_T = 1e-4
+"""Flux density below which tables give it in µT."""
 
 UNKNOWN_ADVICE = {
     "field": "Look for a source outside the bore, near the point at which the unexplained field is "
@@ -86,6 +94,11 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             f"The map does not tell {_title(effect.hypothesis.effect.name, titles)} from "
             f"{_joined_by_or(_titles(effect, titles))}."
             for effect in diagnosis.identified if rivals(effect)]
+        if diagnosis.positions:
+            sentences.append(
+                "The magnet is the same from several sides, so that the map may be displaced by "
+                f"{_joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
+                "first is used here.")
         unusual = [f"{_title(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                    for effect in diagnosis.identified
                    if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
@@ -104,9 +117,11 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 "many effects together are a fit rather than a diagnosis, and some of them take "
                 "the place of another cause.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
-        start = "Nothing else is missing: with that," if sentences else "Nothing is missing:"
+        start = ("Nothing else is missing that this map can show: with that," if sentences
+                 else "Nothing is missing that this map can show:")
         return [*sentences, f"{start} the map agrees with the study within noise (chi² per reading "
-                f"{after.prior_conflict:.3g})."]
+                f"{after.prior_conflict:.3g}).",
+                *([limits_in_words(diagnosis.limits)] if diagnosis.limits else [])]
     if unknown is not None:
         x, y, z = (f"{1e3 * component:.0f}" for component in unknown.at_m)
         start = ("A single cause outside the catalogue could equally well take the place of all of "
@@ -173,8 +188,28 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
         rows.append({"readings": f"{fit.part}{region}", "count": str(fit.readings)} | {
             name: " → ".join(text(getattr(fits[number], key)) for fits in found)
             for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
-                                    ("median error", "median_relative_error", _percent),
                                     ("95 % band holds", "coverage95", _fraction))})
+    return rows
+
+
+def residual_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Return the rows of a table of rms differences of model and readings by component, as text.
+
+    Training readings have been fitted, held-out readings have not.
+    """
+    shown, main = states(diagnosis), main_field_T(diagnosis)
+    found = [region_scores(state.update, state.loo_residuals) for state in shown]
+    rows = []
+    for number, fit in enumerate(found[-1]):
+        for component, last in fit.rms_T.items():
+            sizes = {state.when: fits[number].rms_T[component]
+                     for state, fits in zip(shown, found, strict=True)}
+            if diagnosis.floor_T:
+                sizes["model-free floor"] = diagnosis.floor_T.get(component, float("nan"))
+            rows.append({"readings": fit.part + (
+                "" if fit.region == ALL_READINGS else f", {fit.region}"), "component": component}
+                | {name: _flux_density(size) for name, size in sizes.items()}
+                | {"ppm of the main field": f"{1e6 * last / main:.3g}"})
     return rows
 
 
@@ -204,7 +239,8 @@ def write_diagnosis_report(
                 "log Bayes factor": finding.factor, "kind": finding.kind}
                for finding in other_findings(diagnosis)]
         + [_entry(effect, titles) for effect in diagnosis.identified],
-        changes=change_table(diagnosis), disagreeing="; ".join(
+        changes=change_table(diagnosis), residuals=residual_table(diagnosis),
+        main_field=_flux_density(main_field_T(diagnosis)), disagreeing="; ".join(
             f"{state.when}: {_disagreement_summary(state.groups)}" for state in states(diagnosis)),
         states=[state.when for state in states(diagnosis)],
         classes=[f"The map would be the same with {_joined_by_or(texts)}."
@@ -306,9 +342,12 @@ def _gain(value: float) -> str:
     return f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
 
 
-def _percent(value: float | None) -> str:
-    """Format a fraction in percent, with two digits."""
-    return EMPTY_CELL if value is None else f"{100 * value:.2g}\u00a0%"
+def _flux_density(value: float) -> str:
+    """Format a flux density in T as mT, or as µT if it is small."""
+    if np.isnan(value):
+        return EMPTY_CELL
+    size, unit = (1e3 * value, "mT") if abs(value) >= SMALL_T else (1e6 * value, "µT")
+    return f"{size:.3g}\u00a0{unit}"
 
 
 def _fraction(value: float) -> str:

@@ -160,6 +160,15 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
         assert after[key]["chi2_per_reading"] == pytest.approx(1.0, abs=0.4)
         assert before[key]["chi2_per_reading"] > 2 * after[key]["chi2_per_reading"]
         assert after[key]["coverage95"] == pytest.approx(0.95, abs=0.06)
+    held = [after["held out", "all"]["rms_T"], before["held out", "all"]["rms_T"]]
+    assert list(held[0]) == ["Bx", "By", "Bz"]
+    # noise of 3e-5 T and what the blocks leave; 48 readings of each component
+    assert all(2e-5 < value < 6e-5 for value in held[0].values())
+    assert max(held[1].values()) > 2 * max(held[0].values())
+    assert 0.1 < found["main_field_T"] < 1
+    assert "µT" in shown.out
+    assert "ppm of the main field" in shown.out
+    assert "median" not in json.dumps(found["scores"])
     assert any(one["p"] < 1e-6 for one in found["groups"]["before"])
     assert all(one["p"] > 1e-4 for one in found["groups"]["after"])
     assert sum(found["probabilities"].values()) == pytest.approx(1)
@@ -203,8 +212,31 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert max(found["probabilities"], key=found["probabilities"].get) == "none"
     assert (out / "study.diagnosed.toml").read_text() == STUDY
     page = (out / "diagnosis.html").read_text()
-    assert "<strong>Nothing is missing:" in page
+    assert "<strong>Nothing is missing that this map can show:" in page
+    assert "It would have shown the loss of" in page
+    loss = found["limits"]["loss"]  # noise of 3e-5 T, 1 % and 1 deg of the blocks
+    assert 0.01 < loss["median"] <= loss["worst"] < 0.5
     assert "before" not in page.split("<h2>How sure")[0]
+
+
+def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):
+    data, out, check = measured(tmp_path, 0.0), tmp_path / "out", tmp_path / "check.json"
+    arguments = ["diagnose", str(study), "--measurements", str(data), "-o", str(out),
+                 "--effects", "gain_x", "--check", str(check)]
+    for wrong in (None, "{}", '{"floor_T": [1, 2]}', '{"floor_T": [1, 2, NaN]}', "["):
+        if wrong is not None:
+            check.write_text(wrong)
+        assert main(arguments) == 4
+        assert "check.json" in capsys.readouterr().err
+    check.write_text('{"floor_T": [4.25e-5, 1.5e-4, 2e-5]}')
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "model-free floor" in shown
+    assert "42.5\u00a0µT" in shown
+    assert "0.15\u00a0mT" in shown
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["floor_T"] == {"Bx": 4.25e-5, "By": 1.5e-4, "Bz": 2e-5}
+    assert "model-free floor" in (out / "diagnosis.html").read_text()
 
 
 def test_a_misread_map_with_outliers(study, tmp_path, capsys):
@@ -298,16 +330,18 @@ def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
 
 def test_the_documentation_says_what_is_in_the_file():
     section = (ROOT / "docs" / "diagnosis.md").read_text()
-    keys = re.findall(r"^\| `([a-z_]+)` \|", section, re.MULTILINE)
+    keys = re.findall(r"^\| `([A-Za-z_]+)` \|", section, re.MULTILINE)
     study = parse_study(tomllib.loads(STUDY))
     update = SimpleNamespace(
         study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
-        relative_error=lambda _: np.zeros(1), prediction_posterior=None)
+        readings=np.zeros(1), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
+        observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
         before=update, after=update, gross_errors=(), outliers=(), identified=(),
         position_noise=None, solver_error=None, unknown=None, found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
-        loo_residuals_after=np.zeros(1), rounds=1, converged=True)
+        loo_residuals_after=np.zeros(1), rounds=1, converged=True, positions=(), limits=None,
+        floor_T=None)
     assert keys == list(diagnosis_summary(nothing))
     assert all(f"`{name}`" in section for name in ERRORS_BY_PLAUSIBILITY)
     rows = [line.split("|") for line in section.splitlines()

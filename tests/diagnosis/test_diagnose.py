@@ -12,8 +12,10 @@ from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
 from halbach_fe.diagnosis.search import _possible
+from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.report.diagnosis import verdict
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
@@ -80,3 +82,22 @@ def test_no_recoil_permeability_is_below_one():
         named = IdentifiedEffect(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
                       SelectedEffect(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
         assert _possible(with_array(recoil_permeability=1.05), [named], CIRCLES) == there
+
+
+def test_sides_that_are_equal_are_told_with_their_odds(session, generator):
+    """Bx of a line beside the axis, which is the same on the other side."""
+    line = np.column_stack([np.zeros((41, 2)), np.linspace(-0.2, 0.2, 41)])
+    data = measured(STUDY, generator, line, at=np.add(line, [0.04, 0.0, 0.0]))
+    data["B_T"].values[:, 1:] = np.nan
+    some = [effect for effect in catalogue() if effect.name in ("wrong_line", "gain_x")]
+    found = diagnose(STUDY, data, session, effects=some)
+    named = next(one for one in found.identified if one.hypothesis.effect.name == "wrong_line")
+    assert found.after.prior_conflict < found.after.conflict_limit
+    across = [position.amplitudes["wrong_line"][0] for position in found.positions]
+    assert min(across) == pytest.approx(-max(across), abs=5e-3)
+    assert sum(position.probability for position in found.positions) == pytest.approx(1)
+    # the magnet is symmetric: neither side can be sure
+    assert max(position.probability for position in found.positions) < 0.9
+    assert abs(named.values[0]) == pytest.approx(0.04, abs=4 * named.sd[0])
+    assert "The magnet is the same from several sides" in " ".join(verdict(found))
+    assert len(diagnosis_summary(found)["positions"]) == len(found.positions) > 1

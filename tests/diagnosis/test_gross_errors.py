@@ -175,3 +175,53 @@ def test_what_no_error_explains_is_not_named(right, generator):
     assert find_gross_errors(STUDY, field_map(CIRCLES, right["B_T"].values[order])) == ()
     other = measured(with_array(inner_radius_m=0.12, outer_radius_m=0.17), generator)
     assert find_gross_errors(STUDY, other) == ()
+
+
+LINE = np.column_stack([np.zeros((41, 2)), np.linspace(-0.2, 0.2, 41)])
+
+
+@pytest.mark.parametrize("shift", [(0.04, 0.0, 0.0), (0.0, 0.04, 0.0)])
+def test_sides_that_one_component_does_not_tell_apart(generator, shift):
+    """Bx is the same on both sides of the axis: all are told, the true one among them."""
+    data = measured(STUDY, generator, LINE, at=LINE + np.array(shift))
+    data["B_T"].values[:, 1:] = np.nan
+    (found,) = find_gross_errors(STUDY, data)
+    assert found.names == ("wrong_line",)
+    sides = np.array([start["wrong_line"] for start in found.starts])
+    # along the axis every displacement is sharp; across, Bx of blocks of 1 % is flat
+    assert np.abs(sides[:, 2]).max() < 1e-3
+    along = sides[:, int(np.argmax(shift))]
+    assert max(np.abs(along - 0.04).min(), np.abs(along + 0.04).min()) < 4e-3
+    assert found.convention not in found.alternatives
+
+
+def test_a_side_that_three_components_tell(generator):
+    """Negative control: Bz is opposite on the other side."""
+    data = measured(STUDY, generator, LINE, at=np.add(LINE, [0.04, 0.0, 0.0]))
+    (found,) = find_gross_errors(STUDY, data)
+    assert found.alternatives == ()
+    assert found.convention.shift_m == pytest.approx((0.04, 0.0, 0.0), abs=2e-3)
+
+
+def test_an_error_is_not_its_own_alternative(generator):
+    """On the axis a wrong sign of x changes no position, and is that of Bx alone."""
+    data = measured(STUDY, generator, LINE)
+    (found,) = find_gross_errors(STUDY, field_map(LINE, data["B_T"].values * [-1, 1, 1]))
+    assert found.names == ("sign_flipped_axis",)
+    read = [in_si_and_magnet_axes(each.apply(STUDY).instrument, data)
+            for each in (found.convention, *found.alternatives) if each.magnet is None]
+    assert len({(each["B_T"].values.tobytes(), points_of(each).tobytes()) for each in read}) == len(
+        read)
+
+
+@pytest.mark.parametrize("lacking", [1, 2])
+def test_a_wrong_block_is_not_another_number_of_rings(generator, lacking):
+    """In millimetres, with one of eight blocks of a ring missing or upside down."""
+    study = with_array(blocks_per_ring=8, rings=2, block={"shape": "sector"})
+    blocks, points = build_magnet(study).blocks, CIRCLES * [0.9, 0.9, 0.4]
+    true = field_of(blocks, points) - lacking * field_of(blocks[3:4], points)
+    data = field_map(1e3 * points, true + 5e-5 * generator.standard_normal(true.shape))
+    (found,) = find_gross_errors(study, data)
+    assert found.names == ("millimetres",)
+    assert found.misfit_after > 0.05  # by itself it would not have been believed
+    assert find_gross_errors(found.apply(study), data) == ()

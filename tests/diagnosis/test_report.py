@@ -12,7 +12,7 @@ from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
-from halbach_fe.diagnosis.result import UnknownCause
+from halbach_fe.diagnosis.result import Hypothesis, UnknownCause
 from halbach_fe.diagnosis.summary import (
     amounts,
     diagnosis_summary,
@@ -154,8 +154,26 @@ def test_numbers_for_people(flat):
     assert human_unit(Parameter("factor", "1", 1.0)) == ("", 1.0)
     assert human_unit(Parameter("spin", "furlong", 1.0)) == ("furlong", 1.0)
     assert place_in_words(Place(2, 11)) == "ring 2, slot 11"
+    assert place_in_words(Place(2, 0)) == "ring 2"
     assert place_in_words(Place(at_m=(0.5,))) == "at 0.5 m"
     assert place_in_words(Place()) == ""
+
+
+def test_both_of_two_swapped_blocks_are_named(flat):
+    found, _ = flat
+    one, swapped = found.identified[0], EFFECTS["blocks_swapped"]
+    place = Place(1, 3, other=(1, 12), labels=("r01s03", "r01s12"))
+    candidate = Candidate("blocks_swapped", place.name, (0,), is_binary=True)
+    both = replace(found, identified=(replace(
+        one, hypothesis=Hypothesis(swapped, place), values=np.ones(1), sd=np.zeros(1),
+        selection=replace(one.selection, candidate=candidate, alternatives=())),))
+    words = "ring 1, slot 3 and ring 1, slot 12"
+    assert words in verdict(both)[0]
+    assert found_table(both)[0]["place"] == words
+    assert diagnosis_summary(both)["effects"][0]["place"] == "r01s03, r01s12"
+    assert "r01s03, r01s12" in note(both.identified[0])
+    own = Place(1, 3, other=(1, 4), labels=("A7", "r01s04"))  # a free block has its own label
+    assert place_in_words(own) == "block A7 and ring 1, slot 4"
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)

@@ -1,0 +1,109 @@
+"""The smallest change of a block that a map would have shown.
+
+A change of known size makes the log Bayes factor of its effect rise with the square of the
+amplitude, by the information matrix of its signatures with the blocks integrated out. The limit is
+the amplitude at which the posterior odds pass the threshold of naming, without noise: about half of
+all changes of that size would be named, and nearly all of half again as much.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import Effect, each_block
+from halbach_fe.diagnosis.effects.block_demagnetized import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.block_displaced import BlockDisplacedEffect
+from halbach_fe.diagnosis.model_selection import (
+    DETECTION_LOG_ODDS,
+    EFFECT_PRIOR_ODDS,
+    WIDE_PRIOR_SD,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.diagnosis.result import DetectionLimits
+from halbach_fe.diagnosis.search import marginal_of
+from halbach_fe.inference.result import InferenceResult
+from halbach_fe.measurement.instrument import probe_points
+from halbach_fe.study.model import Study
+
+BLOCKS_AT_ONCE = 100
+"""Number of blocks whose signatures are kept at a time, to bound their memory."""
+
+
+def detection_limits(
+    update: InferenceResult, times: Floats, columns: Floats
+) -> DetectionLimits | None:
+    """Return the smallest changes of single blocks that the training readings would have shown.
+
+    Parameters
+    ----------
+    update : InferenceResult
+        The inference with the identified effects in the model.
+    times : ndarray, shape (n,)
+        Time of each point of the map.
+    columns : ndarray, shape (rows, k)
+        Whitened signatures of the identified effects per prior standard deviation, whose amplitudes
+        are free.
+
+    Returns
+    -------
+    DetectionLimits or None
+        None if no block is magnetized.
+    """
+    places = each_block(update.study)
+    if not places:
+        return None
+    whitened, _, marginal, _ = marginal_of(update)
+    points = probe_points(update.study.instrument, update.observation.map_points)
+    nominal = NominalFields(update.study, points, times, _not_solved)
+    threshold = DETECTION_LOG_ODDS - float(np.log(EFFECT_PRIOR_ODDS / len(places)))
+
+    def limits(effect: Effect, count: int) -> Floats:
+        """Return the limits (places,) of an effect by its first ``count`` parameters."""
+        sd, found = effect.parameters[0].sd, []
+        for first in range(0, len(places), BLOCKS_AT_ONCE):
+            signatures = [sd * whitened(update.observation.read(
+                effect.signature(nominal, place)[:count]))
+                for place in places[first:first + BLOCKS_AT_ONCE]]
+            evidence = marginal.evidence(np.hstack([columns, *signatures]),
+                                         np.zeros(len(columns))).given(range(columns.shape[1]))
+            for number in range(len(signatures)):
+                own = slice(columns.shape[1] + count * number, columns.shape[1] + count * (
+                    number + 1))
+                found.append(sd * smallest_amplitude(evidence.information[own, own], threshold))
+        return np.array(found)
+
+    return DetectionLimits(
+        tuple(place.name for place in places), limits(BlockDemagnetizedEffect(), 1),
+        limits(BlockDisplacedEffect(), update.magnet.dimension))
+
+
+def smallest_amplitude(information: Floats, threshold: float) -> float:
+    """Return the amplitude at which the log Bayes factor of an effect passes a threshold.
+
+    Parameters
+    ----------
+    information : ndarray, shape (k, k)
+        Of its signatures, per prior standard deviation of their amplitudes. The amplitudes are in
+        the direction in which they are least visible.
+    threshold : float
+
+    Returns
+    -------
+    float
+        In prior standard deviations; infinite if the readings show nothing of the effect.
+    """
+    visible = np.maximum(np.linalg.eigvalsh(information), 0.0)
+    if visible[0] <= np.finfo(float).eps * visible[-1] or not visible[-1]:
+        return float("inf")
+    found = []
+    for precision in (1.0, WIDE_PRIOR_SD**-2):  # both priors have the probability 1/2
+        gain = visible[0]**2 / (visible[0] + precision)
+        cost = threshold + float(np.log(2) + np.log1p(visible / precision).sum() / 2)
+        found.append(float(np.sqrt(2 * cost / gain)))
+    return min(found)
+
+
+def _not_solved(study: Study) -> Floats:
+    """Take the place of a solver: changes of single blocks need their field in vacuum only."""
+    raise AssertionError(f"study {study.name} was not to be solved")
