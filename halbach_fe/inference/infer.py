@@ -14,7 +14,13 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsi
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.inference.instrument_fit import Beside, OpenTerms, joined, of_the_first
+from halbach_fe.inference.instrument_fit import (
+    Beside,
+    Linearization,
+    OpenTerms,
+    joined,
+    of_the_first,
+)
 from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.inference.result import InferenceResult, InstrumentTerms, Prediction
@@ -103,22 +109,25 @@ def infer(
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
     maps = maps_of(magnet.study, data, validation_map)
     open_terms = OpenTerms.of(maps)
-    total, at_rest = np.zeros(len(open_terms)), not len(open_terms)
+    total = np.zeros(len(open_terms))
+    solved: tuple[Response, Linearization | None] | None = None
     for _ in range(ROUNDS):
         readings = read_campaign(magnet, maps)
         training = readings.training
-        try:
-            model = response_matrix(magnet, readings.observation, session)
-        except PointsOutsideError as error:
-            raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
+        here = open_terms.linearized(magnet, maps, readings, session.within(
+            "instrument")) if len(open_terms) else None
+        if solved is None or here is None or solved[1] is None or not here.is_near(
+                solved[1], float(readings.noise.sd.min())):
+            solved = _response(magnet, readings.observation, session), here
+        model = solved[0]
         varying = len(model.parameters) - len(magnet.parameter_names)
         magnet_prior = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
                                  else study_prior(magnet, varying))
         matrix: Rows = model.matrix
         whole_prior = magnet_prior
-        if len(open_terms):
-            matrix = Beside(model.matrix, open_terms.columns(
-                magnet, maps, readings, session.within("instrument")))
+        if here is not None and solved[1] is not None:
+            model = replace(model, offset=model.offset + here.nominal - solved[1].nominal)
+            matrix = Beside(model.matrix, here.columns)
             whole_prior = joined(magnet_prior, -total, open_terms.sd)
         residual = readings.values - model.offset
         errors = readings.noise.with_independent_errors(model.error)
@@ -166,6 +175,14 @@ def infer(
                               at_rest)
         if len(open_terms) else None,
         overlaps=overlaps(matrix, residual, errors, whole_prior, readings))
+
+
+def _response(magnet: Magnet, observation: Observation, session: Session) -> Response:
+    """Return the response of all readings to the magnetizations."""
+    try:
+        return response_matrix(magnet, observation, session)
+    except PointsOutsideError as error:
+        raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
 
 
 def _with_instruments(study: Study, maps: Sequence[Map]) -> Study:

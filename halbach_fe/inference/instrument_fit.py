@@ -18,7 +18,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.readings import Readings
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, map_time, sensor_positions
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    map_time,
+    sensor_matrix,
+    sensor_positions,
+)
 from halbach_fe.measurement.instrument_terms import (
     APART,
     NAMES,
@@ -27,6 +32,7 @@ from halbach_fe.measurement.instrument_terms import (
     by_terms,
     field_at_sensors,
     prior_sd,
+    seen,
     with_terms,
 )
 from halbach_fe.solver.formulation_choice import field_function
@@ -34,6 +40,10 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows
 from halbach_fe.study.measurement import Instrument
+
+DEVIATION = 0.05
+"""Deviations of the blocks relative to their magnetization. A response matrix is kept as long as a
+shift of the sensors changes the field of such deviations by less than the noise."""
 
 
 @dataclass(frozen=True)
@@ -99,25 +109,55 @@ class OpenTerms:
         own = np.where(place >= 0, changes[place], 0.0)
         return with_terms(one.study.instrument, one.middle_m, own)
 
-    def columns(
+    def linearized(
         self, magnet: Magnet, maps: Sequence[Map], readings: Readings, session: Session
-    ) -> Floats:
-        """Return the derivatives (readings, terms) of all readings by the open terms."""
+    ) -> Linearization:
+        """Return how the readings of the nominal magnet depend on the open terms."""
         field = field_function(magnet, session)
-        parts = []
+        nominal, columns, steepness = [], [], []
         for one, place in zip(maps, self.places, strict=True):
-            own = np.zeros((3 * one.data.sizes["point"], len(self)))
-            if (place >= 0).any():
-                instrument = one.study.instrument
-                data = in_si_and_magnet_axes(instrument, one.data)
-                points = points_of(data)
-                at_sensors, gradient = field_at_sensors(field, sensor_positions(instrument, points))
-                found = by_terms(instrument, points, one.middle_m, map_time(data), at_sensors,
-                                 gradient)
-                own[:, place[place >= 0]] = found.reshape(len(own), -1)[:, place >= 0]
-            parts.append(own)
-        return readings.observation.read(
-            np.concatenate(parts).T.reshape(len(self), -1, 3)).T
+            instrument = one.study.instrument
+            data = in_si_and_magnet_axes(instrument, one.data)
+            points = points_of(data)
+            at_sensors, gradient = field_at_sensors(field, sensor_positions(instrument, points))
+            found = by_terms(instrument, points, one.middle_m, map_time(data), at_sensors, gradient)
+            own = np.zeros((3 * len(points), len(self)))
+            own[:, place[place >= 0]] = found.reshape(len(own), -1)[:, place >= 0]
+            columns.append(own)
+            nominal.append(seen(sensor_matrix(instrument), at_sensors))
+            steepness.append(gradient.reshape(-1, 9))
+        read = readings.observation.read
+        return Linearization(
+            readings.observation.points, read(np.concatenate(nominal)),
+            read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T,
+            float(np.sqrt(np.mean(np.sum(np.concatenate(steepness)**2, axis=1)))))
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Readings of the nominal magnet about some terms of the instruments.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), in m
+        Places of the sensors.
+    nominal : ndarray, shape (readings,), in T
+        Readings of the nominal magnet, without offset and drift.
+    columns : ndarray, shape (readings, terms)
+        Derivatives by the terms.
+    steepness : float, in T/m
+        Rms gradient of the field at the sensors.
+    """
+
+    points: Floats
+    nominal: Floats
+    columns: Floats
+    steepness: float
+
+    def is_near(self, other: Linearization, sigma_T: float) -> bool:
+        """Tell whether the same response matrix serves both for a noise of ``sigma_T``."""
+        moved = float(np.abs(self.points - other.points).max())
+        return moved * self.steepness * DEVIATION < sigma_T
 
 
 @dataclass(frozen=True)
