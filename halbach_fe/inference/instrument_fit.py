@@ -114,7 +114,7 @@ class OpenTerms:
     ) -> Linearization:
         """Return how the readings of the nominal magnet depend on the open terms."""
         field = field_function(magnet, session)
-        nominal, columns, steepness = [], [], []
+        nominal, columns, sensors, steepness = [], [], [], []
         for one, place in zip(maps, self.places, strict=True):
             instrument = one.study.instrument
             data = in_si_and_magnet_axes(instrument, one.data)
@@ -125,12 +125,12 @@ class OpenTerms:
             own[:, place[place >= 0]] = found.reshape(len(own), -1)[:, place >= 0]
             columns.append(own)
             nominal.append(seen(sensor_matrix(instrument), at_sensors))
-            steepness.append(gradient.reshape(-1, 9))
+            sensors.append(sensor_positions(instrument, points).reshape(-1, 3))
+            steepness.append(np.linalg.norm(gradient.reshape(-1, 9), axis=1))
         read = readings.observation.read
         return Linearization(
-            readings.observation.points, read(np.concatenate(nominal)),
-            read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T,
-            float(np.sqrt(np.mean(np.sum(np.concatenate(steepness)**2, axis=1)))))
+            np.concatenate(sensors), np.concatenate(steepness), read(np.concatenate(nominal)),
+            read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T)
 
 
 @dataclass(frozen=True)
@@ -139,25 +139,25 @@ class Linearization:
 
     Attributes
     ----------
-    points : ndarray, shape (n, 3), in m
-        Places of the sensors.
+    sensors : ndarray, shape (n, 3), in m
+        Places of all sensors.
+    steepness : ndarray, shape (n,), in T/m
+        Norm of the gradient there.
     nominal : ndarray, shape (readings,), in T
         Readings of the nominal magnet, without offset and drift.
     columns : ndarray, shape (readings, terms)
         Derivatives by the terms.
-    steepness : float, in T/m
-        Rms gradient of the field at the sensors.
     """
 
-    points: Floats
+    sensors: Floats
+    steepness: Floats
     nominal: Floats
     columns: Floats
-    steepness: float
 
     def is_near(self, other: Linearization, sigma_T: float) -> bool:
         """Tell whether the same response matrix serves both for a noise of ``sigma_T``."""
-        moved = float(np.abs(self.points - other.points).max())
-        return moved * self.steepness * DEVIATION < sigma_T
+        moved = np.linalg.norm(self.sensors - other.sensors, axis=1)
+        return float((moved * self.steepness).max()) * DEVIATION < sigma_T
 
 
 @dataclass(frozen=True)
