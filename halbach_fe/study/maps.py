@@ -25,8 +25,8 @@ class InstrumentSd(StudyModel):
     ``translation_m`` is the standard deviation of the place of the map's middle along each axis of
     the magnet, ``rotation_rad`` that of the turn of the map about each axis through its middle. The
     others are those of each component of the instrument's keys of the same name. State what was
-    known without the map: 1e-3 and 0.01 for a pose that `halbach-fe register` found, so that the
-    same readings are not counted twice.
+    known without the map, for a pose that `halbach-fe register` found some millimetres and 0.01, so
+    that the same readings are not counted twice.
     """
 
     translation_m: PositionSd = 0.0
