@@ -766,8 +766,8 @@ class _State:
         information = derivative.T @ projected + np.diag(self.prior_sd**-2)
         inverse = np.linalg.inv(information)
         uphill = derivative.T @ left - scaled / self.prior_sd
-        step = inverse @ uphill if damping is None else np.linalg.solve(
-            information + np.diag(damping), uphill)
+        step = inverse @ uphill if damping is None else np.asarray(np.linalg.solve(
+            information + np.diag(damping), uphill), np.float64)
         return step, np.sqrt(np.diag(inverse)), float(residual @ left + scaled @ scaled)
 
     def chi2(self, rows: NDArray[np.bool_], scaled: Floats) -> float:
