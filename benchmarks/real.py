@@ -88,7 +88,9 @@ def faser(note: Note) -> None:
         write_map(field_map(np.column_stack([0 * z, 0 * z, z]),
                             np.column_stack([measured, unread, unread])), folder / "map.csv")
         _do("register", STUDIES / "faser" / "profile.toml", "--measurements", folder / "map.csv",
-            "--fit", "instrument.z_scale=0.05", "--turn-rad", "0.02", "-o", folder / "pose")
+            "--fit", "instrument.z_scale=0.05", "--turn-rad", "0.02",
+            "--most", "1",  # equal poses predict the same
+            "-o", folder / "pose")
         _do("infer", folder / "pose" / "study.registered.toml", "--measurements",
             folder / "map.csv", "-o", folder / "inferred")
         with (folder / "inferred" / "prediction.csv").open() as file:

@@ -39,6 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alternative", type=_open_keys, action="append", default=[],
                         metavar="KEY=SD,...", help="other numbers that may be open in place of "
                         "those of --fit; their odds are compared; can be given several times")
+    parser.add_argument("--most", type=common.positive, metavar="N",
+                        help="largest number of poses that are fitted with the blocks (default: "
+                        "4, or 8 on a line, of those that the search finds)")
     parser.add_argument("--across-m", type=common.positive_number, metavar="SD",
                         help="prior standard deviation of the map's distance from the axis, for a "
                         "map that does not determine it (default: the blocks' outer radius)")
@@ -80,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_campaign(arguments, study, text, data, say)
     with common.session(arguments) as session:
         found = register(build_magnet(study), data, session, open_keys=arguments.fit,
-                         alternatives=arguments.alternative,
+                         alternatives=arguments.alternative, most=arguments.most,
                          pose=PosePrior(arguments.across_m, arguments.turn_rad), say=say)
     write_registration(study, text, data, found, arguments.output, common.digests({
         "study file": arguments.study, "measurements": arguments.measurements}))

@@ -341,12 +341,18 @@ def register(
             "map", "registration", "one that fits into the bore, or beside the magnet",
             "points inside blocks in every likely pose", "Check its unit of length."))
     found: list[Registration] = []
+    by_fit: list[list[Registration]] = []
     for fit in fits:
-        own: list[Registration] = []
+        by_fit.append([])
         for number, start in enumerate(starts):
             say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
                 + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
-            own.append(fit.refined(start))
+            by_fit[-1].append(fit.refined(start))
+    best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
+    for fit, own in zip(fits, by_fit, strict=True):
+        # no hypothesis shall lose because it came to rest somewhere else
+        if not any(each is best for each in own):
+            own.append(fit.refined(np.append(best.middle_m, best.instrument.rotation_rad)))
         own.sort(key=lambda each: -each.log_evidence)
         found += [each for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]

@@ -120,7 +120,7 @@ def answers_of(pose: PosePrior, data: xr.Dataset, session: Session) -> list[Answ
     found = register(
         build_magnet(read_study(STUDY)), data, session, open_keys=own[0].open_keys,
         alternatives=[each.open_keys for each in own[1:]], pose=pose, most=1, say=common.say)
-    by_keys = {frozenset(each.open_keys): each for each in found}
+    by_keys = {frozenset(each.open_keys): each for each in reversed(found)}  # the best of each
     answers = []
     for each in own:
         registration = by_keys[frozenset(key.key for key in each.open_keys)]
