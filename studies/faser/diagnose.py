@@ -144,7 +144,7 @@ def hypothesis_table(answers: list[Answer], published: PublishedErrors) -> list[
             found.middle_m[:2], found.translation_sd_m[:2], strict=True))
         fringe, homogeneous = each.medians()
         rows.append({
-            "a profile of": each.hypothesis.name, "odds": f"{100 * probability:.2g} %",
+            "a profile of": each.hypothesis.name, "odds": f"{100 * probability:.3g} %",
             "fringe": f"{fringe:.3f}", "homogeneous": f"{homogeneous:.1e}",
             "chi²/reading": f"{found.chi2:.3g}",
             "x, y in mm": f"{x}, {y}" if each.hypothesis.pose is ANYWHERE else "0, 0",
@@ -211,13 +211,14 @@ def sentences(best: Answer, poses: list[Registration], answers: list[Answer],
     said = [
         f"The published profile is not that of the axis. It is the profile of B_x on a line "
         f"beside the axis, {radius:.1f} ± {radius_sd:.1f} mm from it and about {angle:.0f}° from "
-        f"the direction of the field: a line of the mapper's circles of "
+        f"the direction of the field, as are the mapper's circles of "
         f"{1e3 * MAPPER_RADIUS_M:.0f} mm.",
         f"So read, the median relative error of held-out readings in the fringe field falls from "
         f"{paper[0]:.2f} in the paper to {here[0]:.3f}, and in the homogeneous field from "
         f"{paper[1]:.1e} to {here[1]:.1e}.",
         f"The best answer on the axis, {axis.hypothesis.name.partition('; ')[2]}, is less probable "
-        f"by a factor of 10^{log_odds:.0f}, and leaves {axis.medians()[0]:.3f} in the fringe.",
+        f"by a factor of 10^{log_odds:.0f}, and leaves {axis.medians()[0]:.3f} in the fringe, with "
+        f"blocks bent to chi² of {axis.registration.chi2:.2g} per reading.",
     ]
     line = fitted[0]
     others = [f"{each.reading.name} by a factor of "
