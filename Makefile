@@ -4,7 +4,7 @@
 # make verify-calibration  are the posteriors as sure as they may be?
 # make verify-diagnosis    are hidden effects found, and only those?
 # make study-faser           the published profile, and the synthetic twin of the whole campaign
-# make study-faser-diagnosis what the model lacks, by the published profile
+# make study-faser-diagnosis what the published profile is a profile of, and what is left
 # make study-linear-3d       the paper's linear validation: 576 magnetizations from a map of the bore
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke

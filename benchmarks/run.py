@@ -32,8 +32,8 @@ RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
-         "real": real.emphatic, "real_mri": real.mri}
-ALONE = ("recovery", "scaling", "moments", "iron3d", "real", "real_mri")
+         "real": real.emphatic, "real_mri": real.mri, "faser": real.faser}
+ALONE = ("recovery", "scaling", "moments", "iron3d", "real", "real_mri", "faser")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -2,11 +2,11 @@
 
 Needs no first guess: every rotation by right angles and every place along the axis is tried, then
 pose and probe are fitted together with the blocks. Numbers that a drawing leaves open can be fitted
-too. Writes study.registered.toml (the study's own file with the instrument and these numbers),
-registration.json, registration.html and its figure. A symmetric magnet allows several poses, all of
-which are reported with their odds; the file has the most probable one. If the study lists maps,
-they are registered one after the other, each in the magnet as those before it have updated it, and
-each gets a folder with its own page.
+too, and sets of them are compared with --alternative. Writes study.registered.toml (the study's own
+file with the instrument and these numbers), registration.json, registration.html and its figure. A
+symmetric magnet allows several poses, all of which are reported with their odds; the file has the
+most probable one. If the study lists maps, they are registered one after the other, each in the
+magnet as those before it have updated it, and each gets a folder with its own page.
 """
 
 from __future__ import annotations
@@ -34,7 +34,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="measured field map (CSV or HDF5), unless the study lists maps")
     parser.add_argument("--fit", type=_open_key, action="append", default=[], metavar="KEY=SD",
                         help="a number of the study that is open, with its standard deviation, "
-                        "such as array.remanence_T=0.02; can be given several times")
+                        "such as array.remanence_T=0.02, or instrument.z_scale=0.02 for the "
+                        "step of the map; can be given several times")
+    parser.add_argument("--alternative", type=_open_keys, action="append", default=[],
+                        metavar="KEY=SD,...", help="other numbers that may be open in place of "
+                        "those of --fit; their odds are compared; can be given several times")
+    parser.add_argument("--most", type=common.positive, metavar="N",
+                        help="largest number of poses that are fitted with the blocks (default: "
+                        "4, or 8 on a line, of those that the search finds)")
+    parser.add_argument("--across-m", type=common.positive_number, metavar="SD",
+                        help="prior standard deviation of the map's distance from the axis, for a "
+                        "map that does not determine it (default: the blocks' outer radius)")
+    parser.add_argument("--turn-rad", type=common.positive_number, metavar="SD", default=0.1,
+                        help="prior standard deviation of the map's turns from right angles, for a "
+                        "map that does not determine them (default: %(default)s)")
 
 
 def _open_key(text: str) -> OpenKey:
@@ -51,10 +64,14 @@ def _open_key(text: str) -> OpenKey:
     return OpenKey(key, value)
 
 
+def _open_keys(text: str) -> list[OpenKey]:
+    return [_open_key(part.strip()) for part in text.split(",")]
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Register the map, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.inference.registration import register
+    from halbach_fe.inference.registration import PosePrior, register
     from halbach_fe.report.registration import registration_summary, write_registration
     from halbach_fe.study.reader import read_study
 
@@ -65,7 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(data, dict):
         return _run_campaign(arguments, study, text, data, say)
     with common.session(arguments) as session:
-        found = register(build_magnet(study), data, session, open_keys=arguments.fit, say=say)
+        found = register(build_magnet(study), data, session, open_keys=arguments.fit,
+                         alternatives=arguments.alternative, most=arguments.most,
+                         pose=PosePrior(arguments.across_m, arguments.turn_rad), say=say)
     write_registration(study, text, data, found, arguments.output, common.digests({
         "study file": arguments.study, "measurements": arguments.measurements}))
     if arguments.json:

@@ -6,16 +6,24 @@ middle from the axes of the map to those of the magnet.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import permutations, product
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.line_search import along_the_axis, line_of, poses_along
+from halbach_fe.inference.pose_space import (
+    Field,
+    misfit_of,
+    moved_by,
+    right_angles,
+    same_pose,
+    share_of,
+)
 from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
@@ -44,14 +52,15 @@ MIRROR = np.array([1.0, 1.0, -1.0])
 """Factors of the coordinates of a mirror image. A magnetic field is an axial vector: those of its
 components are the opposite."""
 
-SAME_M, SAME_RAD = 1e-3, 0.02
-"""Candidates that differ by less are one: in m, and in rad."""
-
 MOST_POSES = 4
 """Largest number of poses that are fitted with the magnet's own model."""
 
-LONGEST_M, LONGEST_RAD = 5e-3, 0.05
-"""Longest step of a fit, along a direction and about it."""
+MOST_OF_A_LINE = 8
+"""The same of a map on a line. A component that is even in x, y and z, as in an ideal dipole, is
+the same on four lines in two directions."""
+
+NARROW = 0.02
+"""Width up to which a map lies on a line, in units of the bore's radius."""
 
 ITERATIONS = 12
 """Largest number of steps of the improvement of a candidate."""
@@ -59,20 +68,10 @@ ITERATIONS = 12
 DIFFERENCE_M = 2e-4
 """Step of finite differences."""
 
-Field = Callable[[Floats], Floats]
-"""Takes points (n, 3) in m and returns B (n, 3) in T."""
-
-
-def right_angles() -> list[Floats]:
-    """Return the 24 rotation matrices that bring axes to axes."""
-    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3))
-             for signs in product((1.0, -1.0), repeat=3)]
-    proper = [matrix for matrix in found if np.linalg.det(matrix) > 0]
-    return sorted(proper, key=lambda matrix: -float(np.trace(matrix)))
-
 
 def coarse_poses(
-    magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_]
+    magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_],
+    across_m: float = np.inf,
 ) -> list[Floats]:
     """Return poses (6,), the best first: where the map's middle lies in m, and a rotation vector.
 
@@ -85,17 +84,20 @@ def coarse_poses(
         In m and T; NaN for components that were not measured.
     training : ndarray of bool, shape (n, 3)
         The readings that may be used.
+    across_m : float, optional
+        Prior standard deviation of the middle's distance from the axis along x and y.
     """
     rows = np.flatnonzero(training.any(axis=1))
     used = np.where(training, readings, 0.0)
     if not len(rows) or not used.any():
         raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
     points = points - middle_of(points)
-    improved = _searched(magnet, points, used, training, rows)
+    line = line_of(points[rows], NARROW * magnet.bore_radius)
+    improved = _searched(magnet, points, used, training, line, across_m)
     best = improved[0][0]
     size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
-    if best > SUSPICIOUS * size:
-        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training, rows)[0][0]
+    if line is None and best > SUSPICIOUS * size:  # a line is its own mirror image
+        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training)[0][0]
         if mirrored < best / MIRRORED:
             raise MeasurementError(must_be(
                 "map", "registration", "that of the study's magnet",
@@ -107,62 +109,73 @@ def coarse_poses(
             "map", "registration", "one that some pose of the magnet explains",
             f"{best / size:.0%} of its field unexplained in the best one",
             "Check the axes and signs of its columns with halbach-fe check."))
-    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:MOST_POSES]
+    most = MOST_POSES if line is None else MOST_OF_A_LINE
+    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:most]
 
 
 def _searched(
-    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_], rows: Ints
+    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_],
+    line: Floats | None = None, across_m: float = np.inf,
 ) -> list[tuple[float, Floats]]:
     """Return the rms residuals in T of poses, and these, the best first.
 
-    Points (n, 3) in m are about their middle; ``rows`` are those with readings that may be used,
-    and ``used`` (n, 3) the readings, 0 where they may not.
+    Points (n, 3) in m are about their middle; ``used`` (n, 3) are the readings, 0 where they may
+    not be used; ``line`` (3,) is the direction of the line on which they lie, if they do.
     """
+    vacuum = field_in_vacuum(magnet.blocks)
+    improved = [] if line is None else poses_along(
+        magnet, vacuum, points, used, training, line, across_m)
+    rotations = [matrix for matrix in right_angles()
+                 if line is None or not along_the_axis(matrix, line)]
+    improved += _on_the_axis(magnet, vacuum, points, used, training, rotations,
+                             improved[0][0] if improved else np.inf)
+    if not improved:
+        raise MeasurementError(must_be(
+            "map", "registration", "one that fits into the bore, or beside the magnet",
+            f"points over {', '.join(f'{1e3 * size:.0f}' for size in np.ptp(points, axis=0))} mm, "
+            "which lie inside blocks in every likely pose",
+            "Check its unit of length, and the study's radii."))
+    return sorted(improved, key=lambda each: each[0])
+
+
+def _on_the_axis(
+    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
+    rotations: Sequence[Floats], known: float,
+) -> list[tuple[float, Floats]]:
+    """Return misfits in T and poses (6,) to which least squares leads from places on the axis.
+
+    ``known`` is the misfit in T of the best pose that is known already.
+    """
+    rows = np.flatnonzero(training.any(axis=1))
     few, more = (rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
                  for count in (COARSE_POINTS, MIDDLE_POINTS))
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
-    shifts = np.linspace(-reach, reach, steps)
-    scores, vacuum = [], field_in_vacuum(magnet.blocks)
-    for matrix in right_angles():
+    scores = []
+    for matrix in rotations:
         turned = points[few] @ matrix.T
-        places = (turned[None] + np.outer(shifts, [0, 0, 1])[:, None]).reshape(-1, 3)
-        inside = np.any(magnet.contains(places).reshape(len(shifts), -1), axis=1).tolist()
-        fields = vacuum(places).reshape(len(shifts), -1, 3) @ matrix
-        for shift, field, hit in zip(shifts, fields, inside, strict=True):
-            if not hit:
-                scores.append((_misfit(field, used[few], training[few])[0], shift, matrix))
-    if not scores:
-        raise MeasurementError(must_be(
-            "map", "registration", "one that fits into the bore, or beside the magnet",
-            f"points over {', '.join(f'{1e3 * size:.0f}' for size in np.ptp(points, axis=0))} mm",
-            "Check its unit of length, and the study's radii."))
+        shifts = np.linspace(-reach, reach, steps)
+        places = turned[None] + np.outer(shifts, [0, 0, 1])[:, None]
+        inside = magnet.contains(places.reshape(-1, 3)).reshape(len(shifts), -1).any(axis=1)
+        shifts, places = shifts[~inside], places[~inside]
+        if not len(shifts):
+            continue
+        fields = vacuum(places.reshape(-1, 3)).reshape(len(shifts), -1, 3) @ matrix
+        scores += [(misfit_of(field, used[few], training[few])[0], shift, matrix)
+                   for shift, field in zip(shifts, fields, strict=True)]
     scores.sort(key=lambda each: each[0])
     improved: list[tuple[float, Floats]] = []
     tried: dict[bytes, int] = {}
     for rough, shift, matrix in scores:
         key = matrix.tobytes()
         tried[key] = tried.get(key, 0) + 1
-        if rough > WORTH_TRYING * scores[0][0] or tried[key] > CANDIDATES:
+        if rough > WORTH_TRYING * min(scores[0][0], known) or tried[key] > CANDIDATES:
             continue
         pose = np.concatenate([[0.0, 0.0, shift], Rotation.from_matrix(matrix).as_rotvec()])
         misfit, pose = _improved(magnet, vacuum, pose, points[more], used[more], training[more])
-        if misfit is not None and not any(_same(pose, other) for _, other in improved):
+        if misfit is not None and not any(same_pose(pose, other) for _, other in improved):
             improved.append((misfit, pose))
-    if not improved:
-        raise MeasurementError(must_be("map", "registration", "one that fits into the bore",
-                                       "points inside blocks in every likely pose"))
-    return sorted(improved, key=lambda each: each[0])
-
-
-def _misfit(
-    field: Floats, readings: Floats, training: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Return the rms in T of readings less a field times the best positive factor, and it."""
-    seen = np.where(training, field, 0.0)
-    power = float(np.sum(seen**2))
-    factor = max(0.0, float(np.sum(seen * readings)) / power) if power else 0.0
-    return float(np.sqrt(np.sum((readings - factor * seen)**2) / training.sum())), factor
+    return improved
 
 
 def _improved(
@@ -178,7 +191,7 @@ def _improved(
             np.split(vacuum(np.concatenate(places)), len(poses)), turns, strict=True)]
 
     (field,) = fields([pose])
-    misfit, factor = _misfit(field, readings, training)
+    misfit, factor = misfit_of(field, readings, training)
     sizes = np.repeat([DIFFERENCE_M, DIFFERENCE_M / magnet.bore_radius], 3)
     for _ in range(ITERATIONS):
         around = fields([moved_by(pose, step) for step in np.diag(sizes)])
@@ -189,7 +202,7 @@ def _improved(
         for _ in range(4):
             other = moved_by(pose, step)
             (tried,) = fields([other])
-            score = _misfit(tried, readings, training)
+            score = misfit_of(tried, readings, training)
             if score[0] < misfit:
                 break
             step = step / 2
@@ -202,22 +215,3 @@ def _improved(
     turn = Rotation.from_rotvec(pose[3:])
     inside = magnet.contains(turn.apply(points) + pose[:3])
     return (None if inside.any() else misfit), pose
-
-
-def _same(first: Floats, second: Floats) -> bool:
-    """Tell whether two poses put the middle of the map in the same place and turn it alike."""
-    one, other = (Rotation.from_rotvec(pose[3:]) for pose in (first, second))
-    return bool(np.linalg.norm(first[:3] - second[:3]) < SAME_M
-                and (one * other.inv()).magnitude() < SAME_RAD)
-
-
-def share_of(step: Floats) -> float:
-    """Return the part of a step (6 or more,) of a pose that is not too long."""
-    longest = max(np.abs(step[:3]).max() / LONGEST_M, np.abs(step[3:6]).max() / LONGEST_RAD)
-    return float(1 / max(1.0, longest))
-
-
-def moved_by(pose: Floats, step: Floats) -> Floats:
-    """Return a pose (6,) after a shift in m and a turn in rad about the magnet's axes, (6,)."""
-    turned = Rotation.from_rotvec(step[3:]) * Rotation.from_rotvec(pose[3:])
-    return np.concatenate([pose[:3] + step[:3], turned.as_rotvec()])

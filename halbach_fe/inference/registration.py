@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -28,7 +29,16 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.pose_search import Field, coarse_poses, moved_by, share_of
+from halbach_fe.inference.line_search import line_of
+from halbach_fe.inference.pose_search import NARROW, coarse_poses
+from halbach_fe.inference.pose_space import (
+    LONGEST_M,
+    LONGEST_RAD,
+    Field,
+    moved_by,
+    right_angles,
+    share_of,
+)
 from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
@@ -57,7 +67,7 @@ from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
-ITERATIONS = 12
+ITERATIONS = 25
 """Largest number of steps of a fit."""
 
 AT_REST, NO_BETTER = 0.02, 1e-3
@@ -72,6 +82,9 @@ SEEN = 0.1
 """Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
 of a reading."""
 
+SMALL = 1e-5
+"""Step of finite differences by open keys of the instrument."""
+
 LONGEST_SD = 1.0
 """Longest step of an open key, in prior standard deviations."""
 
@@ -79,11 +92,30 @@ RENEWED = 0.7
 """Change of an open key, in prior standard deviations, after which derivatives by open keys are
 computed anew."""
 
+BLURS = (1.0, 0.1, 0.01)
+"""Noise that is added on a line while the fit is on its way, in units of what the nominal blocks
+leave at first."""
+
+NEAR = 0.1
+"""Part of that shift up to which columns are kept on a line, where single blocks are near."""
+
 HALVINGS = 5
 """Largest number of halvings of a step that does not improve the fit."""
 
 PROBE = 21
 """Number of parameters of the probe: crosstalk, gains, offsets, and places of the sensors."""
+
+DEGREES = ("shift along x", "shift along y", "shift along z",
+           "turn about x", "turn about y", "turn about z")
+"""Degrees of freedom of a pose, along and about the axes of the magnet."""
+
+UNDETERMINED = 0.5
+"""Standard deviation, in units of the prior's, from which the map does not determine a degree of
+freedom."""
+
+EXPLAINED = 3.0
+"""Chi-squared per reading up to which the updated magnet explains a map. Unlike a wrong magnet,
+noise that the study takes for 1.7 times too small does not pass it."""
 
 OFFSETS = slice(9, 12)
 """Offsets among the parameters of the probe."""
@@ -113,13 +145,38 @@ class ProbePrior:
 
 
 @dataclass(frozen=True)
+class PosePrior:
+    """Prior standard deviations of the pose, which matter where the map does not determine it.
+
+    Attributes
+    ----------
+    across_m : float, optional
+        Of the middle of the map from the magnet's axis along x and y; by default the outer radius
+        of the blocks.
+    turn_rad : float
+        Of the turns about the magnet's axes from the nearest rotation by right angles.
+    """
+
+    across_m: float | None = None
+    turn_rad: float = 0.1
+
+    def sd(self, magnet: Magnet) -> Floats:
+        """Return the standard deviations (6,) of shifts in m and turns in rad.
+
+        That along the axis is the magnet's half length, about where the search has found the map.
+        """
+        across = self.across_m if self.across_m is not None else magnet.array_outer_radius
+        return np.array([across, across, magnet.half_length, *[self.turn_rad] * 3])
+
+
+@dataclass(frozen=True)
 class OpenKey:
     """A number of the study that a drawing leaves open, to be fitted with the pose.
 
     Attributes
     ----------
     key : str
-        Such as ``demagnetization.squareness``.
+        Such as ``demagnetization.squareness``, or ``instrument.z_scale`` for the step of the map.
     sd : float
         Prior standard deviation about the value in the study.
     """
@@ -143,6 +200,11 @@ class OpenKey:
                                      "a number that is given, to be fitted", f"'{found}'"))
         return float(found)
 
+    @property
+    def of_instrument(self) -> bool:
+        """Whether the number belongs to the mapper, not to the magnet."""
+        return self.key.startswith("instrument.")
+
     def apply(self, study: Study, value: float) -> Study:
         """Return the study with another number."""
         return study.with_(**{self.key.replace(".", "__"): value})
@@ -161,8 +223,15 @@ class Registration:
         Where the middle of the map lies in the magnet, see `middle_of`.
     translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
         Standard deviations of that place, and of the turns about the magnet's axes.
+    prior_sd : ndarray, shape (6,)
+        Prior standard deviations of that place in m and of the turns in rad. Where the standard
+        deviations are nearly as large, the map does not determine the pose.
     open_keys : dict of str to (float, float)
         Value and standard deviation of each open key.
+    chi2 : float
+        Chi-squared per reading of the readings that were fitted, by the updated blocks.
+    held_out_chi2 : float
+        The same of the readings that the study holds out; NaN if there are none.
     rms_T : ndarray, shape (3,)
         Rms residual of the readings along each axis that were fitted, by the updated blocks.
     nominal_rms_T : ndarray, shape (3,)
@@ -183,7 +252,10 @@ class Registration:
     middle_m: Floats
     translation_sd_m: Floats
     rotation_sd_rad: Floats
+    prior_sd: Floats
     open_keys: dict[str, tuple[float, float]]
+    chi2: float
+    held_out_chi2: float
     rms_T: Floats
     nominal_rms_T: Floats
     held_out_rms_T: Floats
@@ -197,11 +269,25 @@ class Registration:
         """The registered instrument."""
         return self.study.instrument
 
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Shifts and turns that the map does not determine, which the prior holds."""
+        sd = np.concatenate([self.translation_sd_m, self.rotation_sd_rad])
+        return tuple(name for name, one, prior in zip(DEGREES, sd, self.prior_sd, strict=True)
+                     if one > UNDETERMINED * prior)
+
+    @property
+    def explains(self) -> bool:
+        """Whether the updated magnet leaves about the noise of the readings that were fitted."""
+        return self.chi2 < EXPLAINED
+
 
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
     open_keys: Sequence[OpenKey] = (), say: Callable[[str], None] = lambda _: None,
     blocks: Gaussian | None = None,
+    pose: PosePrior | None = None, alternatives: Sequence[Sequence[OpenKey]] = (),
+    most: int | None = None,
 ) -> list[Registration]:
     """Find the pose of a map in a magnet.
 
@@ -211,8 +297,9 @@ def register(
         Its study states the noise, what is held out, and units, axes and law of the instrument; the
         pose that it states is not used.
     data : Dataset
-        The map, see `halbach_fe.read_map`, with all three components along axes of one sign; see
-        `halbach_fe.check_map`.
+        The map, see `halbach_fe.read_map`, with components along axes of one sign; see
+        `halbach_fe.check_map`. A line of readings, or a single component, determines a part of the
+        pose only; the prior holds the others, as the standard deviations say.
     session : Session
     probe : ProbePrior, optional
     open_keys : sequence of OpenKey, optional
@@ -221,6 +308,12 @@ def register(
         Called with a description of each step before it starts.
     blocks : Gaussian, optional
         `Registration.blocks` of another map, which replace the study's prior.
+    pose : PosePrior, optional
+    alternatives : sequence of sequence of OpenKey, optional
+        Other hypotheses: numbers that are fitted in place of ``open_keys``. The evidence compares
+        all of them.
+    most : int, optional
+        Largest number of poses that every hypothesis fits, of those that the search finds.
 
     Returns
     -------
@@ -234,19 +327,44 @@ def register(
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
     """
-    fit = _Fit.of(magnet, data, session, probe or ProbePrior(), tuple(open_keys), blocks)
+    prior = pose or PosePrior()
+    fits = [_Fit.of(magnet, data, session, probe or ProbePrior(), tuple(keys), prior,
+                    blocks)
+            for keys in (open_keys, *alternatives)]
+    fit = fits[0]
     say("searching the pose among rotations by right angles and shifts along the axis")
-    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training)
-    starts = [pose for pose in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), pose)]
+    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0])
+    starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
+    starts = starts[:most]
     if not starts:
         raise MeasurementError(must_be(
             "map", "registration", "one that fits into the bore, or beside the magnet",
             "points inside blocks in every likely pose", "Check its unit of length."))
-    found = []
-    for number, pose in enumerate(starts):
-        say(f"fitting pose {number + 1} of {len(starts)} with the blocks")
-        found.append(fit.refined(pose))
+    found: list[Registration] = []
+    by_fit: list[list[Registration]] = []
+    for fit in fits:
+        by_fit.append([])
+        for number, start in enumerate(starts):
+            say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
+                + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
+            by_fit[-1].append(fit.refined(start))
+    best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
+    for fit, own in zip(fits, by_fit, strict=True):
+        # no hypothesis shall lose because it came to rest somewhere else
+        if not any(each is best for each in own):
+            own.append(fit.refined(np.append(best.middle_m, best.instrument.rotation_rad)))
+        own.sort(key=lambda each: -each.log_evidence)
+        found += [each for number, each in enumerate(own)
+                  if not any(_same(each, other) for other in own[:number])]
     return sorted(found, key=lambda each: -each.log_evidence)
+
+
+def _same(one: Registration, other: Registration) -> bool:
+    """Tell whether two fits have ended in the same place, within its standard deviation."""
+    turn = Rotation.from_rotvec(one.instrument.rotation_rad) * Rotation.from_rotvec(
+        other.instrument.rotation_rad).inv()
+    moved, turned = np.abs(one.middle_m - other.middle_m), np.abs(turn.as_rotvec())
+    return bool((moved < other.translation_sd_m).all() and (turned < other.rotation_sd_rad).all())
 
 
 # --- least squares with the blocks --------------------------------------------------------------
@@ -268,6 +386,8 @@ class _Fit:
         The study's instrument without its pose.
     prior : Gaussian
         Of all parameters of the blocks.
+    pose_sd : ndarray, shape (6,)
+        Prior standard deviations of the pose in m and rad.
     derivatives : dict
         Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
     solved : dict
@@ -285,6 +405,7 @@ class _Fit:
     probe: ProbePrior
     base: Instrument
     open: tuple[OpenKey, ...]
+    pose_sd: Floats
     variations: Variations | None
     prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
@@ -292,7 +413,7 @@ class _Fit:
 
     @classmethod
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
-           open_keys: tuple[OpenKey, ...], blocks: Gaussian | None) -> _Fit:
+           open_keys: tuple[OpenKey, ...], pose: PosePrior, blocks: Gaussian | None) -> _Fit:
         study = magnet.study
         if magnet.dimension == 2:
             raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
@@ -326,12 +447,17 @@ class _Fit:
             blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
-                   session, probe, base, open_keys, variations, blocks)
+                   session, probe, base, open_keys, pose.sd(magnet), variations, blocks)
 
     @property
     def smallest_sigma(self) -> float:
         """Noise in T of the most exact reading."""
         return float(self.sigma[self.training].min())
+
+    @cached_property
+    def on_a_line(self) -> bool:
+        """Whether the map lies on a line, so that it does not determine its pose."""
+        return line_of(self.points, NARROW * self.magnet.bore_radius) is not None
 
     def prior_sd(self) -> Floats:
         """Return the prior standard deviations of the parameters after the pose."""
@@ -342,9 +468,36 @@ class _Fit:
 
     def instrument(self, pose: Floats, values: Floats) -> Instrument:
         """Return the instrument of a pose (6,) and of the other parameters."""
-        middle = middle_of(self.points)
-        return with_terms(self.base, middle, np.concatenate([
+        base = self._base(values)
+        middle = self._origin(base)
+        return with_terms(base, middle, np.concatenate([
             pose[:3] - middle, pose[3:], values[:PROBE], np.zeros(3)]))
+
+    def _origin(self, base: Instrument) -> Floats:
+        """Return the middle (3,) in m of the map, in the scale of an instrument without pose."""
+        return middle_of(sensor_positions(base.with_(
+            sensor_position_m=((0.0, 0.0, 0.0),) * 3), self.points)[:, 0])
+
+    def _base(self, values: Floats) -> Instrument:
+        """Return the instrument without its pose, with the values of the open keys."""
+        study = self.magnet.study.with_(instrument=self.base)
+        for each, value in zip(self.open, each_value(self, values), strict=True):
+            if each.of_instrument:
+                study = each.apply(study, value)
+        return study.instrument
+
+    def scaled(self, pose: Floats, values: Floats, start: Floats) -> Floats:
+        """Return all parameters (p,) less their prior means, in prior standard deviations.
+
+        The prior mean of the place across is the axis, that of the place along it is the one of
+        the pose ``start``; of the turns it is the nearest rotation by right angles.
+        """
+        turns = [Rotation.from_matrix(matrix) for matrix in right_angles()]
+        nearest = min(turns, key=lambda turn: (
+            Rotation.from_rotvec(start[3:]) * turn.inv()).magnitude())
+        turned = (Rotation.from_rotvec(pose[3:]) * nearest.inv()).as_rotvec()
+        place = pose[:3] - [0.0, 0.0, start[2]]
+        return np.concatenate([np.append(place, turned) / self.pose_sd, values / self.prior_sd()])
 
     def study_of(self, pose: Floats, values: Floats) -> Study:
         """Return the study of a pose and of the other parameters."""
@@ -353,43 +506,57 @@ class _Fit:
     def refined(self, pose: Floats) -> Registration:
         """Return the registration to which least squares leads from a pose (6,)."""
         prior_sd = self.prior_sd()
-        values = np.zeros(len(prior_sd))
+        start, values = pose, np.zeros(len(prior_sd))
         rows = self.training.ravel()
         self.derivatives.clear()  # those of another pose belong to other places
         columns = self._columns(pose, values)
         state = self._state(pose, values, columns)
-        at_rest = False
-        for _ in range(ITERATIONS):
-            step, sd, chi2 = state.step(rows, values / prior_sd)
-            if float(np.abs(step / sd).max()) < AT_REST:
-                at_rest = True
-                break
-            longest = LONGEST_SD * prior_sd[PROBE:]
-            step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
-            share = share_of(step)
-            for _ in range(HALVINGS):
-                other, changed = moved_by(pose, share * step[:6]), values + share * step[6:]
-                if self.is_possible(changed, other):
-                    moved = self._middle(other, changed) - columns.places
-                    near = columns if np.abs(moved).max() < state.reach else (
-                        self._columns(other, changed))
-                    tried = self._state(other, changed, near)
-                    now = tried.chi2(rows, changed / prior_sd)
-                    if now <= chi2:
-                        break
-                share /= 2
-            else:
-                break
-            pose, values, state, columns = other, changed, tried, near
-            if chi2 - now < NO_BETTER * chi2:
-                at_rest = True
-                break
-        step, sd, chi2 = state.step(rows, values / prior_sd)
-        updated, log_evidence, mean, covariance = state.updated(rows, values / prior_sd)
+        for blurred in self._blur(state):
+            # noise of positions grows with the gradient: a fit would look for one, so it is held
+            sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
+            at_rest = False
+
+            def reach(state: _State, blurred: float = blurred) -> float:
+                """Return how far in m the block columns hold; on a line only the noise counts."""
+                return state.reach * (
+                    NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
+
+            for _ in range(ITERATIONS):
+                state = state.with_noise(sigma)
+                step, sd, chi2 = state.step(rows, self.scaled(pose, values, start), self._damping)
+                if float(np.abs(step / sd).max()) < AT_REST:
+                    at_rest = True
+                    break
+                longest = LONGEST_SD * prior_sd[PROBE:]
+                step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
+                share = share_of(step)
+                for _ in range(HALVINGS):
+                    other, changed = moved_by(pose, share * step[:6]), values + share * step[6:]
+                    if self.is_possible(changed, other):
+                        moved = self._middle(other, changed) - columns.places
+                        near = columns if np.abs(moved).max() < reach(state) else (
+                            self._columns(other, changed))
+                        tried = self._state(other, changed, near).with_noise(sigma)
+                        now = tried.chi2(rows, self.scaled(other, changed, start))
+                        if now <= chi2:
+                            break
+                    share /= 2
+                else:
+                    break
+                pose, values, state, columns = other, changed, tried, near
+                if chi2 - now < NO_BETTER * chi2:
+                    at_rest = True
+                    break
+            state = state.with_noise(None)
+        scaled = self.scaled(pose, values, start)
+        sd = state.step(rows, scaled)[1]
+        updated, log_evidence, mean, covariance = state.updated(rows, scaled)
         return Registration(
-            self.study_of(pose, values), pose[:3], sd[:3], sd[3:6],
+            self.study_of(pose, values), pose[:3], sd[:3], sd[3:6], self.pose_sd,
             {each.key: (value, error) for each, value, error in zip(
                 self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
+            _mean_square(updated / state.sigma, self.training),
+            _mean_square(updated / state.sigma, self.held_out),
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
             log_evidence, at_rest, self._blocks(columns.directions, mean, covariance))
@@ -400,6 +567,28 @@ class _Fit:
         variances, axes = np.linalg.eigh(covariance)
         return Gaussian(self.prior.mean + root @ (directions @ mean), CovarianceFactor(
             root, directions @ axes, np.sqrt(np.clip(variances, 0.0, 1.0))))
+
+    @cached_property
+    def _damping(self) -> Floats:
+        """Inverse squares (p,) of the longest steps, which keep short what a line leaves open.
+
+        They are added to the information of a step: only where the map says little does it matter.
+        """
+        damping = np.zeros(6 + len(self.prior_sd()))
+        if self.on_a_line:
+            damping[:6] = np.repeat([LONGEST_M, LONGEST_RAD], 3)**-2.0
+        return damping
+
+    def _blur(self, state: _State) -> Sequence[float]:
+        """Return noise in T to be added to that of the readings, less and less; zero at last.
+
+        On a line, deviations of the blocks can take up what a wrong place or scale leaves. They
+        cannot as long as the noise is as large as what the nominal blocks leave.
+        """
+        if not self.on_a_line:
+            return (0.0,)
+        left = float(np.nanmax(_rms(state.residual, self.training)))
+        return (*(left * part for part in BLURS), 0.0)
 
     def is_possible(self, values: Floats, pose: Floats | None = None) -> bool:
         """Tell whether a valid study has these values, and all readings lie in air at a pose."""
@@ -442,12 +631,14 @@ class _Fit:
         """Return the magnet with the values of the open keys."""
         magnet = self.magnet
         for each, value in zip(self.open, each_value(self, values), strict=True):
-            magnet = magnet.with_study(each.apply(magnet.study, value))
+            if not each.of_instrument:
+                magnet = magnet.with_study(each.apply(magnet.study, value))
         return magnet
 
     def _field(self, values: Floats) -> Field:
         """Return the field of the nominal magnet with the values of the open keys."""
-        key = values[PROBE:].tobytes()
+        key = np.array([value for each, value in zip(self.open, values[PROBE:], strict=True)
+                        if not each.of_instrument]).tobytes()
         if key not in self.solved:
             while len(self.solved) > len(self.open) + 1:
                 del self.solved[next(iter(self.solved))]
@@ -455,18 +646,20 @@ class _Fit:
         return self.solved[key]
 
     def _by_open_keys(self, values: Floats, middle: Floats) -> list[Floats]:
-        """Return the derivatives (n, 3) of B at places (n, 3) in m by every open key."""
+        """Return the derivatives (n, 3) of B at places (n, 3) in m by every key of the magnet."""
         scaled = values[PROBE:] / self.prior_sd()[PROBE:]
         known = self.derivatives.get("at")
         if known is None or np.abs(scaled - known).max(initial=0.0) > RENEWED:
             self.derivatives["at"] = scaled
             here = self._field(values)(middle) if self.open else middle
             for number, each in enumerate(self.open):
+                if each.of_instrument:
+                    continue
                 step = each.sd * PART_OF_SD * np.eye(len(values))[PROBE + number]
                 changed = values + step if self.is_possible(values + step) else values - step
                 self.derivatives[each.key] = (self._field(changed)(middle) - here) / (
                     changed - values)[PROBE + number]
-        return [self.derivatives[each.key] for each in self.open]
+        return [self.derivatives[each.key] for each in self.open if not each.of_instrument]
 
     def _state(self, pose: Floats, values: Floats, near: _BlockColumns) -> _State:
         """Return residual and derivatives of all readings at a pose and instrument."""
@@ -477,15 +670,24 @@ class _Fit:
         here, gradient = field_at_sensors(self._field(values), sensors)
         residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
         columns = list(np.moveaxis(by_terms(
-            instrument, self.points, middle_of(self.points), np.zeros(count), here, gradient,
-            STEADY), -1, 0))
-        for change in self._by_open_keys(values, middle):
-            columns.append(change @ matrix.T)
+            instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
+            gradient, STEADY), -1, 0))
+        magnets = iter(self._by_open_keys(values, middle))
+        for number, each in enumerate(self.open, start=PROBE):
+            if not each.of_instrument:
+                columns.append(next(magnets) @ matrix.T)
+                continue
+            step = SMALL * np.eye(len(values))[number]
+            other = self.instrument(pose, values + step)
+            moved = sensor_positions(other, self.points) - sensors
+            there = here + np.einsum("nsck,nsk->nsc", gradient, moved)
+            columns.append((seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL)
         at_mean = gradient.mean(axis=1)
         sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
             "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
         return _State(residual, np.stack(columns, axis=-1),
-                      np.einsum("ij,njk->nik", matrix, near.fields), sigma, self.prior_sd(),
+                      np.einsum("ij,njk->nik", matrix, near.fields), sigma,
+                      np.concatenate([self.pose_sd, self.prior_sd()]),
                       self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
                           at_mean**2, axis=(1, 2)))))))
 
@@ -524,9 +726,11 @@ class _State:
     by_block : ndarray, shape (n, 3, k), in T
         Readings per prior standard deviation of the magnetizations.
     sigma : ndarray, shape (n, 3), in T
-    prior_sd : ndarray, shape (p - 6,)
+    prior_sd : ndarray, shape (p,)
     reach : float, in m
         Largest shift for which ``by_block`` holds, see `DEVIATION`.
+    noise : ndarray, shape (n, 3), in T, optional
+        Taken instead of ``sigma``, see `with_noise`.
     """
 
     residual: Floats
@@ -535,20 +739,26 @@ class _State:
     sigma: Floats
     prior_sd: Floats
     reach: float
+    noise: Floats | None = None
+
+    def with_noise(self, noise: Floats | None) -> _State:
+        """Return the state with another noise (n, 3) in T, or with its own if there is none."""
+        return dataclasses.replace(self, noise=noise)
 
     def _whitened(self, rows: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
         """Return residual (r,), derivatives (r, p) and block columns (r, k) of some readings."""
-        sigma = self.sigma.ravel()[rows]
+        sigma = (self.sigma if self.noise is None else self.noise).ravel()[rows]
         return (self.residual.ravel()[rows] / sigma,
                 self.by_parameter.reshape(len(rows), -1)[rows] / sigma[:, None],
                 self.by_block.reshape(len(rows), -1)[rows] / sigma[:, None])
 
-    def step(self, rows: NDArray[np.bool_], scaled: Floats) -> tuple[Floats, Floats, float]:
+    def step(self, rows: NDArray[np.bool_], scaled: Floats, damping: Floats | None = None,
+             ) -> tuple[Floats, Floats, float]:
         """Return the step (p,) to the most probable parameters, their sd (p,), and chi-squared.
 
-        The magnetizations are integrated out. ``scaled`` are the present parameters after the pose
-        in prior standard deviations; the pose has no prior. chi-squared is that of the present
-        parameters.
+        The magnetizations are integrated out. ``scaled`` are the present parameters less their
+        prior means, in prior standard deviations; chi-squared is theirs. ``damping`` (p,) shortens
+        the step, not the standard deviations.
         """
         residual, derivative, blocks = self._whitened(rows)
         inner = blocks.T @ blocks
@@ -559,12 +769,12 @@ class _State:
             return values - blocks @ cho_solve(factor, blocks.T @ values)
 
         left, projected = kept(residual), kept(derivative)
-        precision = np.concatenate([np.zeros(6), self.prior_sd**-2])
-        information = derivative.T @ projected + np.diag(precision)
-        prior = np.concatenate([np.zeros(6), scaled / self.prior_sd])
+        information = derivative.T @ projected + np.diag(self.prior_sd**-2)
         inverse = np.linalg.inv(information)
-        return (inverse @ (derivative.T @ left - prior), np.sqrt(np.diag(inverse)),
-                float(residual @ left + scaled @ scaled))
+        uphill = derivative.T @ left - scaled / self.prior_sd
+        step = inverse @ uphill if damping is None else np.asarray(np.linalg.solve(
+            information + np.diag(damping), uphill), np.float64)
+        return step, np.sqrt(np.diag(inverse)), float(residual @ left + scaled @ scaled)
 
     def chi2(self, rows: NDArray[np.bool_], scaled: Floats) -> float:
         """Return chi-squared with the magnetizations integrated out, see `step`."""
@@ -575,19 +785,17 @@ class _State:
     ) -> tuple[Floats, float, Floats, Floats]:
         """Return residual (n, 3) in T and log evidence, and mean and covariance of the blocks."""
         residual, derivative, blocks = self._whitened(rows)
-        design = np.hstack([blocks, derivative[:, :6], derivative[:, 6:] * self.prior_sd])
+        design = np.hstack([blocks, derivative * self.prior_sd])
         inner = design.T @ design
+        inner[np.diag_indices(len(inner))] += 1.0
         count = blocks.shape[1]
-        keep = np.ones(len(inner))
-        keep[count:count + 6] = 0.0
-        inner[np.diag_indices(len(inner))] += keep
-        start = np.concatenate([np.zeros(count + 6), scaled])
+        start = np.concatenate([np.zeros(count), scaled])
         factor = cho_factor(inner, lower=True)
-        solution = cho_solve(factor, design.T @ residual - start * keep)
+        solution = cho_solve(factor, design.T @ residual - start)
         updated = self.residual - self.by_block @ solution[:count] - self.by_parameter @ (
-            np.concatenate([solution[count:count + 6], solution[count + 6:] * self.prior_sd]))
+            solution[count:] * self.prior_sd)
         left = residual - design @ solution
-        chi2 = float(left @ left + np.sum((keep * (solution + start))**2))
+        chi2 = float(left @ left + np.sum((solution + start)**2))
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
             np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
                 factor, np.eye(len(inner)))[:count, :count]
@@ -604,6 +812,11 @@ def _rms(residual: Floats, rows: NDArray[np.bool_]) -> Floats:
     count = rows.sum(axis=0)
     total = np.sum(np.where(rows, residual, 0.0)**2, axis=0)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def _mean_square(values: Floats, rows: NDArray[np.bool_]) -> float:
+    """Return the mean square of the chosen values (n, 3); NaN if there are none."""
+    return float(np.mean(values[rows]**2)) if rows.any() else float("nan")
 
 
 def odds(found: Sequence[Registration]) -> Floats:

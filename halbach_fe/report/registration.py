@@ -43,12 +43,26 @@ def sentences(found: Sequence[Registration], before: str = NOMINAL) -> list[str]
         best.middle_m, best.translation_sd_m, strict=True))
     answer = [f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
               "magnet."]
+    if not best.explains:
+        answer.insert(0, (
+            "This magnet does not explain the map: even in the best pose and with updated blocks, "
+            f"chi² is {best.chi2:.3g} per reading, where about 1 is expected. The map is of "
+            "another magnet, its noise is larger than the study says, or the study lacks "
+            "something; see halbach-fe diagnose. The least bad answer follows."))
     others = [100 * value for value in probability[1:] if value > EQUALLY_GOOD]
     if others:
         answer.append(
-            f"{len(others)} other pose{'s' if len(others) > 1 else ''} cannot be ruled out, with "
+            f"{len(others)} other answer{'s' if len(others) > 1 else ''} cannot be ruled out, with "
             f"odds of {', '.join(f'{value:.0f}' for value in others)} % beside "
             f"{100 * probability[0]:.0f} %: the magnet looks the same from there.")
+    if best.undetermined:
+        answer.append(
+            f"The map does not determine the {', '.join(best.undetermined)}: the prior holds "
+            f"{'it' if len(best.undetermined) == 1 else 'them'}, with the standard deviations of "
+            f"the table.")
+    if len(by_hypothesis(found)) > 1:
+        answer.append("Odds of what is open: " + "; ".join(
+            f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
     answer.append(
         f"The {before} is there {_mT(best.nominal_rms_T)} off the readings that were fitted, "
         f"with updated blocks {_mT(best.rms_T)}"
@@ -60,6 +74,19 @@ def sentences(found: Sequence[Registration], before: str = NOMINAL) -> list[str]
         answer.append("The fit has not come to rest: its error bars may be too small. Look for "
                       "what the model lacks with halbach-fe diagnose.")
     return answer
+
+
+def hypothesis(one: Registration) -> str:
+    """Return the names of the numbers that a registration has fitted."""
+    return ", ".join(one.open_keys) or "nothing open"
+
+
+def by_hypothesis(found: Sequence[Registration]) -> dict[str, float]:
+    """Return the odds of each set of open numbers, over all of its poses, the best first."""
+    total: dict[str, float] = {}
+    for each, probability in zip(found, odds(found), strict=True):
+        total[hypothesis(each)] = total.get(hypothesis(each), 0.0) + float(probability)
+    return total
 
 
 def _mT(rms: np.ndarray) -> str:  # noqa: N802 - a unit
@@ -75,13 +102,15 @@ def pose_table(
     for each, probability in zip(found, odds(found), strict=True):
         rows.append({
             "odds": f"{100 * probability:.3g} %",
+            **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
             "middle in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.middle_m),
             "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
             "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
                                           each.instrument.rotation_rad),
+            "sd in mrad": ", ".join(f"{1e3 * value:.2f}" for value in each.rotation_sd_rad),
             "nominal" if before == NOMINAL else "before": _mT(each.nominal_rms_T),
-            "updated": _mT(each.rms_T)})
+            "updated": _mT(each.rms_T), "chi²/reading": f"{each.chi2:.3g}"})
     return rows
 
 
@@ -104,7 +133,9 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         return [None if np.isnan(value) else float(value) for value in values]
 
     return {"poses": [{
-        "odds": float(probability), "at_rest": each.at_rest,
+        "odds": float(probability), "at_rest": each.at_rest, "explains": each.explains,
+        "undetermined": list(each.undetermined), "chi2": each.chi2,
+        "held_out_chi2": None if np.isnan(each.held_out_chi2) else each.held_out_chi2,
         "axes": axes_of_map(each.instrument),
         "instrument": each.instrument.model_dump(mode="json", exclude_defaults=True),
         "open_keys": {key: {"value": value, "sd": sd}

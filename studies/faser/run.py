@@ -74,7 +74,8 @@ def assumptions(update: InferenceResult, z_step: float) -> list[str]:
         f"So placed, the measured profile is {1000 * measured:.0f} mm wide at half its height, the "
         f"model's {1000 * model:.0f} mm: step or length is wrong, which explains a part of the "
         f"misfit in the fringe field; a step of {1000 * z_step * model / measured:.2f} mm would "
-        "make them equal. What remains would need another cause.",
+        "make them equal. What remains is that the line lies beside the axis: see "
+        "make study-faser-diagnosis.",
         "The 1.0 m magnet has 12 rings of 83.3 mm; the ring length is inferred.",
         "The nominal moment of 330 A m² per block, as published, gives a bore field some 2 % "
         "above the measured one; the prior allows 5 % for what all blocks share.",
