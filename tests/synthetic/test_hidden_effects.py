@@ -57,6 +57,7 @@ NAMES = [
     "blocks_swapped", "block_flipped", "block_missing", "block_demagnetized",
     "corners_demagnetized", "magnetization_gradient", "temperature", "temperature_gradient",
     "inner_radius", "length", "background", "neighbour_magnet", "ferromagnetic_object",
+    "knee",
     "gain_x", "gain_y", "gain_z", "offset_x", "offset_y", "offset_z", "misalignment_xy",
     "misalignment_xz", "misalignment_yx", "misalignment_yz", "misalignment_zx",
     "misalignment_zy", "planar_hall", "quadratic_nonlinearity", "cubic_nonlinearity",
