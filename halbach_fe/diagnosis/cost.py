@@ -12,7 +12,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.diagnose import MAX_ROUNDS, blocks_of
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -20,7 +20,12 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
+from halbach_fe.response.resource_estimate import (
+    OWN_SECONDS,
+    Estimate,
+    estimate_infer,
+    estimate_solve,
+)
 from halbach_fe.study.model import Study
 
 FEWEST_ROUNDS = 2
@@ -36,29 +41,29 @@ class DiagnosisEstimate:
     ----------
     update : Estimate
         Cost of the inference that every round computes.
-    field : Estimate
-        Cost of the field of the nominal magnet, of which some signatures need several.
     signatures : int
         Number of hypotheses whose signatures are computed in the first round.
     fields : int
-        Number of fields of whole magnets that these signatures need.
+        Number of fields of whole magnets that these signatures need, with iron for example.
+    fields_s : float
+        Time in s of these fields.
     """
 
     update: Estimate
-    field: Estimate
     signatures: int
     fields: int
+    fields_s: float
 
     def seconds(self, rounds: int) -> float:
         """Return the time in s of so many rounds."""
-        return rounds * self.update.seconds + self.fields * self.field.seconds
+        return OWN_SECONDS + rounds * (self.update.seconds - OWN_SECONDS) + self.fields_s
 
     def as_dict(self) -> dict[str, Any]:
         """Return the estimate as plain data for JSON."""
         return {"rounds": [FEWEST_ROUNDS, MAX_ROUNDS], "signatures": self.signatures,
                 "fields": self.fields, "seconds": [
                     self.seconds(FEWEST_ROUNDS), self.seconds(MAX_ROUNDS)],
-                "each_round": self.update.as_dict(), "each_field": self.field.as_dict()}
+                "each_round": self.update.as_dict()}
 
 
 def estimate_diagnosis(
@@ -78,22 +83,25 @@ def estimate_diagnosis(
     study, magnet = corrected, build_magnet(corrected)
     observation = observation_of(magnet, data, blocks, validation_map)
     points = probe_points(study.instrument, observation.map_points)[:1]
-    signatures = fields = 0
+    signatures, fields, seconds = 0, 0, 0.0
     for effect in catalogue() if effects is None else effects:
         places = effect.places(study)
         if not places:
             continue
         signatures += min(len(places), SHORTLIST) if effect.name == "blocks_swapped" else len(
             places)
-        if _solves(effect, study, points):
-            fields += sum(_solves(effect, study, points, number) for number in range(len(places)))
-    return DiagnosisEstimate(
-        estimate_infer(magnet, observation, jobs), estimate_solve(magnet, observation, jobs),
-        signatures, fields)
+        asked = _asked(effect, study, points, places[0])
+        if asked:  # all places of an effect need fields of much the same cost
+            fields += len(places) * len(asked)
+            seconds += len(places) * sum(
+                estimate_solve(build_magnet(each), observation, jobs).seconds - OWN_SECONDS
+                for each in asked)
+    return DiagnosisEstimate(estimate_infer(magnet, observation, jobs), signatures, fields,
+                             seconds)
 
 
-def _solves(effect: Effect, study: Study, points: Floats, number: int = 0) -> int:
-    """Return the number of magnets whose field the signature at a place needs."""
+def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[Study]:
+    """Return the magnets whose field the signature at a place needs."""
     asked: list[Study] = []
 
     def solve(changed: Study) -> Floats:
@@ -102,5 +110,5 @@ def _solves(effect: Effect, study: Study, points: Floats, number: int = 0) -> in
         return np.zeros((len(points), 3))
 
     nominal = NominalFields(study, points, np.zeros(len(points)), solve)
-    effect.signature(nominal, effect.places(study)[number])
-    return len(asked)
+    effect.signature(nominal, place)
+    return asked

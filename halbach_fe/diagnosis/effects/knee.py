@@ -27,12 +27,13 @@ down to that of NdFeB which is 80 K hotter."""
 SQUARENESS, LEAST_SQUARE = 0.85, 0.3
 """Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
 
-FEWEST_CELLS = 4
-"""Smallest number of cells along the side of a block for its losses."""
+SIGNATURE_CELLS, FEWEST_CELLS = 3, 4
+"""Smallest number of cells along the side of a block for the losses of a signature, and of the
+model."""
 
-MOST_BLOCKS = 300
+MOST_BLOCKS = 100
 """Largest number of blocks for which losses are searched unless the study describes the material:
-each place takes a solution of the whole magnet."""
+each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
 
 STEPS = (0.01, 0.05)
 """Steps of the finite differences, in the logarithms of `KneeEffect.refinements`."""
@@ -82,10 +83,11 @@ class KneeEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        before = nominal.study
+        before, cells = nominal.study, _cells(nominal.study, SIGNATURE_CELLS)
         if not nominal.magnet.is_vacuum:  # by the same route, so that both have the same cells
-            before = before.with_(solver__route="moments", mesh__cells_per_side=_cells(before))
-        return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
+            before = before.with_(solver__route="moments", mesh__cells_per_side=cells)
+        lost = self.apply(before, place, [1.0]).with_(mesh__cells_per_side=cells)
+        return (nominal.solve(lost) - nominal.solve(before))[None]
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.refine`."""
@@ -135,9 +137,9 @@ def _squareness(log_odds: float) -> float:
     return LEAST_SQUARE + (MOST_SQUARE - LEAST_SQUARE) * odds / (1 + odds)
 
 
-def _cells(study: Study) -> int:
-    """Return the number of cells along a block's side that losses need at least."""
-    return max(FEWEST_CELLS, study.mesh.cells_per_side or 0)
+def _cells(study: Study, fewest: int = FEWEST_CELLS) -> int:
+    """Return the study's number of cells along a block's side, or the fewest for losses."""
+    return max(fewest, study.mesh.cells_per_side or 0)
 
 
 EFFECTS = (KneeEffect(),)
