@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -155,7 +156,7 @@ def diagnose(
         prior_mean = (first[0] if first else update).prior.mean
         search = score_hypotheses(
             corrected, start, update, prior_mean, times, solver, effects, identified, signatures,
-            pace.advance, lambda last=closing: last or pace.is_over)
+            pace.advance, partial(_is_over, pace, closing))
         first = first or (update, search)
         solver_error = None if identified else explain_by_solver_error(update)
         if solver_error:
@@ -203,6 +204,11 @@ def diagnose(
         solver_error=solver_error, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T,
         uncompared=search.uncompared if closing or search.uncompared else None)
+
+
+def _is_over(pace: Pace, closing: bool) -> bool:
+    """Tell whether no further signatures are computed: in the last round, or the time is up."""
+    return closing or pace.is_over
 
 
 def blocks_of(blocks: BlockTable | None, study: Study, corrected: Study) -> BlockTable | None:

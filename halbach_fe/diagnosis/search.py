@@ -219,15 +219,15 @@ def score_hypotheses(
             return whitened(update.observation.read(
                 effect.derivative(nominal_start, place, amounts.tolist())))
 
-        place = _improved_place(effect, [known[number].place for number in numbers],
-                                [columns[number] for number in numbers], of, fixed, marginal,
-                                residual)
-        if place is not None and (effect.name, place) not in signatures:
-            signature = whitened(update.observation.read(effect.signature(nominal_start, place)))
-            signatures[effect.name, place] = signature
-            known.append(Hypothesis(effect, place))
+        better = _improved_place(effect, [known[number].place for number in numbers],
+                                 [columns[number] for number in numbers], of, fixed, marginal,
+                                 residual)
+        if better is not None and (effect.name, better) not in signatures:
+            signature = whitened(update.observation.read(effect.signature(nominal_start, better)))
+            signatures[effect.name, better] = signature
+            known.append(Hypothesis(effect, better))
             columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
-            candidates.append(Candidate(effect.name, place.name, tuple(range(signature.shape[1])),
+            candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique))
     chosen = most_likely(candidates, columns, marginal, residual, {
         number for number, hypothesis in enumerate(known)
