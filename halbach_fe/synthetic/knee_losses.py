@@ -29,6 +29,9 @@ TOLERANCE, MAX_STEPS = 1e-7, 5000
 """Largest change of the part that a cell keeps, which ends the iteration, and the largest number of
 steps."""
 
+NEAR = 6.0
+"""Distance of a cell, in cube roots of its volume, beyond which it is a dipole."""
+
 NEGLIGIBLE = 1e-6
 """Losses below this part of the remanence are left out."""
 
@@ -65,9 +68,8 @@ def with_knee_losses(magnet: TrueMagnet, coercivity_T: float, squareness: float)
     strength = np.linalg.norm(easy, axis=1)
     easy = easy / strength[:, None]
     outer = np.einsum("ni,ni->n", vacuum_field(magnet.bodies, middles), easy)
-    # field along the easy axis of one cell by the loss of all the remanence of another
-    by_loss = np.array([np.einsum("ni,ni->n", lost_field([cell.lost(1.0)], middles), easy)
-                        for cell in cells]).T
+    by_loss = np.array([np.einsum("ni,ni->n", _field_of_loss(cell, middles), easy)
+                        for cell in cells]).T  # along the easy axis, if another loses everything
     width = coercivity_T * (1 - squareness) / (2 * float(np.arctanh(0.9)))
     lost = np.zeros(len(cells))
     # a loss changes the field by at most the remanence, and that the loss by 1 / (2 w)
@@ -92,6 +94,23 @@ def lost_field(losses: Sequence[LostCell], points: Floats) -> Floats:
         own = piece_field((body.shape, cell.u, cell.v), polarization, body.in_shape(points))
         total += own @ body.shape_orientation.as_matrix().T
     return total
+
+
+def _field_of_loss(cell: _Cell, points: Floats) -> Floats:
+    """Return mu_0 H (n, 3) in T at points (n, 3) in m if a cell loses all its remanence.
+
+    Far away that is the field of a dipole, which is in error by the square of size by distance.
+    """
+    body, away = cell.body, points - cell.middle
+    distance = np.linalg.norm(away, axis=1)
+    size = np.cbrt(body.shape.volume * body.shape.share(cell.u, cell.v))
+    near = distance <= NEAR * size
+    field = np.zeros((len(points), 3))
+    field[near] = lost_field([cell.lost(1.0)], points[near])
+    far = away[~near] / distance[~near, None]
+    moment = -size**3 / (4 * np.pi) * body.orientation.apply(body.remanence)
+    field[~near] = (3 * far * (far @ moment)[:, None] - moment) / distance[~near, None]**3
+    return field
 
 
 def _cells(body: Body, count: int) -> list[_Cell]:
