@@ -52,14 +52,20 @@ BLAS_BUFFER_BYTES = 128 * 2**20
 """What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
 and library, on two threads."""
 
+GETDP_LIMIT_S = 3600.0
+"""Time limit of each GetDP process, unless another is asked for."""
+
 MAX_ORDER = 100
 """Highest order of a multipole. Higher orders are negligible in the bore."""
 
 
-def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add STUDY, -o, --json, and the options of every verb that solves."""
+def add_study_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
+    """Add STUDY, -o, --json, and the options of every verb that solves.
+
+    ``time_limit`` tells whether --time-limit is that of each GetDP process.
+    """
     add_study_and_output(parser)
-    add_solver_arguments(parser)
+    add_solver_arguments(parser, time_limit)
     add_json_argument(parser)
 
 
@@ -97,7 +103,7 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
     return 0
 
 
-def add_solver_arguments(parser: argparse.ArgumentParser) -> None:
+def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
     """Add the options of GetDP's runs: --jobs, --mpi, --scheduler, --cache, --getdp and so on."""
     parser.add_argument("--jobs", type=positive, metavar="N",
                         help="number of GetDP runs at a time (default: 2, or with --scheduler the "
@@ -112,8 +118,10 @@ def add_solver_arguments(parser: argparse.ArgumentParser) -> None:
                         "then ~/.cache/halbach-fe)")
     parser.add_argument("--no-cache", action="store_true",
                         help="neither read nor write the cache of GetDP's answers")
-    parser.add_argument("--time-limit", type=float, default=3600.0, metavar="SECONDS",
-                        help="time limit of each GetDP process in s (default: %(default)g)")
+    if time_limit:
+        parser.add_argument("--time-limit", type=positive_number, default=GETDP_LIMIT_S,
+                            metavar="SECONDS",
+                            help="time limit of each GetDP process in s (default: %(default)g)")
     add_getdp_argument(parser)
 
 
@@ -459,7 +467,13 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
                   MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
                   disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        def show(done: int, total: int) -> None:
+            if not done:  # the next step has a pace of its own
+                bar.reset(task)
+            bar.update(task, completed=done, total=total)
+
+        yield show
 
 
 def print_json(value: object) -> None:

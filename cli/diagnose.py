@@ -19,15 +19,21 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.study.types import COMPONENTS
 
 if TYPE_CHECKING:
+    from halbach_fe.diagnosis.cost import DiagnosisEstimate
     from halbach_fe.diagnosis.effects.base import Effect
     from halbach_fe.diagnosis.result import Diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    common.add_study_arguments(parser)
+    common.add_study_arguments(parser, time_limit=False)
+    common.add_dry_run_argument(parser)
     common.add_measurement_arguments(parser)
     common.add_held_out_argument(parser)
+    parser.add_argument("--time-limit", dest="diagnosis_limit", type=common.positive_number,
+                        metavar="SECONDS",
+                        help="time in s after which the search ends with what it has so far; the "
+                        "step under way is finished (default: none)")
     parser.add_argument("--check", type=Path, metavar="JSON",
                         help="check.json of halbach-fe check for this map, whose model-free "
                         "floor is shown beside the results")
@@ -81,15 +87,41 @@ def run(arguments: argparse.Namespace) -> int:
     text = arguments.study.read_text(encoding="utf-8")
     data, blocks, validation_map = common.measurements(arguments)
     floor = floor_of(arguments.check) if arguments.check else None
+    if arguments.dry_run:
+        from halbach_fe.diagnosis.cost import estimate_diagnosis
+
+        return print_cost(estimate_diagnosis(study, data, blocks, arguments.effects,
+                                             validation_map, common.jobs(arguments)),
+                          arguments.json)
+    # no process may take longer than GetDP's own limit, unless the whole diagnosis may
+    arguments.time_limit = max(common.GETDP_LIMIT_S, arguments.diagnosis_limit or 0.0)
     with common.session(arguments) as session:
         diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
-                             common.say, floor_T=floor)
+                             common.say, floor_T=floor, time_limit_s=arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
     write_diagnosis(diagnosis, separating, study, text, arguments.output)
     if arguments.json:
         common.print_json(diagnosis_summary(diagnosis, separating))
     else:
         print_diagnosis(diagnosis, arguments.output)
+    return 0
+
+
+def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
+    """Print what a diagnosis would solve; return 0."""
+    if as_json:
+        common.print_json(estimate.as_dict())
+        return 0
+    from halbach_fe.diagnosis.pace import duration
+    from halbach_fe.response.resource_estimate import TIME_FACTOR
+
+    common.print_estimate(estimate.update, as_json=False)
+    rounds = estimate.as_dict()["rounds"]
+    times = " to ".join(duration(estimate.seconds(count)) for count in rounds)
+    common.say(f"That is one round; a diagnosis that finds something takes {rounds[0]} to "
+               f"{rounds[1]}. The first one compares {estimate.signatures} hypotheses, which need "
+               f"{estimate.fields} more fields of whole magnets. In all {times}, within a factor "
+               f"of about {TIME_FACTOR:g}.")
     return 0
 
 

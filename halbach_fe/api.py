@@ -74,6 +74,7 @@ def diagnose(
     magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[str] | None = None, validation_map: xr.Dataset | None = None,
     say: Say = lambda text: None, floor_T: dict[str, float] | None = None,
+    time_limit_s: float | None = None,
 ) -> Diagnosis:
     """Find which effects the study lacks to explain a measured map, and add them to the model.
 
@@ -96,6 +97,8 @@ def diagnose(
     floor_T : dict of str to float, optional
         The model-free floor of the map by component (``Bx``), see `halbach_fe.check_map`; it is
         shown beside the results.
+    time_limit_s : float, optional
+        Time after which the search ends with what it has so far.
 
     Returns
     -------
@@ -128,7 +131,7 @@ def diagnose(
     chosen = (None if effects is None
               else [effect_by_name[name] for name in dict.fromkeys(effects)])
     return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say,
-                                   floor_T=floor_T)
+                                   floor_T=floor_T, time_limit_s=time_limit_s)
 
 
 def multipoles(

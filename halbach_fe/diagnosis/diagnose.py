@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -32,6 +33,7 @@ from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.model_selection import probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
+from halbach_fe.diagnosis.pace import Pace
 from halbach_fe.diagnosis.position_noise import (
     estimate_position_noise,
     has_settled,
@@ -46,6 +48,7 @@ from halbach_fe.diagnosis.search import (
     apply_effects,
     identify_effects,
     score_hypotheses,
+    with_short_steps,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
 from halbach_fe.diagnosis.unknown_cause import find_unknown_cause
@@ -73,7 +76,7 @@ def diagnose(
     study: Study, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
     say: Say = lambda text: None, solver: NominalSolver | None = None,
-    floor_T: dict[str, float] | None = None,
+    floor_T: dict[str, float] | None = None, time_limit_s: float | None = None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain a map.
 
@@ -96,6 +99,9 @@ def diagnose(
         Several diagnoses may share one, so that equal magnets are solved once.
     floor_T : dict of str to float, optional
         The model-free floor of the map by component, to be reported with the results.
+    time_limit_s : float, optional
+        Time after which the search ends with what it has so far. The step under way is finished,
+        and so is one with the effects that were found; that takes one more inference.
 
     Returns
     -------
@@ -109,17 +115,18 @@ def diagnose(
     refuse_several_maps(study, "a diagnosis")
     refuse_open_instruments(study, "a diagnosis, which finds errors of instruments itself")
     effects = catalogue() if effects is None else effects
+    pace = Pace(say, session.progress, time_limit_s)
+    session = replace(session, progress=pace.advance)
+    pace.begin("looking for gross errors of the map")
     gross_errors, corrected, starts = _correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:
         say(f"gross error: {error.convention.text}")
-    if blocks is not None and corrected.array.blocks_by_ring != study.array.blocks_by_ring:
-        unplaced = np.zeros_like(blocks.ring)  # the table's rings are not those of this magnet
-        blocks = replace(blocks, ring=unplaced, slot=unplaced)
+    blocks = blocks_of(blocks, study, corrected)
     signatures: Signatures = {}
     solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
     times = np.concatenate([map_time(each) for each in (data, validation_map) if each is not None])
     first: tuple[InferenceResult, Search] | None = None
-    position_noise, converged = None, True
+    position_noise, converged, closing = None, True, False
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
 
@@ -137,6 +144,7 @@ def diagnose(
     for number in range(MAX_ROUNDS):
         names = ", ".join(effect.selection.candidate.name for effect in identified)
         say(f"round {number + 1}: the model with {names or 'no effect added'}")
+        pace.begin(f"round {number + 1}, solving")
         update = updated(identified, f"round-{number + 1}")
         if number == 0:
             outliers = outliers_of(update)
@@ -144,10 +152,11 @@ def diagnose(
             say(f"outliers: {len(outliers)} readings are excluded")
             corrected = excluding(corrected, outliers)
             update = updated(identified, "without-outliers")
+        pace.begin(f"round {number + 1}, effects")
         prior_mean = (first[0] if first else update).prior.mean
         search = score_hypotheses(
             corrected, start, update, prior_mean, times, solver, effects, identified, signatures,
-            session.progress or (lambda done, total: None))
+            pace.advance, partial(_is_over, pace, closing))
         first = first or (update, search)
         solver_error = None if identified else explain_by_solver_error(update)
         if solver_error:
@@ -155,11 +164,12 @@ def diagnose(
             break
         estimate = estimate_position_noise(update, search.marginal, search.columns, search.training,
                                            position_noise)
-        if not has_settled(position_noise, estimate):
+        if not closing and not has_settled(position_noise, estimate):
             say(f"vibration: positions with a standard deviation of "
                 f"{1e3 * estimate.sd_m if estimate else 0:.2g} mm are added to the noise")
             position_noise = estimate
             signatures.clear()  # they were whitened by the previous noise
+            closing = pace.is_over
             continue
         found = identify_effects(corrected, search, update.observation.map_points)
         converged = _has_converged(identified, found)
@@ -169,7 +179,11 @@ def diagnose(
             identified = tuple(replace(effect, values=present[effect.hypothesis])
                                for effect in found)
             break
-        identified = found
+        if closing:  # the model has the effects of the previous round
+            break
+        identified, closing = with_short_steps(found, identified), pace.is_over
+        if closing:
+            say("the time is up: the effects so far are put into the model")
     assert first is not None
     unknown = None if solver_error else find_unknown_cause(search, update, identified)
     if unknown is not None and unknown.alone:
@@ -188,7 +202,21 @@ def diagnose(
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
         gross_errors=gross_errors, outliers=outliers, position_noise=position_noise,
         solver_error=solver_error, converged=converged, positions=positions,
-        limits=limits, floor_T=floor_T)
+        limits=limits, floor_T=floor_T,
+        uncompared=search.uncompared if closing or search.uncompared else None)
+
+
+def _is_over(pace: Pace, closing: bool) -> bool:
+    """Tell whether no further signatures are computed: in the last round, or the time is up."""
+    return closing or pace.is_over
+
+
+def blocks_of(blocks: BlockTable | None, study: Study, corrected: Study) -> BlockTable | None:
+    """Return the measured blocks, without their places if the corrected study has other rings."""
+    if blocks is None or corrected.array.blocks_by_ring == study.array.blocks_by_ring:
+        return blocks
+    unplaced = np.zeros_like(blocks.ring)
+    return replace(blocks, ring=unplaced, slot=unplaced)
 
 
 def _correct_map_errors(

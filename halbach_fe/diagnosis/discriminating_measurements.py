@@ -400,7 +400,9 @@ def _distance(
         return np.vstack([scan.of(hypothesis) for scan in readings])
 
     in_full = identified.hypothesis.effect.applied_in_full
-    signature = of(identified.hypothesis) @ (np.ones(1) if in_full else identified.values)
+    signature = of(identified.hypothesis)
+    # refinements change how large the effect is, which hardly changes what a measurement tells
+    signature = signature @ (np.ones(1) if in_full else identified.values[:signature.shape[1]])
     if rival.effect.is_binary:
         signature = signature - of(rival)[:, 0]
     free = [other for other in (rival, *(effect.hypothesis for effect in diagnosis.identified))

@@ -174,7 +174,7 @@ def select_effects(
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
-    while len(chosen) < max_effects:
+    while candidates and len(chosen) < max_effects:
         conditional = with_candidates(evidence, [candidates[number] for number in chosen])
         odds = log_bayes_factors(conditional, candidates) + prior
         odds[[*chosen, *excluded]] = -np.inf

@@ -58,6 +58,22 @@ class IdentifiedEffect:
     selection: SelectedEffect
 
     @property
+    def place(self) -> Place:
+        """Where the effect is, see `Effect.refined_place`."""
+        hypothesis = self.hypothesis
+        return hypothesis.effect.refined_place(hypothesis.place, self.values.tolist())
+
+    @property
+    def name(self) -> str:
+        """Effect and place."""
+        return f"{self.hypothesis.effect.name} {self.place.name}".strip()
+
+    @property
+    def reported(self) -> tuple[Floats, Floats]:
+        """Amplitudes and standard deviations as reports state them, see `Effect.reported`."""
+        return self.hypothesis.effect.reported(self.hypothesis.place, self.values, self.sd)
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters (and refinements) to which the amplitudes belong."""
         effect = self.hypothesis.effect
@@ -188,6 +204,9 @@ class Diagnosis(ShownInNotebook):
     limits : DetectionLimits or None
         The smallest changes of single blocks that the map would have shown; None if no block is
         magnetized.
+    uncompared : int or None
+        Number of hypotheses that were not compared, if the time limit cut the search; None if it
+        did not.
     floor_T : dict of str to float, or None
         The model-free floor of the map by component (``Bx``), if Maxwell's check of it is known.
 
@@ -222,6 +241,7 @@ class Diagnosis(ShownInNotebook):
     positions: tuple[PossiblePosition, ...] = ()
     limits: DetectionLimits | None = None
     floor_T: dict[str, float] | None = None
+    uncompared: int | None = None
 
     @property
     def study(self) -> Study:

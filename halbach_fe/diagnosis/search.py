@@ -13,6 +13,7 @@ from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
 from halbach_fe.diagnosis.model_selection import (
+    DETECTION_LOG_ODDS,
     Candidate,
     SelectedEffect,
     select_effects,
@@ -28,6 +29,10 @@ from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
+
+MAX_PLACE_STEPS, PLACE_TOLERANCE = 20, 0.1
+"""Largest number of steps that improve a place, and the length in standard deviations of a step
+that ends them."""
 
 Say = Callable[[str], None]
 """A callable that reports progress; its argument is a line of text."""
@@ -83,6 +88,8 @@ class Search:
         The readings with blocks and solver error integrated out.
     training : ndarray, shape (rows,)
         Whitened residual of the training readings with the identified effects in the model.
+    uncompared : int
+        Number of hypotheses for which there was no time.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -92,6 +99,7 @@ class Search:
     residual: Floats
     marginal: Marginal
     training: Floats
+    uncompared: int = 0
 
 
 def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
@@ -106,7 +114,7 @@ def score_hypotheses(
     corrected: Study, start: Sequence[IdentifiedEffect], update: InferenceResult,
     prior_mean: Floats, times: Floats, solver: NominalSolver, effects: Sequence[Effect],
     identified: Sequence[IdentifiedEffect], signatures: Signatures,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda done, total: None, is_over: Callable[[], bool] = lambda: False,
 ) -> Search:
     """Compare all effects at a point where some effects are in the model already.
 
@@ -135,6 +143,8 @@ def score_hypotheses(
         later rounds reuse them.
     progress : callable, optional
         Called with the numbers of finished and of all hypotheses.
+    is_over : callable, optional
+        Tells whether the time is up. Signatures that are not known by then are left out.
     """
     whitened, response, marginal, training = marginal_of(update)
     residual = training
@@ -161,6 +171,8 @@ def score_hypotheses(
                           if name == effect.name)))]
     candidates: list[Candidate] = []
     columns: list[Floats] = []
+    known: list[Hypothesis] = []
+    improvable: dict[str, list[int]] = {}
     for number, hypothesis in enumerate(shortlisted):
         progress(number, len(shortlisted))
         effect, place = hypothesis.effect, hypothesis.place
@@ -168,6 +180,8 @@ def score_hypotheses(
         present = in_model.get(key)
         if present is None:
             signature = signatures.get(key)
+            if signature is None and is_over():
+                continue
             if signature is None:
                 signature = signatures[key] = whitened(update.observation.read(
                     effect.signature(nominal_start, place)))
@@ -181,21 +195,101 @@ def score_hypotheses(
                 present.hypothesis, amounts, nominal_fields_of(others))))
             residual = residual + signature @ amounts
         else:
-            signature = whitened(update.observation.read(effect.signature(nominal, place)))
-            residual = residual + signature @ present.values
+            amounts = np.pad(present.values,
+                             (0, len(amplitude_scale(effect)) - len(present.values)))
+            signature = whitened(update.observation.read(
+                effect.derivative(nominal, place, amounts.tolist())))
+            residual = residual + signature @ amounts
+        known.append(hypothesis)
         columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
         candidates.append(Candidate(
             effect.name, place.name, tuple(range(signature.shape[1])),
-            effect.is_binary or signature.shape[1] > len(effect.parameters), effect.unique))
+            effect.is_binary or (effect.applied_in_full
+                                 and signature.shape[1] > len(effect.parameters)), effect.unique))
+        if present is None and effect.refinements and not effect.applied_in_full:
+            improvable.setdefault(effect.name, []).append(len(known) - 1)
+    progress(len(shortlisted), len(shortlisted))
+    fixed = np.hstack([np.zeros((len(residual), 0)), *(
+        part for part, one in zip(columns, known, strict=True)
+        if (one.effect.name, one.place) in in_model)])
+    for numbers in improvable.values():
+        effect = known[numbers[0]].effect
+
+        def of(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
+            return whitened(update.observation.read(
+                effect.derivative(nominal_start, place, amounts.tolist())))
+
+        better = _improved_place(effect, [known[number].place for number in numbers],
+                                 [columns[number] for number in numbers], of, fixed, marginal,
+                                 residual)
+        if better is not None and (effect.name, better) not in signatures:
+            signature = whitened(update.observation.read(effect.signature(nominal_start, better)))
+            signatures[effect.name, better] = signature
+            known.append(Hypothesis(effect, better))
+            columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
+            candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
+                                        effect.is_binary, effect.unique))
     chosen = most_likely(candidates, columns, marginal, residual, {
-        number for number, hypothesis in enumerate(shortlisted)
+        number for number, hypothesis in enumerate(known)
         if (hypothesis.effect.name, hypothesis.place) in in_model})
     ends = np.cumsum([columns[number].shape[1] for number in chosen]).tolist()
     compared = [replace(candidates[number], columns=tuple(range(
         end - columns[number].shape[1], end))) for number, end in zip(chosen, ends, strict=True)]
-    stacked = np.hstack([columns[number] for number in chosen])
-    return Search(tuple(shortlisted[number] for number in chosen), tuple(compared),
-                  marginal.evidence(stacked, residual), stacked, residual, marginal, training)
+    stacked = np.hstack([np.zeros((len(residual), 0)), *(columns[number] for number in chosen)])
+    return Search(tuple(known[number] for number in chosen), tuple(compared),
+                  marginal.evidence(stacked, residual), stacked, residual, marginal, training,
+                  len(shortlisted) - len(known))
+
+
+def _improved_place(
+    effect: Effect, places: Sequence[Place], columns: Sequence[Floats],
+    derivative: Callable[[Place, Floats], Floats], fixed: Floats, marginal: Marginal,
+    residual: Floats,
+) -> Place | None:
+    """Return a better place than the best of a grid, by steps of Gauss and Newton.
+
+    Only effects whose field adds to that of the magnet come here, so that nothing has to be solved.
+
+    Parameters
+    ----------
+    effect : Effect
+    places : sequence of Place
+    columns : sequence of ndarray, shape (rows, k)
+        Whitened signatures at these places per prior standard deviation.
+    derivative : callable
+        Takes a place and all amplitudes; returns whitened derivatives (rows, k + r).
+    fixed : ndarray, shape (rows, f)
+        Whitened signatures of effects in the model, whose amplitudes are free.
+    marginal : Marginal
+    residual : ndarray, shape (rows,)
+
+    Returns
+    -------
+    Place or None
+        None if no place explains anything.
+    """
+    size, scale = len(effect.parameters), amplitude_scale(effect)
+    fits = [marginal.evidence(np.hstack([fixed, part]), residual).fit(
+        range(fixed.shape[1] + size)) for part in columns]
+    best = int(np.argmax([fit.log_evidence for fit in fits]))
+    alone = marginal.evidence(fixed, residual).fit(range(fixed.shape[1])).log_evidence
+    if fits[best].log_evidence - alone < DETECTION_LOG_ODDS:
+        return None
+    values = np.zeros(len(scale))
+    values[:size] = scale[:size] * fits[best].mean[fixed.shape[1]:]
+    longest = np.array([parameter.longest_step for parameter in (
+        *effect.parameters, *effect.refinements)])
+    for _ in range(MAX_PLACE_STEPS):
+        slopes = derivative(places[best], values)
+        evidence = marginal.evidence(np.hstack([fixed, slopes * scale]),
+                                     residual + slopes[:, size:] @ values[size:])
+        fit = evidence.fit(range(len(evidence.prior)))
+        sd = scale * np.sqrt(np.diag(fit.covariance))[fixed.shape[1]:]
+        step = np.clip(scale * fit.mean[fixed.shape[1]:] - values, -longest, longest)
+        values = values + step
+        if (np.abs(step[size:]) <= PLACE_TOLERANCE * sd[size:]).all():
+            break
+    return effect.refined_place(places[best], values.tolist())
 
 
 def marginal_of(
@@ -328,6 +422,25 @@ def _amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Ide
             np.concatenate([np.zeros(fixed), scale * deviation[part]]), selection))
         first += free
     return tuple(identified)
+
+
+def with_short_steps(
+    found: Sequence[IdentifiedEffect], before: Sequence[IdentifiedEffect]
+) -> tuple[IdentifiedEffect, ...]:
+    """Return identified effects whose amplitudes are not too far from those of the last round.
+
+    Effects that are far from linear could run away otherwise, see `Parameter.longest_step`.
+    """
+    last = {effect.hypothesis: effect.values for effect in before}
+    limited = []
+    for effect in found:
+        start = np.zeros(len(effect.values))
+        known = last.get(effect.hypothesis, start)[:len(start)]
+        start[:len(known)] = known
+        longest = np.array([parameter.longest_step for parameter in effect.parameters])
+        limited.append(replace(effect, values=start + np.clip(
+            effect.values - start, -longest, longest)))
+    return tuple(limited)
 
 
 def amplitude_scale(effect: Effect) -> Floats:

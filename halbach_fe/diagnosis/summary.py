@@ -43,8 +43,11 @@ STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
 
 DISPLAY_UNITS = {
     "m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "1/T": ("%/T", 100.0),
-    "1/T^2": ("%/T²", 100.0), "A m2": ("A m²", 1.0), "K": ("K", 1.0)}
+    "1/T^2": ("%/T²", 100.0), "A m2": ("A m²", 1.0), "A/m": ("kA/m", 1e-3), "K": ("K", 1.0)}
 """Units that reports show for the units of parameters, and the factor to convert to them."""
+
+PRESENT = "present"
+"""Amount of an effect that is all or nothing."""
 
 EMPTY_CELL = "–"
 """Text of a table's cell without an entry."""
@@ -170,9 +173,8 @@ def note(identified: IdentifiedEffect) -> str:
     fitted = ", ".join(
         f"{parameter.name} {_rounded(value, sd)}{_spaced(parameter.unit)}"
         for parameter, value, sd in _uncertain(identified))
-    candidate = identified.selection.candidate
     factor = f"log Bayes factor {identified.selection.log_bayes_factor:.1f}"
-    return f"{candidate.name}: {fitted or 'present'}, {factor}"
+    return f"{identified.name}: {fitted or 'present'}, {factor}"
 
 
 def amounts(identified: IdentifiedEffect) -> list[str]:
@@ -184,14 +186,14 @@ def amounts(identified: IdentifiedEffect) -> list[str]:
         name = "" if alone else f"{parameter.name} "
         text = _rounded(factor * value, factor * sd).replace("-", "−")
         found.append(f"{name}{text}{_spaced(unit)}")
-    return found or ["present"]
+    return found or [PRESENT]
 
 
 def _uncertain(identified: IdentifiedEffect) -> list[tuple[Parameter, float, float]]:
     """Return the parameters, values and standard deviations of amplitudes that were fitted."""
+    values, deviations = identified.reported
     return [(parameter, value, sd) for parameter, value, sd in zip(
-        identified.parameters, identified.values.tolist(), identified.sd.tolist(), strict=True)
-        if sd > 0]
+        identified.parameters, values.tolist(), deviations.tolist(), strict=True) if sd > 0]
 
 
 def human_unit(parameter: Parameter) -> tuple[str, float]:
@@ -334,6 +336,7 @@ def diagnosis_summary(
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
+        "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
         "verdict": "numerical" if diagnosis.solver_error else
         "unknown" if diagnosis.unknown and not diagnosis.found_anything else
         "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
@@ -406,13 +409,14 @@ def limits_in_words(limits: DetectionLimits) -> str:
 def _entry(identified: IdentifiedEffect) -> dict[str, object]:
     """Return the JSON entry of an identified effect."""
     effect, selection = identified.hypothesis.effect, identified.selection
+    values, deviations = identified.reported
     return {
         "effect": effect.name, "title": effect.title, "kind": effect.kind,
-        "place": identified.hypothesis.place.name,
+        "place": identified.place.name,
         "parameters": [
             {"name": parameter.name, "unit": parameter.unit, "value": value, "sd": sd}
-            for parameter, value, sd in zip(identified.parameters, identified.values.tolist(),
-                                            identified.sd.tolist(), strict=True)],
+            for parameter, value, sd in zip(identified.parameters, values.tolist(),
+                                            deviations.tolist(), strict=True)],
         "log_bayes_factor": selection.log_bayes_factor, "log_odds": selection.log_odds,
         "alternatives": [
             {"effect": candidate.effect, "place": candidate.place, "log_bayes_factor": factor}

@@ -19,6 +19,7 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
     EMPTY_CELL,
+    PRESENT,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
@@ -82,6 +83,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     titles = _catalogue_titles(diagnosis)
     before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
     sentences = [finding.sentence for finding in other_findings(diagnosis)]
+    if diagnosis.uncompared is not None:
+        sentences.insert(0, _cut_in_words(diagnosis.uncompared, diagnosis.rounds))
     if diagnosis.solver_error:
         return sentences
     if diagnosis.identified:
@@ -107,7 +110,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 "Far larger than usual (relative to the prior's standard deviation): "
                 f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
                 "suspect another cause.")
-        if not diagnosis.converged:
+        if not diagnosis.converged and diagnosis.uncompared is None:
             sentences.append(
                 f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
                 "their amplitudes still changed.")
@@ -117,7 +120,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 "many effects together are a fit rather than a diagnosis, and some of them take "
                 "the place of another cause.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
-        start = ("Nothing else is missing that this map can show: with that," if sentences
+        start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
+                 "Nothing else is missing that this map can show: with that," if sentences
                  else "Nothing is missing that this map can show:")
         return [*sentences, f"{start} the map agrees with the study within noise (chi² per reading "
                 f"{after.prior_conflict:.3g}).",
@@ -154,6 +158,13 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     return sentences
 
 
+def _cut_in_words(uncompared: int, rounds: int) -> str:
+    """Say that the time limit cut the search."""
+    text = ("The time limit cut the search after "
+            f"{rounds} {'rounds' if rounds > 1 else 'round'}: this is what it had so far")
+    return f"{text}, with {uncompared} hypotheses not compared." if uncompared else f"{text}."
+
+
 def _over_prior_sd(identified: IdentifiedEffect) -> float:
     """Return the largest ratio of an amplitude to its prior standard deviation.
 
@@ -172,7 +183,7 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
              for finding in other_findings(diagnosis)]
     return found + [
         {"effect": effect.selection.candidate.effect,
-         "place": place_in_words(effect.hypothesis.place),
+         "place": place_in_words(effect.place),
          "amplitude": "; ".join(amounts(effect)),
          "log Bayes factor": f"{effect.selection.log_bayes_factor:.1f}",
          "it could be": ", ".join(rival.effect for rival, _ in rivals(effect)) or EMPTY_CELL}
@@ -264,8 +275,8 @@ def write_diagnosis_report(
 def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
     """Describe an effect with its place and amplitudes."""
     effect = identified.hypothesis.effect
-    parts = [_title(effect.name, titles), place_in_words(identified.hypothesis.place),
-             "" if effect.is_binary else "; ".join(amounts(identified))]
+    parts = [_title(effect.name, titles), place_in_words(identified.place),
+             "; ".join(text for text in amounts(identified) if text != PRESENT)]
     return ", ".join(part for part in parts if part)
 
 
@@ -312,7 +323,7 @@ def _entry(identified: IdentifiedEffect, titles: dict[str, str]) -> dict[str, st
     """Return the row of an effect in the page's table of findings."""
     effect = identified.hypothesis.effect
     return {"finding": _title(effect.name, titles),
-            "place": place_in_words(identified.hypothesis.place) or EMPTY_CELL,
+            "place": place_in_words(identified.place) or EMPTY_CELL,
             "amplitude": "; ".join(text.replace(" ", "\u00a0") for text in amounts(identified)),
             "log Bayes factor": f"{identified.selection.log_bayes_factor:.1f}",
             "kind": effect.kind}

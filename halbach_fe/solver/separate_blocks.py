@@ -69,11 +69,14 @@ class SeparateReaction:
     without_losses : tuple of Moments
         The same of blocks that have lost nothing, from which the error bar follows if the study
         infers variations inside the blocks, which make up for errors of the losses.
+    slow : bool
+        Whether ``blocks`` have irreversible losses, whose field converges slowly.
     """
 
     blocks: tuple[Moments, ...]
     iron: IronReaction | None
     without_losses: tuple[Moments, ...] = ()
+    slow: bool = False
 
     def field(self, points: Floats) -> Floats:
         """Return the reaction (n, 3) in T at points (n, 3) in m."""
@@ -91,7 +94,8 @@ class SeparateReaction:
             from halbach_fe.solver.moments.solve import field_with_errors
 
             fine, coarse = self.without_losses or self.blocks
-            field, error = field_with_errors(fine, coarse, points)
+            field, error = field_with_errors(
+                fine, coarse, points, self.slow and not self.without_losses)
             if self.without_losses:
                 field = self.blocks[0].reaction(points)
         if self.iron is not None:
@@ -125,7 +129,7 @@ def solve_separate(
         apart = estimate and magnet.has_losses and magnet.study.prior.variation_sd > 0
         return SeparateReaction(
             tuple(_polarized(magnet, system) for system in systems[:1 if apart else 2]), None,
-            tuple(system.solve() for system in systems) if apart else ())
+            tuple(system.solve() for system in systems) if apart else (), magnet.has_losses)
     bodies = iron_rectangles(magnet)
     remanent = _remembered(field_in_vacuum(blocks))
     if not systems:
@@ -144,7 +148,8 @@ def solve_separate(
             if estimate:
                 iron = solve_iron(bodies, source, session, magnet.name, start=iron)
             return SeparateReaction(tuple(
-                _polarized(magnet, system, iron.field) for system in systems), iron)
+                _polarized(magnet, system, iron.field) for system in systems), iron,
+                slow=magnet.has_losses)
         before = now
     raise HalbachError(
         f"Blocks and iron of study {magnet.name} do not come to rest in {MAX_TURNS} turns: the "

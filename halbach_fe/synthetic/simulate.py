@@ -39,6 +39,7 @@ from halbach_fe.synthetic.hidden_effects import (
     with_effects,
 )
 from halbach_fe.synthetic.hidden_effects.effect_types import site_of
+from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import Progress, no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
 from halbach_fe.synthetic.optional_packages import version_of
@@ -205,7 +206,8 @@ def true_field(
     everywhere = np.vstack([points, spheres])
     field = (vacuum_field(magnet.all_bodies, everywhere, progress)
              + reaction_field(magnet, everywhere, elements, progress)
-             + _external_field(magnet, everywhere, progress))
+             + _external_field(magnet, everywhere, progress)
+             + lost_field(magnet.losses, everywhere))
     result = field[:len(points)]
     for sphere, own in zip(magnet.objects, field[len(points):], strict=True):
         result = result + moment_field(np.array([sphere.place]), 3 * sphere.volume * own[None],

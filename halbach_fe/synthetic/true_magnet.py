@@ -39,6 +39,26 @@ class BodyPart:
 
 
 @dataclass(frozen=True)
+class LostCell:
+    """A part of a body that has lost a part of its remanence.
+
+    Attributes
+    ----------
+    body : Body
+        The block, or a slice of it along z.
+    u, v : Fractions
+        Limits of the cell in the body, see `BodyPart`.
+    part : float
+        Part of the remanence that is lost.
+    """
+
+    body: Body
+    u: Fractions
+    v: Fractions
+    part: float
+
+
+@dataclass(frozen=True)
 class Body:
     """One block of magnet material.
 
@@ -235,6 +255,8 @@ class TrueMagnet:
         Neighbouring magnets in vacuum that the study knows of.
     dipoles : tuple of pairs of tuples
         Places in m and moments in A m^2 of distant magnetized objects.
+    losses : tuple of LostCell
+        What the blocks of a magnet in vacuum have lost.
     """
 
     dimension: int
@@ -245,6 +267,7 @@ class TrueMagnet:
     objects: tuple[SoftSphere, ...] = ()
     neighbours: tuple[VacuumNeighbour, ...] = ()
     dipoles: tuple[tuple[Vector, Vector], ...] = ()
+    losses: tuple[LostCell, ...] = ()
 
     @property
     def all_bodies(self) -> tuple[Body, ...]:

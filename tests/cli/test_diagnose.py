@@ -341,10 +341,59 @@ def test_the_documentation_says_what_is_in_the_file():
         position_noise=None, solver_error=None, unknown=None, found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, converged=True, positions=(), limits=None,
-        floor_T=None)
+        floor_T=None, uncompared=None)
     assert keys == list(diagnosis_summary(nothing))
     assert all(f"`{name}`" in section for name in ERRORS_BY_PLAUSIBILITY)
     rows = [line.split("|") for line in section.splitlines()
             if line.startswith(("| field |", "| instrument |"))]
     assert {(row[1].strip(), name.strip()) for row in rows for name in row[2].split(",")} == {
         (effect.kind, effect.name) for effect in catalogue()}
+
+
+def test_a_dry_run_counts_and_writes_nothing(study, tmp_path, capsys):
+    data, out = measured(tmp_path, 0.0), tmp_path / "out"
+    arguments = ["diagnose", str(study), "--measurements", str(data), "-o", str(out),
+                 "--getdp", "/nonexistent", "--dry-run"]
+    assert main([*arguments, "--effects", "gain_x,block_missing,recoil_permeability",
+                 "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    # a gain, 16 blocks, and a permeability whose signature is the field of another magnet
+    assert (found["signatures"], found["fields"]) == (1 + 16 + 1, 1)
+    assert found["each_round"]["parameters"] == 48
+    assert found["each_round"]["readings"] == 600
+    assert 0 < found["seconds"][0] < found["seconds"][1]
+    assert main([*arguments, "--effects", "gain_x"]) == 0
+    said = capsys.readouterr()
+    assert "compares 1 hypotheses" in said.err
+    assert "parameters" in said.out
+    assert not out.exists()
+
+
+def test_a_time_limit_says_what_there_was_time_for(study, tmp_path, capsys):
+    """The first inference is always finished; after it there is no time for any effect."""
+    data, out = measured(tmp_path, SAG_M), tmp_path / "out"
+    arguments = ["diagnose", str(study), "--measurements", str(data), "-o", str(out),
+                 "--effects", CHOICE]
+    assert main([*arguments, "--time-limit", "1e-3"]) == 0
+    said = capsys.readouterr()
+    assert "The time limit cut the search after 1 round" in said.err
+    assert "hypotheses not compared" in said.err
+    assert "Nothing is missing" not in said.err
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["cut"] == {"uncompared": 5 + 16}
+    assert (found["effects"], found["rounds"]) == ([], 1)
+    assert found["scores"]["after"][0]["chi2_per_reading"] > 1.5
+    assert "cut the search" in (out / "diagnosis.html").read_text()
+    assert (out / "study.diagnosed.toml").read_text() == STUDY
+    assert main([*arguments, "--time-limit", "3600"]) == 0  # negative control: time enough
+    assert json.loads((out / "diagnosis.json").read_text())["cut"] is None
+
+
+@pytest.mark.parametrize("limit", ["nan", "-1", "0", "inf", "soon"])
+@pytest.mark.parametrize("verb", ["diagnose", "infer"])
+def test_no_limit_is_refused(study, tmp_path, capsys, verb, limit):
+    with pytest.raises(SystemExit) as stopped:
+        main([verb, str(study), "--measurements", "map.csv", "-o", str(tmp_path / "out"),
+              f"--time-limit={limit}"])
+    assert stopped.value.code == 2
+    assert "--time-limit" in capsys.readouterr().err

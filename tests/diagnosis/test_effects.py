@@ -25,7 +25,8 @@ STUDY = parse_study(changed(
 POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
 TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
-SOLVED = {"iron_ring", "iron_saturation", "recoil_permeability", "recoil_permeability_across"}
+SOLVED = {"iron_ring", "iron_saturation", "knee", "recoil_permeability",
+          "recoil_permeability_across"}
 STEP = 0.05
 """Of the amplitudes' standard deviations: as far as most effects are linear."""
 

@@ -15,7 +15,7 @@ from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
 SCRIPT = ROOT / "studies" / "diagnosis" / "run.py"
-FEW = {"offset_z": 28, "arm_sag": 47, "none": 143, "coil": 169}
+FEW = {"offset_z": 29, "arm_sag": 48, "none": 145, "coil": 171}
 """Numbers of cases: two single effects, nothing, and one outside the catalogue, whose field an
 offset and two misalignments add up to."""
 

@@ -47,7 +47,7 @@ COARSE = Elements(0.04, 3)
 BY_NGSOLVE = ("iron_ring", "recoil_permeability", "recoil_permeability_across")
 SELECTORS = {"ring": 1.0, "slot": 1.0, "other_ring": 1.0, "other_slot": 1.0, "seam": 1.0,
              "first": 1.0, "second": 1.0}
-ALWAYS = ("block_flipped", "block_missing", "neighbour_magnet", "sign_flipped_axis",
+ALWAYS = ("block_flipped", "block_missing", "knee", "neighbour_magnet", "sign_flipped_axis",
           "millimetres", "millitesla", "reversed_z")
 """Effects that have no size."""
 
@@ -57,6 +57,7 @@ NAMES = [
     "blocks_swapped", "block_flipped", "block_missing", "block_demagnetized",
     "corners_demagnetized", "magnetization_gradient", "temperature", "temperature_gradient",
     "inner_radius", "length", "background", "neighbour_magnet", "ferromagnetic_object",
+    "knee",
     "gain_x", "gain_y", "gain_z", "offset_x", "offset_y", "offset_z", "misalignment_xy",
     "misalignment_xz", "misalignment_yx", "misalignment_yz", "misalignment_zx",
     "misalignment_zy", "planar_hall", "quadratic_nonlinearity", "cubic_nonlinearity",

@@ -37,12 +37,16 @@ class Parameter:
         Prior standard deviation about 0.
     minimum : float
         Smallest amplitude that is physically possible, such as 0 for a gap that cannot be negative.
+    longest_step : float
+        Largest change of the amplitude between two solutions of the full model, for effects that
+        are far from linear.
     """
 
     name: str
     unit: str
     sd: float
     minimum: float = -np.inf
+    longest_step: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ class Place:
         Coordinates or lengths in m, whose meaning depends on the effect.
     other : (int, int)
         Ring and slot of the second block of effects that concern two; (0, 0) for others.
+    words : str
+        Description of a place that is no position; empty for others.
     labels : tuple of str
         Names of these blocks, of which free blocks have their own; empty to number them.
     """
@@ -65,6 +71,7 @@ class Place:
     slot: int = 0
     at_m: tuple[float, ...] = ()
     other: tuple[int, int] = (0, 0)
+    words: str = ""
     labels: tuple[str, ...] = field(default=(), compare=False)
 
     @property
@@ -72,6 +79,8 @@ class Place:
         """The label of the place in reports; empty if the effect has a single place."""
         ring, slot = (f"{letter}{number:02d}" if number else ""
                       for letter, number in (("r", self.ring), ("s", self.slot)))
+        if self.words:
+            return self.words
         if self.at_m:
             lengths = (round(length, 6) + 0.0 for length in self.at_m)  # no -0, no 1e-18
             return f"at {', '.join(f'{length:.4g}' for length in lengths)} m"
@@ -154,6 +163,15 @@ class Effect(ABC):
         """
         return np.empty((0, *nominal.points.shape))
 
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """Return the change of the readings (k + r, n, 3) in T per unit of all amplitudes.
+
+        That is at ``values``, of an effect in the model that is not applied in full: the signature
+        followed by the refinements.
+        """
+        return np.concatenate([self.signature(nominal, place),
+                               self.refine(nominal, place, values)])
+
     @abstractmethod
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """Return the study with the effect applied in full, not only to first order.
@@ -161,6 +179,17 @@ class Effect(ABC):
         The amplitudes ``values`` add to those that the study has already. ``values`` can include
         those of the refinements.
         """
+
+    def refined_place(self, place: Place, values: Sequence[float]) -> Place:
+        """Return where the effect is by its amplitudes; by default its place."""
+        return place
+
+    def reported(self, place: Place, values: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        """Return amplitudes (k,) and their standard deviations (k,) as reports state them.
+
+        They are the fitted ones, unless other numbers mean more to people.
+        """
+        return values, sd
 
 
 class InstrumentEffect(Effect):

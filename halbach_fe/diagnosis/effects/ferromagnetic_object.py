@@ -14,18 +14,26 @@ from halbach_fe.solver.external_field import dipole_field
 from halbach_fe.study.magnet import PointDipole
 from halbach_fe.study.model import Study
 
+STEP_M = 1e-4
+"""Step of the finite differences with respect to the position."""
+
 BEYOND_M = (0.03, 0.08, 0.15, 0.25)
 """Distances of the candidate places from the magnet's ends."""
 
 
 class FerromagneticObjectEffect(Effect):
-    """A small magnetized object, modelled as a point dipole."""
+    """A small magnetized object, modelled as a point dipole.
+
+    The places are a coarse grid. The refinements are the displacement of the object from its place,
+    by short steps: far from the object the field does not say where it is.
+    """
 
     name = "ferromagnetic_object"
     title = "ferromagnetic object near the bore"
     kind = "field"
     parameters = (
         Parameter("x", "A m2", 3.0), Parameter("y", "A m2", 3.0), Parameter("z", "A m2", 3.0),)
+    refinements = tuple(Parameter(f"at {axis}", "m", 0.05, longest_step=0.02) for axis in "xyz")
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
@@ -47,11 +55,36 @@ class FerromagneticObjectEffect(Effect):
         position = np.array(place.at_m)
         return np.array([dipole_field(position, moment, nominal.points) for moment in np.eye(3)])
 
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`."""
+        position, moment = _at(place, values), np.array(values[:3])
+        slopes = [(dipole_field(position + step, moment, nominal.points)
+                   - dipole_field(position - step, moment, nominal.points)) / (2 * STEP_M)
+                  for step in STEP_M * np.eye(3)]
+        fields = [dipole_field(position, unit, nominal.points) for unit in np.eye(3)]
+        return np.array([*fields, *slopes])
+
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        x, y, z = map(float, values)
-        dipole = PointDipole(position_m=place.at_m, moment_A_m2=(x, y, z))
+        x, y, z = map(float, values[:3])
+        position_x, position_y, position_z = _at(place, values).tolist()
+        dipole = PointDipole(position_m=(position_x, position_y, position_z), moment_A_m2=(x, y, z))
         return study.with_(external__dipoles=(*study.external.dipoles, dipole))
+
+    def refined_place(self, place: Place, values: Sequence[float]) -> Place:
+        """See `Effect.refined_place`."""
+        return Place(at_m=tuple(_at(place, values).tolist()))
+
+    def reported(self, place: Place, values: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        """See `Effect.reported`."""
+        if len(values) == len(self.parameters):
+            return values, sd
+        return np.concatenate([values[:3], _at(place, values.tolist())]), sd
+
+
+def _at(place: Place, values: Sequence[float]) -> Floats:
+    """Return the position (3,) in m of the object."""
+    return np.array(place.at_m) + (np.array(values[3:]) if len(values) > 3 else 0.0)
 
 
 EFFECTS = (FerromagneticObjectEffect(),)

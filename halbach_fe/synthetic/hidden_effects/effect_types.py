@@ -19,12 +19,17 @@ from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.true_magnet import TrueMagnet, Vector
 
-Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "x", "y", "z", "circles"]
+Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "vacuum", "few blocks",
+               "x", "y", "z", "circles"]
 """A requirement of an effect on the study.
 
 These are three dimensions, several rings, nothing but equal rings, only blocks of four edges, no
-iron in the study, an observed component x, y or z, and points off the axis (``circles``).
+iron in the study, blocks in vacuum besides, at most `FEW_BLOCKS` of them, an observed component x,
+y or z, and points off the axis (``circles``).
 """
+
+FEW_BLOCKS = 64
+"""Largest number of blocks of a magnet whose losses are simulated, in a minute or two."""
 
 REFERENCE_OUTER_RADIUS_M = 0.2
 """Outer radius in m of the magnets whose tolerances are drawn here.
@@ -43,8 +48,8 @@ class Site:
         Dimension of the study, number of rings, and largest number of blocks per ring.
     inner, outer, half_length : float, in m
         Radii and half length of the array; infinite length in two dimensions.
-    permeability : float
-        Relative recoil permeability.
+    permeability, most_permeable : float
+        Smallest and largest relative recoil permeability.
     has_iron : bool
         Whether the study has an iron ring.
     components : tuple of str
@@ -66,6 +71,7 @@ class Site:
     outer: float
     half_length: float
     permeability: float
+    most_permeable: float
     has_iron: bool
     components: tuple[Component, ...]
     radius: float
@@ -85,6 +91,8 @@ class Site:
         if need in ("x", "y", "z"):
             return need in self.components
         return {"3d": self.dimension == 3, "rings": self.rings > 1, "no iron": not self.has_iron,
+                "few blocks": len(self.places) <= FEW_BLOCKS,
+                "vacuum": not self.has_iron and self.permeability == self.most_permeable == 1.0,
                 "equal rings": self.is_uniform, "four edges": self.has_four_edges,
                 "circles": self.radius > 0}[need]
 
@@ -104,7 +112,8 @@ def site_of(study: Study, magnet: TrueMagnet) -> Site:
         inner, outer = float(radii.min()), float(radii.max())
     return Site(
         study.dimension, len(sizes), max(sizes), inner, outer, magnet.half_length,
-        min(min(body.along, body.across) for body in magnet.bodies), magnet.iron is not None,
+        min(min(body.along, body.across) for body in magnet.bodies),
+        max(max(body.along, body.across) for body in magnet.bodies), magnet.iron is not None,
         ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components,
         float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].min()),
         float(points[:, 2].max()), tuple((body.ring, body.slot) for body in magnet.bodies),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     HiddenEffect,
     HiddenParameter,
@@ -20,6 +21,7 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     signed_log_uniform,
 )
 from halbach_fe.synthetic.iron import FroehlichLaw, TrueIron, Tube
+from halbach_fe.synthetic.knee_losses import with_knee_losses
 from halbach_fe.synthetic.shapes import PrismBody, SectorBody
 from halbach_fe.synthetic.true_magnet import (
     Body,
@@ -258,6 +260,11 @@ def corners_demagnetized(magnet: TrueMagnet, site: Site, fraction: float) -> Tru
     return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)))
 
 
+def knee(magnet: TrueMagnet, site: Site, coercivity: float, squareness: float) -> TrueMagnet:
+    """Take off what a knee of the demagnetization curve lets the blocks' own field take."""
+    return with_knee_losses(magnet, MU_0 * coercivity, squareness)
+
+
 def magnetization_gradient(
     magnet: TrueMagnet, site: Site, ring: float, slot: float, fraction: float
 ) -> TrueMagnet:
@@ -431,4 +438,9 @@ EFFECTS = (
     HiddenEffect("ferromagnetic_object", "field",
                  (*(HiddenParameter(name, M) for name in "xyz"), HiddenParameter("volume", "m^3")),
                  _draw_object, ferromagnetic_object, needs=("3d",)),
+    HiddenEffect("knee", "field",
+                 (HiddenParameter("coercivity", "A/m"), HiddenParameter("squareness")),
+                 lambda site, generator: (generator.uniform(5.0e5, 5.8e5),
+                                          generator.uniform(0.8, 0.9)),
+                 knee, needs=("3d", "vacuum", "few blocks", "four edges")),
 )

@@ -1,0 +1,114 @@
+"""What a diagnosis would solve, counted before it is started."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.diagnose import MAX_ROUNDS, blocks_of
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
+from halbach_fe.diagnosis.gross_errors import find_gross_errors
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import observation_of
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.instrument import probe_points
+from halbach_fe.response.resource_estimate import (
+    OWN_SECONDS,
+    Estimate,
+    estimate_infer,
+    estimate_solve,
+)
+from halbach_fe.study.model import Study
+
+FEWEST_ROUNDS = 2
+"""Rounds of a diagnosis that adds an effect, of which the second confirms it; a map that lacks
+nothing takes one."""
+
+
+@dataclass(frozen=True)
+class DiagnosisEstimate:
+    """The cost of a diagnosis.
+
+    Attributes
+    ----------
+    update : Estimate
+        Cost of the inference that every round computes.
+    signatures : int
+        Number of hypotheses whose signatures are computed in the first round.
+    fields : int
+        Number of fields of whole magnets that these signatures need, with iron for example.
+    fields_s : float
+        Time in s of these fields.
+    """
+
+    update: Estimate
+    signatures: int
+    fields: int
+    fields_s: float
+
+    def seconds(self, rounds: int) -> float:
+        """Return the time in s of so many rounds."""
+        return OWN_SECONDS + rounds * (self.update.seconds - OWN_SECONDS) + self.fields_s
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the estimate as plain data for JSON."""
+        return {"rounds": [FEWEST_ROUNDS, MAX_ROUNDS], "signatures": self.signatures,
+                "fields": self.fields, "seconds": [
+                    self.seconds(FEWEST_ROUNDS), self.seconds(MAX_ROUNDS)],
+                "each_round": self.update.as_dict()}
+
+
+def estimate_diagnosis(
+    study: Study, data: xr.Dataset, blocks: BlockTable | None = None,
+    effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
+    jobs: int = 1,
+) -> DiagnosisEstimate:
+    """Estimate the cost of `halbach_fe.diagnosis.diagnose.diagnose`, with nothing solved.
+
+    Gross errors of the map are found, as in the diagnosis, because the magnet is solved at the
+    corrected positions.
+    """
+    corrected = study
+    for error in find_gross_errors(study, data, blocks):
+        corrected = error.apply(corrected)
+    blocks = blocks_of(blocks, study, corrected)
+    study, magnet = corrected, build_magnet(corrected)
+    observation = observation_of(magnet, data, blocks, validation_map)
+    points = probe_points(study.instrument, observation.map_points)[:1]
+    signatures, fields, seconds = 0, 0, 0.0
+    for effect in catalogue() if effects is None else effects:
+        places = effect.places(study)
+        if not places:
+            continue
+        signatures += min(len(places), SHORTLIST) if effect.name == "blocks_swapped" else len(
+            places)
+        asked = _asked(effect, study, points, places[0])
+        if asked:  # all places of an effect need fields of much the same cost
+            fields += len(places) * len(asked)
+            seconds += len(places) * sum(
+                estimate_solve(build_magnet(each), observation, jobs).seconds - OWN_SECONDS
+                for each in asked)
+    return DiagnosisEstimate(estimate_infer(magnet, observation, jobs), signatures, fields,
+                             seconds)
+
+
+def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[Study]:
+    """Return the magnets whose field the signature at a place needs."""
+    asked: list[Study] = []
+
+    def solve(changed: Study) -> Floats:
+        if changed != study:  # the field of the study itself is shared by all
+            asked.append(changed)
+        return np.zeros((len(points), 3))
+
+    nominal = NominalFields(study, points, np.zeros(len(points)), solve)
+    effect.signature(nominal, place)
+    return asked

@@ -1,0 +1,145 @@
+"""Blocks that the knee of their demagnetization curve has made lose remanence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.study.magnet import MOST_SQUARE, Demagnetization
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study
+
+COERCIVITIES = tuple(np.geomspace(0.45, 1.5, 12).tolist())
+"""Candidate coercivities mu_0 H_cJ relative to the remanence, one place each. Fields that oppose
+the magnetization in a Halbach array reach from 0.3 to 1.3 times the remanence. Between two places
+the losses change by a factor of 2 to 5, so that one of them explains most of any losses."""
+
+STATED = (1.1, 1.0, 0.91, 0.83, 0.75, 0.68, 0.62, 0.56, 0.51)
+"""Candidate coercivities relative to that of the study's table `demagnetization`, if it has one:
+down to that of NdFeB which is 80 K hotter."""
+
+SQUARENESS, LEAST_SQUARE = 0.85, 0.3
+"""Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
+
+SIGNATURE_CELLS, FEWEST_CELLS = 3, 4
+"""Smallest number of cells along the side of a block for the losses of a signature, and of the
+model."""
+
+MOST_BLOCKS = 100
+"""Largest number of blocks for which losses are searched unless the study describes the material:
+each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
+
+STEPS = (0.01, 0.05)
+"""Steps of the finite differences, in the logarithms of `KneeEffect.refinements`."""
+
+
+class KneeEffect(Effect):
+    """The blocks have lost what their own field takes by the knee of the demagnetization curve.
+
+    A place is a coercivity. The refinements are the logarithms of the coercivity relative to it and
+    of the odds of the squareness, so that no step leads to impossible ones; reports state
+    coercivity and squareness. A temperature acts by the coercivity alone, which is that at the
+    temperature the magnet has had: the two cannot be told apart.
+    """
+
+    name = "knee"
+    title = "losses by the knee of the demagnetization curve"
+    kind = "field"
+    parameters = (Parameter("there", "1", 1.0),)
+    refinements = (Parameter("coercivity", "A/m", 0.1, longest_step=0.05),
+                   Parameter("squareness", "1", 1.0, longest_step=0.5))
+    unique = True
+    is_binary = True
+    applied_in_full = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """See `Effect.places`."""
+        material = study.demagnetization
+        if study.dimension == 2 or (material is not None and material.irreversible):
+            return []
+        blocks = build_magnet(study).blocks
+        strongest = max((block.remanence for block in blocks), default=0.0)
+        if material is not None:
+            stated = material.intrinsic_coercivity_A_per_m * (
+                1 + material.coercivity_coefficient_per_K * (
+                    material.temperature_C - material.reference_temperature_C))
+            values = [factor * stated for factor in STATED]
+        elif len(blocks) <= MOST_BLOCKS:
+            values = [factor * strongest / MU_0 for factor in COERCIVITIES]
+        else:
+            return []
+        found = [Place(at_m=(value,), words=f"near {value / 1e3:.0f} kA/m") for value in values]
+        try:
+            self.apply(study, found[0], [1.0])
+        except HalbachError:  # the study asks for a route that has no losses
+            return []
+        return found
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        before, cells = nominal.study, _cells(nominal.study, SIGNATURE_CELLS)
+        if not nominal.magnet.is_vacuum:  # by the same route, so that both have the same cells
+            before = before.with_(solver__route="moments", mesh__cells_per_side=cells)
+        lost = self.apply(before, place, [1.0]).with_(mesh__cells_per_side=cells)
+        return (nominal.solve(lost) - nominal.solve(before))[None]
+
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.refine`."""
+        here = nominal.solve(self.apply(nominal.study, place, values))
+        return np.array([
+            (nominal.solve(self.apply(nominal.study, place, np.add(
+                values, step * np.eye(3)[1 + number]).tolist())) - here) / step
+            for number, step in enumerate(STEPS)])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`."""
+        _, coercivity, squareness = [*values, 0.0, 0.0][:3]
+        law = {"intrinsic_coercivity_A_per_m": _coercivity(place, coercivity),
+               "squareness": _squareness(squareness), "irreversible": True}
+        material = study.demagnetization
+        if material is None:
+            changed = Demagnetization.model_validate(
+                {"remanence_coefficient_per_K": 0.0, "coercivity_coefficient_per_K": 0.0} | law)
+        else:
+            law["intrinsic_coercivity_A_per_m"] /= 1 + material.coercivity_coefficient_per_K * (
+                material.temperature_C - material.reference_temperature_C)
+            changed = material.with_(**law)
+        return study.with_(demagnetization=changed, mesh__cells_per_side=_cells(study))
+
+    def reported(self, place: Place, values: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        """See `Effect.reported`."""
+        values, sd = values.copy(), sd.copy()
+        if len(values) > 1:
+            relative, odds = values[1:]
+            values[1] = _coercivity(place, relative)
+            sd[1] *= values[1]
+            share = (_squareness(odds) - LEAST_SQUARE) / (MOST_SQUARE - LEAST_SQUARE)
+            values[2] = _squareness(odds)
+            sd[2] *= (MOST_SQUARE - LEAST_SQUARE) * share * (1 - share)
+        return values, sd
+
+
+def _coercivity(place: Place, relative: float) -> float:
+    """Return the coercivity in A/m at ``relative``, the logarithm of its ratio to the place's."""
+    return float(place.at_m[0] * np.exp(relative))
+
+
+def _squareness(log_odds: float) -> float:
+    """Return the squareness between its limits at a log odds that is 0 for `SQUARENESS`."""
+    start = (SQUARENESS - LEAST_SQUARE) / (MOST_SQUARE - LEAST_SQUARE)
+    odds = start / (1 - start) * float(np.exp(log_odds))
+    return LEAST_SQUARE + (MOST_SQUARE - LEAST_SQUARE) * odds / (1 + odds)
+
+
+def _cells(study: Study, fewest: int = FEWEST_CELLS) -> int:
+    """Return the study's number of cells along a block's side, or the fewest for losses."""
+    return max(fewest, study.mesh.cells_per_side or 0)
+
+
+EFFECTS = (KneeEffect(),)

@@ -1,0 +1,74 @@
+"""The time that a diagnosis takes: progress within its steps, time left, and the limit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from halbach_fe.solver.session import Progress
+
+QUIET_S = 10.0
+"""Time in s between two lines about the progress of one step."""
+
+MINUTE_S, HOUR_S = 60.0, 3600.0
+
+
+@dataclass
+class Pace:
+    """Reports the progress of the step under way, and tells when the time is up.
+
+    Attributes
+    ----------
+    say : callable
+        Takes a line of text.
+    show : callable, optional
+        Takes the numbers of finished and of all parts of a step, for a progress bar.
+    limit_s : float, optional
+        Time limit in s from the beginning.
+    clock : callable
+        Returns the time in s.
+    """
+
+    say: Callable[[str], None]
+    show: Progress | None = None
+    limit_s: float | None = None
+    clock: Callable[[], float] = time.monotonic
+    _step: str = ""
+    _begun: float = field(init=False)
+    _step_begun: float = field(init=False)
+    _said: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._begun = self._step_begun = self._said = self.clock()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time limit has passed."""
+        return self.limit_s is not None and self.clock() - self._begun >= self.limit_s
+
+    def begin(self, step: str) -> None:
+        """Begin a step, whose name the lines about its progress start with."""
+        self._step, self._step_begun = step, self.clock()
+        self._said = self._step_begun
+
+    def advance(self, done: int, total: int) -> None:
+        """Report that parts of the step are done, with the time left at the pace so far."""
+        if self.show is not None:
+            self.show(done, total)
+        now = self.clock()
+        if not done:  # a step may count anew
+            self._step_begun = now
+        elif done < total and now - self._said >= QUIET_S:
+            left = (now - self._step_begun) * (total - done) / done
+            self.say(f"{self._step}: {done} of {total}, about {duration(left)} left")
+            self._said = now
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in s, min or h, whichever is read most easily."""
+    if seconds < MINUTE_S:
+        return f"{seconds:.0f} s"
+    if seconds < HOUR_S:
+        return f"{seconds / MINUTE_S:.0f} min"
+    return f"{seconds / HOUR_S:.1f} h"

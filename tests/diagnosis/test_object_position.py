@@ -1,0 +1,76 @@
+"""The position of a magnetized object, by magpylib, is refined beyond the grid of places."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.effects.ferromagnetic_object import FerromagneticObjectEffect
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.diagnosis.summary import diagnosis_summary
+from halbach_fe.measurement.field_map import field_map, points_of
+from tests.diagnosis.campaign import CIRCLES, STUDY, measured
+
+POSITION_M = np.array([0.043, 0.171, 0.148])
+"""Between the places of the grid."""
+MOMENT_A_M2 = np.array([6.0, -15.0, 12.0])
+RADIUS_M = 0.01
+
+
+def sphere(points):
+    """B (n, 3) in T of a magnetized sphere, which is that of a dipole outside."""
+    magnet = magpylib.magnet.Sphere(
+        diameter=2 * RADIUS_M, position=POSITION_M,
+        magnetization=MOMENT_A_M2 / (4 / 3 * np.pi * RADIUS_M**3))
+    return magnet.getB(points)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_position_is_that_of_the_sphere(session, generator, there):
+    data = measured(STUDY, generator)
+    if there:
+        data = field_map(points_of(data), np.add(data["B_T"].values, sphere(CIRCLES)))
+    effects = [one for one in catalogue() if one.name in (
+        "background", "ferromagnetic_object", "gain_x", "neighbour_magnet")]
+    found = diagnose(STUDY, data, session, effects=effects)
+    if not there:  # negative control
+        assert found.identified == ()
+        return
+    (named,) = found.identified
+    assert named.hypothesis.effect.name == "ferromagnetic_object"
+    assert found.converged
+    (values, sd) = named.reported
+    true = np.concatenate([MOMENT_A_M2, POSITION_M])
+    assert np.abs(values - true) / sd == pytest.approx(np.zeros(6), abs=4.0)
+    distance = np.linalg.norm(values[3:] - POSITION_M)
+    places = np.array([place.at_m for place in named.hypothesis.effect.places(STUDY)])
+    nearest = np.linalg.norm(places - POSITION_M, axis=1).min()
+    assert distance < 0.2 * nearest
+    assert found.after.prior_conflict < found.after.conflict_limit
+    dipole = found.study.external.dipoles[-1]
+    assert dipole.position_m == pytest.approx(values[3:])
+    entry = diagnosis_summary(found)["effects"][0]
+    assert entry["place"] == named.place.name
+    assert entry["parameters"][3]["value"] == pytest.approx(values[3])
+
+
+def test_derivatives_by_the_position():
+    effect = FerromagneticObjectEffect()
+    nominal = NominalFields(STUDY, CIRCLES[:20], np.zeros(20), lambda _: np.zeros((20, 3)))
+    place, values = Place(at_m=(0.2, 0.0, 0.1)), np.array([1.0, 0.5, -2.0, 0.01, -0.02, 0.005])
+
+    def shown(amounts):
+        (dipole,) = effect.apply(STUDY, place, amounts.tolist()).external.dipoles
+        return magpylib.misc.Dipole(
+            moment=dipole.moment_A_m2, position=dipole.position_m).getB(nominal.points)
+
+    found = effect.derivative(nominal, place, values.tolist())
+    for number, step in enumerate((1e-3,) * 3 + (1e-5,) * 3):
+        moved = step * np.eye(6)[number]
+        change = (shown(values + moved) - shown(values - moved)) / (2 * step)
+        assert np.abs(found[number] - change).max() < 1e-3 * np.abs(change).max()
+        assert np.abs(found[number] + change).max() > np.abs(change).max()
