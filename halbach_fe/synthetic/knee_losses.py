@@ -103,6 +103,7 @@ def _field_of_loss(cell: _Cell, points: Floats) -> Floats:
     """
     body, away = cell.body, points - cell.middle
     distance = np.linalg.norm(away, axis=1)
+    assert not isinstance(body.shape, CylinderBody)  # it has no parts
     size = np.cbrt(body.shape.volume * body.shape.share(cell.u, cell.v))
     near = distance <= NEAR * size
     field = np.zeros((len(points), 3))
