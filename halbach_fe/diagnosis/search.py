@@ -38,10 +38,25 @@ effect's k parameters."""
 
 @dataclass(frozen=True)
 class NominalSolver:
-    """Solves for the fields of nominal magnets, each of them once."""
+    """Solves for the fields of nominal magnets, each of them once, and keeps signatures."""
 
     session: Session
     _solved: dict[tuple[str, str, bytes], Any] = field(default_factory=dict, repr=False)
+    _signatures: dict[tuple[str, bytes], Signatures] = field(default_factory=dict, repr=False)
+
+    def signatures(
+        self, study: Study, update: InferenceResult, prior_mean: Floats, times: Floats
+    ) -> Signatures:
+        """Return the store of signatures for a study and its map.
+
+        They depend on everything but the readings: the places and times of the map, its noise, and
+        what is known of the blocks.
+        """
+        parts = (update.observation.map_points, times, update.errors.sd, prior_mean,
+                 update.held_out.astype(float))
+        key = study.model_dump_json(), b"".join(np.ascontiguousarray(part).tobytes()
+                                                for part in parts)
+        return self._signatures.setdefault(key, {})
 
     def field(self, study: Study, points: Floats) -> Floats:
         """Return `solve_nominal` of the magnet of a study at points (n, 3) in m."""
@@ -83,6 +98,8 @@ class Search:
         The readings with blocks and solver error integrated out.
     training : ndarray, shape (rows,)
         Whitened residual of the training readings with the identified effects in the model.
+    nominal : NominalFields
+        Of the study from which the search started.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -92,6 +109,7 @@ class Search:
     residual: Floats
     marginal: Marginal
     training: Floats
+    nominal: NominalFields
 
 
 def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
@@ -147,6 +165,7 @@ def score_hypotheses(
                              measured_magnetizations=update.by_block(prior_mean))
 
     nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
+    known = solver.signatures(study, update, prior_mean, times)
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
                 for effect in identified}
     kept = marginal.remove(response)
@@ -169,8 +188,10 @@ def score_hypotheses(
         if present is None:
             signature = signatures.get(key)
             if signature is None:
-                signature = signatures[key] = whitened(update.observation.read(
-                    effect.signature(nominal_start, place)))
+                if key not in known:
+                    known[key] = whitened(update.observation.read(
+                        effect.signature(nominal_start, place)))
+                signature = signatures[key] = known[key]
         elif effect.applied_in_full:
             others = apply_effects(
                 corrected, [other for other in identified if other is not present])
@@ -195,7 +216,8 @@ def score_hypotheses(
         end - columns[number].shape[1], end))) for number, end in zip(chosen, ends, strict=True)]
     stacked = np.hstack([columns[number] for number in chosen])
     return Search(tuple(shortlisted[number] for number in chosen), tuple(compared),
-                  marginal.evidence(stacked, residual), stacked, residual, marginal, training)
+                  marginal.evidence(stacked, residual), stacked, residual, marginal, training,
+                  nominal_start)
 
 
 def marginal_of(
@@ -284,16 +306,16 @@ def identify_effects(
     """
     excluded: set[int] = set()
     while True:
-        found = _amplitudes(
+        found = amplitudes(
             search, select_effects(search.evidence, search.candidates, excluded=excluded))
         impossible = next((number for number in range(len(found))
-                    if not _possible(corrected, found[:number + 1], points)), None)
+                    if not possible(corrected, found[:number + 1], points)), None)
         if impossible is None:
             return found
         excluded.add(search.candidates.index(found[impossible].selection.candidate))
 
 
-def _possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
+def possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
     """Tell whether a valid study can have effects of these amplitudes, with the map's points in
     air.
     """
@@ -308,7 +330,7 @@ def _possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floa
     return not inside.any()
 
 
-def _amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
+def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
     """Fit the amplitudes of all selected effects jointly."""
     evidence = search.evidence
     for selection in selected:

@@ -214,8 +214,8 @@ def source_field(
         return np.asarray(source.getB(points))
     if name == "plate":
         source = magpylib.magnet.Cuboid(
-            polarization=direction(), dimension=outer * np.array([0.1, *generator.uniform(1, 2, 2)]),
-            position=(centre := place()))
+            polarization=direction(), position=(centre := place()),
+            dimension=outer * np.array([0.1, *generator.uniform(1, 2, 2)]))
         source.rotate_from_angax(np.degrees(np.arctan2(centre[1], centre[0])), "z", anchor=None)
         return np.asarray(source.getB(points))
     return np.asarray(sum(magpylib.misc.Dipole(
