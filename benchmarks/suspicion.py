@@ -10,6 +10,7 @@ the first linearization, which is exact for such small effects.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,9 +24,16 @@ from benchmarks.unknown import FOLDER
 from halbach_fe.cli import common
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, WIDE_PRIOR_SD
+from halbach_fe.diagnosis.model_selection import (
+    EFFECT_PRIOR_ODDS,
+    WIDE_PRIOR_SD,
+    log_bayes_factors,
+    prior_log_odds,
+    with_candidates,
+)
+from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
-from halbach_fe.diagnosis.unknown_cause import families_of, judge, suspicions
+from halbach_fe.diagnosis.unknown_cause import SUSPECTED, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
@@ -69,6 +77,19 @@ def with_readings(search: Search, update: InferenceResult, data: xr.Dataset) -> 
                    evidence=search.marginal.evidence(search.columns, residual))
 
 
+def probability_at_most(search: Search, named: Sequence[IdentifiedEffect]) -> float:
+    """Return the probability that one more effect is missing, if nothing of any shape competes.
+
+    Competition only lowers it, so that cases in which it is small need not be judged.
+    """
+    chosen = [effect.selection.candidate for effect in named]
+    odds = log_bayes_factors(with_candidates(search.evidence, chosen), search.candidates)
+    odds = np.exp(odds + prior_log_odds(search.candidates))
+    total = sum(weight for candidate, weight in zip(search.candidates, odds.tolist(), strict=True)
+                if candidate not in chosen)
+    return float(total / (1 + total))
+
+
 def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[str, Any]]:
     """Judge the cases that are not there yet, and return the results of all."""
     found: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
@@ -86,13 +107,14 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
             data, name = simulated(seed)
             search = with_readings(base, update, data)
             named = identify_effects(STUDY, search, update.observation.map_points)
-            judgement = judge(search, update, named, flexible)
+            suspected: list[list[Any]] = []
+            if probability_at_most(search, named) >= SUSPECTED:
+                judgement = judge(search, update, named, flexible)
+                suspected = [[list(one.effects), one.probability]
+                             for one in suspicions(judgement, search.hypotheses)]
             found.append({
-                "seed": seed, "hidden": name,
-                "named": [search.candidates[k].effect for k in judgement.best.effects],
-                "unknown": bool(judgement.best.terms),
-                "suspected": [[list(one.effects), one.probability]
-                              for one in suspicions(judgement, search.hypotheses)]})
+                "seed": seed, "hidden": name, "suspected": suspected,
+                "named": [effect.selection.candidate.effect for effect in named]})
             write_text(path, json.dumps(found) + "\n")
     return found
 
