@@ -36,9 +36,6 @@ MANY = 3
 """Number of effects from which one unlisted cause is reported if it explains the readings as well:
 so many effects seldom come together."""
 
-FREE_SOURCES = ("ferromagnetic_object",)
-"""Sources that may be anywhere. `MANY` of them can make up any field, and so name nothing."""
-
 FITS = 1.2
 """Chi-squared per reading up to which terms alone are a full explanation, so that no other has to
 be looked for."""
@@ -253,7 +250,9 @@ class Competition:
                               deviations))
         return self._needed(effects, self.given(terms))
 
-    def best_explanations(self, catalogued: Sequence[int]) -> tuple[Explanation, Explanation]:
+    def best_explanations(
+        self, catalogued: Sequence[int], scattered: bool = False
+    ) -> tuple[Explanation, Explanation]:
         """Return the best explanation, with such effects only as may be named, and the best one
         without any effect.
 
@@ -261,6 +260,9 @@ class Competition:
         ----------
         catalogued : sequence of int
             The effects that are the best explanation by the catalogue alone, the first found first.
+        scattered : bool
+            Whether these are sources at so many places that they could make up any field, and so
+            name nothing.
         """
         by_catalogue = self.explanation(catalogued, ())
         without = self.extended(())
@@ -276,9 +278,8 @@ class Competition:
         best = max((by_catalogue, *found), key=lambda one: one.log_odds)
         if not best.terms:
             tie = without.log_odds > best.log_odds - INDISTINGUISHABLE_LOG_EVIDENCE
-            sources = sum(self.candidates[k].effect in FREE_SOURCES for k in best.effects)
-            vague = sources >= MANY or (tie and len(best.effects) >= MANY)
-            return without if vague and without.terms else by_catalogue, without
+            instead = scattered or (tie and len(best.effects) >= MANY)
+            return without if instead and without.terms else by_catalogue, without
         if not best.effects:
             return best, without
         by_terms = best.log_odds - self.explanation(best.effects, ()).log_odds

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.competition import Competition, Explanation, Term
+from halbach_fe.diagnosis.competition import MANY, Competition, Explanation, Term
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, families
 from halbach_fe.diagnosis.model_selection import (
@@ -47,6 +48,10 @@ MOST = 0.5
 """Share of the excess of chi-squared that terms may leave if they account for most of it. Of
 independent errors at hundreds of points they account for a fifth, as they have `MOST_WAVES`
 functions for each component."""
+
+NEAR_SOURCES = 0.6
+"""Distance, relative to that from the axis, within which two magnetized objects may stand for one
+between them: the places that are compared are 30 degrees apart, which is 0.52."""
 
 SUSPECTED = 0.5
 """Probability from which an effect that is not certain enough to be named is suspected."""
@@ -127,8 +132,21 @@ def judge(
     competition = Competition(marginal, columns[some], residual[some], search.candidates, flexible,
                               lambda fields: whiten(fields)[some])
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
-    best, without = competition.best_explanations(numbers)
+    sources = [effect.hypothesis.place.at_m for effect in identified
+               if effect.hypothesis.effect.name == "ferromagnetic_object"]
+    best, without = competition.best_explanations(numbers, are_scattered(sources))
     return Judgement(competition, competition.explanation(numbers, ()), best, without, whiten)
+
+
+def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
+    """Tell whether many sources are in several places, rather than beside one between them."""
+    if len(places) < MANY:
+        return False
+    points = np.array(places)
+    radius = np.hypot(points[:, 0], points[:, 1])
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    near = apart < NEAR_SOURCES * np.maximum(radius[:, None], radius)
+    return bool(connected_components(near)[0] > 1)
 
 
 def named_effects(

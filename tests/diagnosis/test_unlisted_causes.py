@@ -8,6 +8,7 @@ import pytest
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.unknown_cause import are_scattered
 from halbach_fe.report.diagnosis import verdict
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
@@ -61,6 +62,7 @@ def test_without_the_competition_false_names_appear(small, session, monkeypatch)
     """The control that must fail: the catalogue alone explains a cause that it does not have."""
     data, _ = simulate_unlisted(small, 3, UNLISTED[3])
     monkeypatch.setattr(module, "named_effects", lambda *given: given[3])
+    monkeypatch.setattr(module, "MAX_ROUNDS", 2)  # it would not come to rest
     assert false_names(diagnose(small, data, session, effects=SOME))
 
 
@@ -86,6 +88,13 @@ def test_a_missing_block_beside_an_unlisted_cause(small, session):
     assert found.unknown is not None
     assert not found.unknown.alone
     assert "outside the catalogue remains" in " ".join(verdict(found))
+
+
+def test_scattered_sources():
+    around_one = [(0.0, 0.1, 0.12), (0.05, 0.0866, 0.12), (0.0757, 0.1311, 0.12)]
+    assert not are_scattered(around_one)
+    assert are_scattered([*around_one, (0.0, -0.1, 0.12)])
+    assert not are_scattered([(0.0, 0.1, 0.12), (0.0, -0.1, 0.12)])  # two may well be two
 
 
 def test_every_family_is_drawn_and_seen():
