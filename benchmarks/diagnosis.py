@@ -11,7 +11,7 @@ from halbach_fe.core.errors import StudyError
 SUMMARY = Path(__file__).parent.parent / "results" / "diagnosis" / "summary.json"
 COUNTED = {
     "naming_rate_single": "single_cases", "naming_rate_pairs": "pair_cases",
-    "false_alarm_rate": "clean_cases", "unknown_rate": "outside_cases",
+    "false_alarm_rate": "clean_cases",
     "heldout_recovered_rate": "recovered_of", "iron_fringe_reduction": "iron_cases",
     "others_named_per_case": "effects_cases"}
 """Rates, and of how many cases they are."""

@@ -10,6 +10,11 @@ solved again, and the signatures of these effects are computed anew at that poin
 Gauss-Newton method in which the finite-element model takes the place of the linearized one. The
 iteration has converged when a round changes neither the selection nor the amplitudes.
 
+In every round the selected effects compete with causes of any shape, so that effects which only
+add up to something outside the catalogue are not named (`halbach_fe.diagnosis.competition`). In the
+first round, in which the signatures of large effects are not yet exact, they are given up only if
+they explain far less.
+
 Random errors of the probe's positions are noise rather than an effect: their size is estimated in
 every round, and the comparison is repeated with that noise until it no longer changes.
 """
@@ -29,6 +34,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.equal_positions import possible_positions
 from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.flexible_causes import Family
 from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.model_selection import probabilities
@@ -39,7 +45,7 @@ from halbach_fe.diagnosis.position_noise import (
     has_settled,
     with_position_noise,
 )
-from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect, Suspicion, UnknownCause
 from halbach_fe.diagnosis.search import (
     NominalSolver,
     Say,
@@ -51,7 +57,13 @@ from halbach_fe.diagnosis.search import (
     with_short_steps,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
-from halbach_fe.diagnosis.unknown_cause import find_unknown_cause
+from halbach_fe.diagnosis.unknown_cause import (
+    describe_unknown,
+    families_of,
+    judge,
+    named_effects,
+    suspicions,
+)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
@@ -129,6 +141,7 @@ def diagnose(
     position_noise, converged, closing = None, True, False
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
+    flexible: list[Family] = []
 
     def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
         changed = with_position_noise(apply_effects(corrected, identified), position_noise)
@@ -162,8 +175,15 @@ def diagnose(
         if solver_error:
             say("the solver's own error explains the misfit")
             break
-        estimate = estimate_position_noise(update, search.marginal, search.columns, search.training,
-                                           position_noise)
+        found = identify_effects(corrected, search, update.observation.map_points)
+        flexible = flexible or families_of(search, update)
+        judgement = judge(search, update, found, flexible)
+        if number > 0 or judgement.is_clear or _has_converged(identified, found):
+            found = named_effects(corrected, search, judgement, found,
+                                  update.observation.map_points)
+        estimate = position_noise if judgement.fits else estimate_position_noise(
+            update, search.marginal, np.hstack([search.columns, *judgement.whitened_terms()]),
+            search.training, position_noise)
         if not closing and not has_settled(position_noise, estimate):
             say(f"vibration: positions with a standard deviation of "
                 f"{1e3 * estimate.sd_m if estimate else 0:.2g} mm are added to the noise")
@@ -171,7 +191,6 @@ def diagnose(
             signatures.clear()  # they were whitened by the previous noise
             closing = pace.is_over
             continue
-        found = identify_effects(corrected, search, update.observation.map_points)
         converged = _has_converged(identified, found)
         if converged:
             # the model has the old amplitudes; their sd and evidence are those of this round
@@ -185,9 +204,13 @@ def diagnose(
         if closing:
             say("the time is up: the effects so far are put into the model")
     assert first is not None
-    unknown = None if solver_error else find_unknown_cause(search, update, identified)
-    if unknown is not None and unknown.alone:
-        identified, position_noise, (update, search) = start, None, first
+    unknown: UnknownCause | None = None
+    suspected: tuple[Suspicion, ...] = ()
+    if not solver_error:
+        unknown = describe_unknown(judgement, update, search, identified)
+        suspected = suspicions(judgement, search.hypotheses) if unknown is None else ()
+    if unknown is not None and unknown.alone and not start and position_noise is None:
+        update, search = first
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     in_model = [column for number in numbers for column in search.candidates[number].columns]
     limits = detection_limits(update, times, search.columns[:, in_model])
@@ -202,7 +225,7 @@ def diagnose(
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
         gross_errors=gross_errors, outliers=outliers, position_noise=position_noise,
         solver_error=solver_error, converged=converged, positions=positions,
-        limits=limits, floor_T=floor_T,
+        limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
 
 

@@ -190,7 +190,7 @@ def select_effects(
         chosen = _without_needless(evidence, candidates, chosen, prior)
         if best not in chosen or len(chosen) <= before - 1:
             break  # else the same candidates would be added and dropped for ever
-    return [_selected_effect(evidence, candidates, chosen, number, prior, excluded)
+    return [selected_effect(evidence, candidates, chosen, number, prior, excluded)
             for number in chosen]
 
 
@@ -226,7 +226,7 @@ def _without_needless(
     return chosen
 
 
-def _selected_effect(
+def selected_effect(
     evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], number: int,
     prior: Floats, excluded: Collection[int],
 ) -> SelectedEffect:

@@ -81,11 +81,75 @@ class IdentifiedEffect:
 
 
 @dataclass(frozen=True)
+class Suspicion:
+    """Effects one of which is likelier than not to be missing, without certainty.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Names of the effects, the likeliest first.
+    probability : float
+        Posterior probability that one of them is missing.
+    hypothesis : Hypothesis
+        The likeliest effect at its likeliest place.
+    shares : tuple of float
+        Probability of each of the effects.
+    log_bayes_factor : float
+        Of the likeliest effect at its place.
+    """
+
+    effects: tuple[str, ...]
+    probability: float
+    hypothesis: Hypothesis
+    shares: tuple[float, ...]
+    log_bayes_factor: float
+
+
+@dataclass(frozen=True)
+class UnknownPart:
+    """One term of a discrepancy that no effect of the catalogue explains.
+
+    Attributes
+    ----------
+    acts_on : str
+        ``field``; or ``readings``, ``gains`` or ``positions`` of the instrument.
+    along : str
+        Coordinate of which it is a function: ``z``, ``angle``, ``radius``, ``time``, ``field`` (the
+        magnitude of B) or ``z and angle``; empty for a field.
+    or_else : tuple of str
+        What explains the readings as well: what it acts on, and the coordinate.
+    components : tuple of str
+        Components of the readings or the positions; empty for a field.
+    smooth : bool
+        Whether it varies smoothly, rather than roughly.
+    rms_T, largest_T : float
+        Its size in the readings.
+    size : float
+        Rms error of the readings in T, of the gains, or of the positions in m; 0 for a field.
+    half_wave : float or None
+        Distance along the coordinate over which it typically changes its sign, in m, degrees, T or
+        as a fraction of the map's time; None if it is constant.
+    log_bayes_factor : float
+    """
+
+    acts_on: Literal["field", "readings", "gains", "positions"]
+    along: str
+    or_else: tuple[str, ...]
+    components: tuple[str, ...]
+    smooth: bool
+    rms_T: float
+    largest_T: float
+    size: float
+    half_wave: float | None
+    log_bayes_factor: float
+
+
+@dataclass(frozen=True)
 class UnknownCause:
     """A discrepancy that no effect of the catalogue explains.
 
-    It is modelled as a smooth field or a smooth error of the sensors, see
-    `halbach_fe.diagnosis.smooth_discrepancy`.
+    It is modelled as a field, or as functions of coordinates that act on readings or positions, see
+    `halbach_fe.diagnosis.flexible_causes`.
 
     Attributes
     ----------
@@ -110,6 +174,8 @@ class UnknownCause:
     source_m : tuple of float or None
         Position of the point dipole that explains the readings best, if a field is the likelier
         kind and point dipoles are in the catalogue.
+    parts : tuple of UnknownPart
+        The terms of which it is modelled, the largest first.
     """
 
     kind: Literal["field", "instrument", "either"]
@@ -119,6 +185,7 @@ class UnknownCause:
     largest_T: float
     at_m: tuple[float, ...]
     source_m: tuple[float, ...] | None
+    parts: tuple[UnknownPart, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -175,6 +242,8 @@ class Diagnosis(ShownInNotebook):
     identified : tuple of IdentifiedEffect
     unknown : UnknownCause or None
         The discrepancy that the identified effects leave, if there is one.
+    suspected : tuple of Suspicion
+        What is likelier than not to be missing, but not certain enough to be named.
     probabilities : dict
         Posterior probability of each effect by name, and of ``none``, on the assumption that at
         most one effect is missing from the corrected study.
@@ -242,6 +311,7 @@ class Diagnosis(ShownInNotebook):
     limits: DetectionLimits | None = None
     floor_T: dict[str, float] | None = None
     uncompared: int | None = None
+    suspected: tuple[Suspicion, ...] = ()
 
     @property
     def study(self) -> Study:

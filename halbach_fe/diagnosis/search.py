@@ -43,10 +43,25 @@ effect's k parameters."""
 
 @dataclass(frozen=True)
 class NominalSolver:
-    """Solves for the fields of nominal magnets, each of them once."""
+    """Solves for the fields of nominal magnets, each of them once, and keeps signatures."""
 
     session: Session
     _solved: dict[tuple[str, str, bytes], Any] = field(default_factory=dict, repr=False)
+    _signatures: dict[tuple[str, bytes], Signatures] = field(default_factory=dict, repr=False)
+
+    def signatures(
+        self, study: Study, update: InferenceResult, prior_mean: Floats, times: Floats
+    ) -> Signatures:
+        """Return the store of signatures for a study and its map.
+
+        They depend on everything but the readings: the places and times of the map, its noise, and
+        what is known of the blocks.
+        """
+        parts = (update.observation.map_points, times, update.errors.sd, prior_mean,
+                 update.held_out.astype(float))
+        key = study.model_dump_json(), b"".join(np.ascontiguousarray(part).tobytes()
+                                                for part in parts)
+        return self._signatures.setdefault(key, {})
 
     def field(self, study: Study, points: Floats) -> Floats:
         """Return `solve_nominal` of the magnet of a study at points (n, 3) in m."""
@@ -88,6 +103,8 @@ class Search:
         The readings with blocks and solver error integrated out.
     training : ndarray, shape (rows,)
         Whitened residual of the training readings with the identified effects in the model.
+    nominal : NominalFields
+        Of the study from which the search started.
     uncompared : int
         Number of hypotheses for which there was no time.
     """
@@ -99,6 +116,7 @@ class Search:
     residual: Floats
     marginal: Marginal
     training: Floats
+    nominal: NominalFields
     uncompared: int = 0
 
 
@@ -157,6 +175,7 @@ def score_hypotheses(
                              measured_magnetizations=update.by_block(prior_mean))
 
     nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
+    known = solver.signatures(study, update, prior_mean, times)
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
                 for effect in identified}
     kept = marginal.remove(response)
@@ -171,7 +190,8 @@ def score_hypotheses(
                           if name == effect.name)))]
     candidates: list[Candidate] = []
     columns: list[Floats] = []
-    known: list[Hypothesis] = []
+    scored: list[Hypothesis] = []
+    uncompared = 0
     improvable: dict[str, list[int]] = {}
     for number, hypothesis in enumerate(shortlisted):
         progress(number, len(shortlisted))
@@ -181,10 +201,13 @@ def score_hypotheses(
         if present is None:
             signature = signatures.get(key)
             if signature is None and is_over():
+                uncompared += 1
                 continue
             if signature is None:
-                signature = signatures[key] = whitened(update.observation.read(
-                    effect.signature(nominal_start, place)))
+                if key not in known:
+                    known[key] = whitened(update.observation.read(
+                        effect.signature(nominal_start, place)))
+                signature = signatures[key] = known[key]
         elif effect.applied_in_full:
             others = apply_effects(
                 corrected, [other for other in identified if other is not present])
@@ -200,45 +223,45 @@ def score_hypotheses(
             signature = whitened(update.observation.read(
                 effect.derivative(nominal, place, amounts.tolist())))
             residual = residual + signature @ amounts
-        known.append(hypothesis)
+        scored.append(hypothesis)
         columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
         candidates.append(Candidate(
             effect.name, place.name, tuple(range(signature.shape[1])),
             effect.is_binary or (effect.applied_in_full
                                  and signature.shape[1] > len(effect.parameters)), effect.unique))
         if present is None and effect.refinements and not effect.applied_in_full:
-            improvable.setdefault(effect.name, []).append(len(known) - 1)
+            improvable.setdefault(effect.name, []).append(len(scored) - 1)
     progress(len(shortlisted), len(shortlisted))
     fixed = np.hstack([np.zeros((len(residual), 0)), *(
-        part for part, one in zip(columns, known, strict=True)
+        part for part, one in zip(columns, scored, strict=True)
         if (one.effect.name, one.place) in in_model)])
     for numbers in improvable.values():
-        effect = known[numbers[0]].effect
+        effect = scored[numbers[0]].effect
 
         def of(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
             return whitened(update.observation.read(
                 effect.derivative(nominal_start, place, amounts.tolist())))
 
-        better = _improved_place(effect, [known[number].place for number in numbers],
+        better = _improved_place(effect, [scored[number].place for number in numbers],
                                  [columns[number] for number in numbers], of, fixed, marginal,
                                  residual)
         if better is not None and (effect.name, better) not in signatures:
             signature = whitened(update.observation.read(effect.signature(nominal_start, better)))
             signatures[effect.name, better] = signature
-            known.append(Hypothesis(effect, better))
+            scored.append(Hypothesis(effect, better))
             columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique))
     chosen = most_likely(candidates, columns, marginal, residual, {
-        number for number, hypothesis in enumerate(known)
+        number for number, hypothesis in enumerate(scored)
         if (hypothesis.effect.name, hypothesis.place) in in_model})
     ends = np.cumsum([columns[number].shape[1] for number in chosen]).tolist()
     compared = [replace(candidates[number], columns=tuple(range(
         end - columns[number].shape[1], end))) for number, end in zip(chosen, ends, strict=True)]
     stacked = np.hstack([np.zeros((len(residual), 0)), *(columns[number] for number in chosen)])
-    return Search(tuple(known[number] for number in chosen), tuple(compared),
+    return Search(tuple(scored[number] for number in chosen), tuple(compared),
                   marginal.evidence(stacked, residual), stacked, residual, marginal, training,
-                  len(shortlisted) - len(known))
+                  nominal_start, uncompared)
 
 
 def _improved_place(
@@ -378,16 +401,16 @@ def identify_effects(
     """
     excluded: set[int] = set()
     while True:
-        found = _amplitudes(
+        found = amplitudes(
             search, select_effects(search.evidence, search.candidates, excluded=excluded))
         impossible = next((number for number in range(len(found))
-                    if not _possible(corrected, found[:number + 1], points)), None)
+                    if not possible(corrected, found[:number + 1], points)), None)
         if impossible is None:
             return found
         excluded.add(search.candidates.index(found[impossible].selection.candidate))
 
 
-def _possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
+def possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
     """Tell whether a valid study can have effects of these amplitudes, with the map's points in
     air.
     """
@@ -402,7 +425,7 @@ def _possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floa
     return not inside.any()
 
 
-def _amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
+def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[IdentifiedEffect, ...]:
     """Fit the amplitudes of all selected effects jointly."""
     evidence = search.evidence
     for selection in selected:

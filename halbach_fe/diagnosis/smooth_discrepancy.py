@@ -4,9 +4,7 @@ A field whose sources are outside the bore is ``-grad phi`` with ``phi`` harmoni
 functions times ``cos n phi``, ``cos k z`` and their sines, and polynomials that do not depend on z
 (J. D. Jackson, Classical Electrodynamics, 3rd ed., section 3.7). Errors of a sensor do not have to
 be a field: each component is an independent Fourier series in z and in the azimuth. Both have many
-terms, whose amplitudes have one unknown scale and decrease with order. The evidence is averaged
-over the scale. An effect with one amplitude is therefore the better explanation if it explains the
-readings equally well.
+terms, whose amplitudes decrease with order; `halbach_fe.diagnosis.flexible_causes` judges them.
 
 The solver's own error is also such a field, smooth and of known size. No effect may be identified
 for a misfit that it can explain.
@@ -20,33 +18,10 @@ import numpy as np
 from scipy import special
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.evidence import Evidence
-
-AMPLITUDE_SCALES = np.geomspace(0.1, 300, 15)
-"""Candidate scales of the amplitudes, in units of the noise of a reading."""
 
 DECAY_RATES = ((0.25, 0.125), (1.0, 0.4), (2.0, 1.0))
 """Candidate decay rates of the logarithm of the amplitudes: per azimuthal order, and per half wave
 in z."""
-
-
-@dataclass(frozen=True)
-class SmoothDiscrepancy:
-    """The evidence of one kind of smooth discrepancy.
-
-    Attributes
-    ----------
-    log_bayes_factor : float
-        Log Bayes factor over no discrepancy, averaged over scale and decay.
-    scale : float
-        The likeliest scale, in units of the noise of a reading.
-    mean : ndarray, shape (k,)
-        Posterior mean of the amplitudes of the columns, at the likeliest scale and decay.
-    """
-
-    log_bayes_factor: float
-    scale: float
-    mean: Floats
 
 
 @dataclass(frozen=True)
@@ -63,29 +38,6 @@ class SmoothTerms:
 
     fields: Floats
     fineness: Floats
-
-
-def judge_smooth_terms(evidence: Evidence, fineness: Floats) -> SmoothDiscrepancy:
-    """Return the evidence of all columns together, averaged over scale and decay of the amplitudes.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    fineness : ndarray, shape (k, 2)
-        Of the columns, see `SmoothTerms`.
-    """
-    found, means = [], []
-    for decay in DECAY_RATES:
-        weights = np.exp(-fineness @ decay)
-        values, vectors = np.linalg.eigh(weights[:, None] * evidence.information * weights)
-        values, score = np.maximum(values, 0.0), vectors.T @ (weights * evidence.score)
-        for scale in AMPLITUDE_SCALES:
-            shrunk = scale**2 * score / (1 + scale**2 * values)
-            found.append((score @ shrunk - np.log1p(scale**2 * values).sum()) / 2)
-            means.append(weights * (vectors @ shrunk))
-    best = int(np.argmax(found))
-    return SmoothDiscrepancy(float(special.logsumexp(found) - np.log(len(found))),
-                             float(AMPLITUDE_SCALES[best % len(AMPLITUDE_SCALES)]), means[best])
 
 
 def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothTerms:

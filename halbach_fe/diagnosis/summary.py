@@ -25,6 +25,7 @@ from halbach_fe.diagnosis.result import (
     Hypothesis,
     IdentifiedEffect,
     PossiblePosition,
+    Suspicion,
     UnknownCause,
 )
 from halbach_fe.inference.result import (
@@ -338,7 +339,8 @@ def diagnosis_summary(
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
         "verdict": "numerical" if diagnosis.solver_error else
-        "unknown" if diagnosis.unknown and not diagnosis.found_anything else
+        "unknown" if diagnosis.unknown and not (diagnosis.identified or diagnosis.gross_errors)
+        else "suspected" if diagnosis.suspected and not diagnosis.found_anything else
         "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
         "named" if diagnosis.found_anything else "nothing",
         "gross": [_gross(error) for error in diagnosis.gross_errors],
@@ -348,6 +350,7 @@ def diagnosis_summary(
         "limits": _limits_entry(diagnosis.limits) if diagnosis.limits else None,
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
         "vibration": asdict(diagnosis.position_noise) if diagnosis.position_noise else None,
+        "suspected": [_suspicion(one) for one in diagnosis.suspected],
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),
@@ -372,6 +375,13 @@ def _gross(found: GrossError) -> dict[str, object]:
     return {**entry(found.convention), "misfit_before": found.misfit_before,
             "misfit_after": found.misfit_after,
             "alternatives": [entry(convention) for convention in found.alternatives]}
+
+
+def _suspicion(one: Suspicion) -> dict[str, object]:
+    """Return the JSON entry of a suspicion."""
+    return {"effects": dict(zip(one.effects, one.shares, strict=True)),
+            "place": one.hypothesis.place.name, "probability": one.probability,
+            "log_bayes_factor": one.log_bayes_factor}
 
 
 def _unknown_entry(unknown: UnknownCause) -> dict[str, object]:

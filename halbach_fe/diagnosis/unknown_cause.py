@@ -1,94 +1,264 @@
-"""Detect a smooth field, or a smooth error of the sensors, that the identified effects leave."""
+"""Judge whether effects of the catalogue explain the readings, or something that nobody listed.
+
+The effects that the catalogue alone would give compete with causes of any shape, see
+`halbach_fe.diagnosis.competition`. What wins beside the effects, or in their place, is described:
+what it acts on, along which coordinate it varies, and how large it is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.competition import MANY, Competition, Explanation, Term
+from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.flexible_causes import Family, families
 from halbach_fe.diagnosis.model_selection import (
-    DETECTION_LOG_ODDS,
-    EFFECT_PRIOR_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
     log_bayes_factors,
-    log_evidence,
-    prior_log_odds,
+    selected_effect,
     with_candidates,
 )
-from halbach_fe.diagnosis.result import IdentifiedEffect, UnknownCause
-from halbach_fe.diagnosis.search import Search
-from halbach_fe.diagnosis.smooth_discrepancy import (
-    SmoothTerms,
-    harmonic_fields,
-    judge_smooth_terms,
-    sensor_errors,
+from halbach_fe.diagnosis.result import (
+    Hypothesis,
+    IdentifiedEffect,
+    Suspicion,
+    UnknownCause,
+    UnknownPart,
 )
+from halbach_fe.diagnosis.search import Search, amplitudes, possible
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import probe_points
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
+
+MAX_READINGS = 6000
+"""Largest number of readings that judge between effects and the unknown. Of more, a random subset
+is taken."""
+
+FAR_BETTER = 0.9
+"""Share of the best explanation's log odds below which the catalogue's own explanation is given up
+in the first round, in which the signatures of large effects are not yet exact."""
+
+MOST = 0.5
+"""Share of the excess of chi-squared that terms may leave if they account for most of it. Of
+independent errors at hundreds of points they account for a fifth, as they have `MOST_WAVES`
+functions for each component."""
+
+NEAR_SOURCES = 0.6
+"""Distance, relative to that from the axis, within which two magnetized objects may stand for one
+between them: the places that are compared are 30 degrees apart, which is 0.52."""
+
+SUSPECTED = 0.5
+"""Probability from which an effect that is not certain enough to be named is suspected."""
+
+SHARE_OF_SUSPECTS = 0.9
+"""Share of the suspects' probability that those that are listed have together."""
 
 
-def find_unknown_cause(search: Search, update: InferenceResult,
-                       identified: Sequence[IdentifiedEffect]) -> UnknownCause | None:
-    """Compare smooth discrepancies with the identified effects, and beside them.
+@dataclass(frozen=True)
+class Judgement:
+    """The outcome of the competition in one round.
 
-    Both kinds of smooth discrepancy, a field and an error of the sensors, are compared twice:
-    beside the identified effects, which shows what these leave unexplained, and in place of them,
-    which shows whether several effects merely add up to one unknown cause.
-
-    Returns
-    -------
-    UnknownCause or None
-        None if the identified effects leave nothing smooth and are the better explanation.
+    Attributes
+    ----------
+    competition : Competition
+    catalogued : Explanation
+        The effects that the catalogue alone would give.
+    best : Explanation
+        The best explanation, with such effects only as may be named.
+    without : Explanation
+        The best explanation without any effect.
+    whiten : callable
+        Function of the changes (k, n, 3) in T of a map that returns whitened readings (rows, k).
     """
+
+    competition: Competition
+    catalogued: Explanation
+    best: Explanation
+    without: Explanation
+    whiten: Callable[[Floats], Floats]
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the catalogue's effects explain far less than what is not in the catalogue."""
+        return self.catalogued.log_odds < FAR_BETTER * self.best.log_odds
+
+    @property
+    def fits(self) -> bool:
+        """Whether terms account for most of what the effects leave beyond the noise.
+
+        Random errors of single positions are no function of any coordinate. Terms that account for
+        most of a misfit are therefore the better explanation of it than vibration.
+        """
+        if not self.best.terms:
+            return False
+        before = self.competition.explanation(self.best.effects, ()).chi2
+        return self.best.chi2 - 1 < MOST * (before - 1)
+
+    def whitened_terms(self) -> list[Floats]:
+        """Return the columns (rows, k) of each term, per standard deviation of its amplitudes."""
+        return [self.whiten(term.family.fields()) * term.fitted.deviations
+                for term in self.best.terms]
+
+
+def families_of(search: Search, update: InferenceResult) -> list[Family]:
+    """Return the causes of any shape that compete with the effects of a search."""
+    nominal = search.nominal
+    return families(nominal.points, nominal.time, nominal.field,
+                    nominal.gradient, float(np.median(update.errors.sd)))
+
+
+def judge(
+    search: Search, update: InferenceResult, identified: Sequence[IdentifiedEffect],
+    flexible: Sequence[Family],
+) -> Judgement:
+    """Compare the identified effects with causes of any shape."""
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.subset(rows), update.observation
-    points = probe_points(update.study.instrument, observation.map_points)
-    scale = float(np.median(update.errors.sd))
-    # the search that selected the effects may have had other places, and so other columns
+    marginal, columns, residual = search.marginal, search.columns, search.residual
+    some = np.arange(len(rows))
+    if len(rows) > MAX_READINGS:
+        some = np.sort(np.random.default_rng(0).choice(some, MAX_READINGS, replace=False))
+        marginal = Marginal.of(marginal.whitened[some])
+
+    def whiten(fields: Floats) -> Floats:
+        return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
+
+    competition = Competition(marginal, columns[some], residual[some], search.candidates, flexible,
+                              lambda fields: whiten(fields)[some])
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
-    own = [search.candidates[number] for number in numbers]
-    columns = [column for candidate in own for column in candidate.columns]
-    renumbered = [
-        replace(candidate, columns=tuple(columns.index(column) for column in candidate.columns))
-        for candidate in own]
-    kinds: dict[Literal["field", "instrument", "either"], SmoothTerms] = {
-        "field": harmonic_fields(points), "instrument": sensor_errors(points)}
-    beside, instead = [], []
-    for kind, terms in kinds.items():
-        readings = observation.read(scale * terms.fields)
-        smooth = noise.whiten(np.ascontiguousarray(readings[:, rows].T))
-        both = search.marginal.evidence(
-            np.hstack([search.columns[:, columns], smooth]), search.residual)
-        added = range(len(columns), both.information.shape[0])
-        rest = judge_smooth_terms(with_candidates(both, renumbered).only(added), terms.fineness)
-        in_place = judge_smooth_terms(both.only(added), terms.fineness)
-        beside.append((rest.log_bayes_factor, kind, rest))
-        instead.append((in_place.log_bayes_factor, kind, in_place))
-    beside.sort(key=lambda explanation: -explanation[0])
-    instead.sort(key=lambda explanation: -explanation[0])
-    prior_log_odds_unknown = float(np.log(EFFECT_PRIOR_ODDS))
-    remains = beside[0][0] + prior_log_odds_unknown >= DETECTION_LOG_ODDS
-    # each of several effects that merely add up to the discrepancy costs its own prior odds
-    odds = log_evidence(both, renumbered) + prior_log_odds(search.candidates)[numbers].sum()
-    advantage = instead[0][0] + prior_log_odds_unknown - odds if own else -np.inf
-    alone = bool(advantage > INDISTINGUISHABLE_LOG_EVIDENCE)
-    ambiguous = bool(
-        len(own) > 1 and abs(advantage) <= INDISTINGUISHABLE_LOG_EVIDENCE and not remains)
-    if not (remains or alone or ambiguous):
+    sources = [effect.hypothesis.place.at_m for effect in identified
+               if effect.hypothesis.effect.name == "ferromagnetic_object"]
+    best, without = competition.best_explanations(numbers, are_scattered(sources))
+    return Judgement(competition, competition.explanation(numbers, ()), best, without, whiten)
+
+
+def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
+    """Tell whether many sources are in several places, rather than beside one between them."""
+    if len(places) < MANY:
+        return False
+    points = np.array(places)
+    radius = np.hypot(points[:, 0], points[:, 1])
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    near = apart < NEAR_SOURCES * np.maximum(radius[:, None], radius)
+    return bool(connected_components(near)[0] > 1)
+
+
+def named_effects(
+    corrected: Study, search: Search, judgement: Judgement,
+    identified: Sequence[IdentifiedEffect], points: Floats,
+) -> tuple[IdentifiedEffect, ...]:
+    """Return the effects of the best explanation, with their amplitudes beside its terms."""
+    best, competition = judgement.best, judgement.competition
+    if best == judgement.catalogued:
+        return tuple(identified)
+    evidence = competition.given(best.terms)
+    selected = [selected_effect(evidence, search.candidates, best.effects, number,
+                                competition.prior, ()) for number in best.effects]
+    found = amplitudes(replace(search, evidence=evidence), selected)
+    while found and not possible(corrected, found, points):
+        found = found[:-1]
+    return found
+
+
+def describe_unknown(
+    judgement: Judgement, update: InferenceResult, search: Search,
+    identified: Sequence[IdentifiedEffect],
+) -> UnknownCause | None:
+    """Describe what is not in the catalogue; None if nothing is missing but the effects."""
+    competition, best = judgement.competition, judgement.best
+    tie = judgement.without.log_odds - best.log_odds
+    ambiguous = bool(not best.terms and len(best.effects) > 1 and judgement.without.terms
+                     and tie > -INDISTINGUISHABLE_LOG_EVIDENCE)
+    if not (best.terms or ambiguous):
         return None
-    (factor, kind, best), (second, *_) = instead if alone or ambiguous else beside
-    size = scale * np.linalg.norm(np.tensordot(best.mean, kinds[kind].fields, 1), axis=1)
+    shown = judgement.without if ambiguous else best
+    first = competition.terms_beside(shown.effects, ())
+    factors = {kind: max(term.fitted.log_bayes_factor for term in first
+                         if (term.family.acts_on == "field") == (kind == "field"))
+               for kind in ("field", "instrument")}
+    is_field = shown.terms[0].family.acts_on == "field"
+    kind: Literal["field", "instrument"] = "field" if is_field else "instrument"
+    other = factors["instrument" if kind == "field" else "field"]
+    points = search.nominal.points
+    parts, total = [], np.zeros(points.shape)
+    for number, term in enumerate(shown.terms):
+        field = np.tensordot(term.fitted.mean, term.family.fields(), 1)
+        total += field
+        rivals = [] if number else [
+            one for one in first if one.family is not term.family and one.fitted.log_bayes_factor
+            > first[0].fitted.log_bayes_factor - INDISTINGUISHABLE_LOG_EVIDENCE]
+        parts.append(_part(term, field, rivals))
+    size = np.linalg.norm(total, axis=1)
     source = None
     if kind == "field":
-        others = [] if alone or ambiguous else own
-        factors = log_bayes_factors(with_candidates(search.evidence, others), search.candidates)
+        given = with_candidates(search.evidence, [search.candidates[k] for k in shown.effects])
+        odds = log_bayes_factors(given, search.candidates)
         dipoles = [number for number, hypothesis in enumerate(search.hypotheses)
                    if hypothesis.effect.name == "ferromagnetic_object"]
         if dipoles:
-            source = search.hypotheses[max(dipoles, key=lambda k: factors[k])].place.at_m
+            source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
+    alone = competition.explanation(shown.effects, ())
     return UnknownCause(
-        "either" if factor - second < INDISTINGUISHABLE_LOG_EVIDENCE else kind, factor,
-        alone or not own, ambiguous, float(size.max()),
-        tuple(points[int(np.argmax(size))].tolist()), source)
+        "either" if factors[kind] - other < INDISTINGUISHABLE_LOG_EVIDENCE else kind,
+        shown.log_odds - alone.log_odds - len(shown.terms) * competition.prior_of_family,
+        not identified, ambiguous, float(size.max()),
+        tuple(points[int(np.argmax(size))].tolist()), source, tuple(parts))
+
+
+def _part(term: Term, field: Floats, rivals: Sequence[Term]) -> UnknownPart:
+    """Describe one term, whose posterior mean is ``field`` (n, 3) in T."""
+    family, mean = term.family, term.fitted.mean
+    power = mean**2
+    waves = float(np.sqrt(power @ family.waves**2 / max(power.sum(), 1e-300)))
+    size = family.unit * float(np.sqrt(power.sum()))
+    return UnknownPart(
+        family.acts_on, family.along,
+        tuple(f"{one.family.acts_on} {one.family.along}".strip() for one in rivals),
+        tuple(COMPONENTS[axis] for axis in term.fitted.axes), term.fitted.smooth,
+        float(np.sqrt(np.mean(np.sum(field**2, axis=1)))),
+        float(np.linalg.norm(field, axis=1).max()), size,
+        family.span / waves if waves > 0 else None, term.fitted.log_bayes_factor)
+
+
+def suspicions(judgement: Judgement, hypotheses: Sequence[Hypothesis]) -> tuple[Suspicion, ...]:
+    """Return what is likelier than not to be missing, but not certain enough to be named.
+
+    The probabilities assume that at most one more thing is missing: an effect of the catalogue, or
+    a cause of any shape. Effects that share a probability are one suspicion.
+    """
+    competition, best = judgement.competition, judgement.best
+    if best.terms:
+        return ()
+    candidates = competition.candidates
+    odds = log_bayes_factors(with_candidates(
+        competition.evidence, [candidates[k] for k in best.effects]), candidates)
+    odds += competition.prior
+    taken = {candidates[k].effect for k in best.effects if candidates[k].unique}
+    odds[[number for number, candidate in enumerate(candidates)
+          if number in best.effects or candidate.effect in taken]] = -np.inf
+    others = [term.fitted.log_bayes_factor + competition.prior_of_family
+              for term in competition.terms_beside(best.effects, ())]
+    top = max(0.0, float(odds.max(initial=0.0)), *others)
+    weights = np.exp(odds - top)
+    total = float(np.exp(-top) + weights.sum() + np.exp(np.array(others) - top).sum())
+    by_name: dict[str, float] = {}
+    for candidate, weight in zip(candidates, weights.tolist(), strict=True):
+        by_name[candidate.effect] = by_name.get(candidate.effect, 0.0) + weight / total
+    ranked = sorted(by_name, key=lambda name: -by_name[name])
+    named: list[str] = []
+    together = sum(by_name.values())
+    while ranked and sum(by_name[name] for name in named) < SHARE_OF_SUSPECTS * together:
+        named.append(ranked.pop(0))
+    probability = sum(by_name[name] for name in named)
+    if probability < SUSPECTED:
+        return ()
+    likeliest = int(np.argmax(odds))
+    factor = float(odds[likeliest] - competition.prior[likeliest])
+    return (Suspicion(tuple(named), probability, hypotheses[likeliest],
+                      tuple(by_name[name] for name in named), factor),)

@@ -36,6 +36,12 @@ from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.page import save, write_page
+from halbach_fe.report.unknown_cause import (
+    more_readings,
+    suspicion_sentences,
+    unknown_advice,
+    unknown_sentences,
+)
 
 UNUSUAL_AMPLITUDE = 20.0
 """Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
@@ -60,22 +66,6 @@ FIGURES = {
 
 SMALL_T = 1e-4
 """Flux density below which tables give it in µT."""
-
-UNKNOWN_ADVICE = {
-    "field": "Look for a source outside the bore, near the point at which the unexplained field is "
-             "largest. Readings beyond the end of the map at that point would show more of the "
-             "field.",
-    "instrument": "The same map with the probe turned by 180° shows which sensor is in error: the "
-                  "error turns with the sensor.",
-    "either": "The same map with the probe turned by 180° tells a field from the sensors: errors "
-              "of the sensors turn with the probe."}
-"""Advice on the next measurement by the kind of an unknown cause."""
-
-UNKNOWN_KINDS = {
-    "field": "a smooth field from a source that is not in the catalogue",
-    "instrument": "a smooth error of the sensors, which no field could be",
-    "either": "a smooth field or a smooth error of the sensors"}
-"""Description of an unknown cause by its kind."""
 
 
 def verdict(diagnosis: Diagnosis) -> list[str]:
@@ -119,6 +109,8 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
                 "many effects together are a fit rather than a diagnosis, and some of them take "
                 "the place of another cause.")
+    elif diagnosis.suspected:
+        sentences.append("Nothing can be named for certain.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
         start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
                  "Nothing else is missing that this map can show: with that," if sentences
@@ -127,23 +119,14 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
                 f"{after.prior_conflict:.3g}).",
                 *([limits_in_words(diagnosis.limits)] if diagnosis.limits else [])]
     if unknown is not None:
-        x, y, z = (f"{1e3 * component:.0f}" for component in unknown.at_m)
-        start = ("A single cause outside the catalogue could equally well take the place of all of "
-                 "them" if unknown.ambiguous else "Something outside the catalogue "
-                 + ("remains" if diagnosis.identified else "is missing"))
-        sentences.append(
-            f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
-            f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
-            f"{unknown.log_bayes_factor:.0f}).")
-        if unknown.source_m is not None:
-            x, y, z = (f"{1e3 * component:.0f}" for component in unknown.source_m)
-            sentences.append("If the source is a small magnetized object, it is near "
-                             f"({x}, {y}, {z}) mm.")
-    elif not diagnosis.identified:
+        sentences += unknown_sentences(unknown, bool(diagnosis.identified))
+    elif not diagnosis.identified and not diagnosis.suspected:
         return [*sentences, f"The map disagrees with the study (chi² per reading "
                 f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
                 "no effect of the catalogue explains the difference, nor does a smooth field or "
                 "sensor error. Check the noise of the study."]
+    for suspicion in diagnosis.suspected:
+        sentences += suspicion_sentences(suspicion, titles)
     if diagnosis.identified:
         held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
                         for fit in fits[1:2])
@@ -266,7 +249,8 @@ def write_diagnosis_report(
         ground={"found": DETECTION_LOG_ODDS, "alike": INDISTINGUISHABLE_LOG_EVIDENCE,
                 "odds": round(1 / EFFECT_PRIOR_ODDS), "enough": SEPARATING_GAIN,
                 "discoveries": DISCOVERIES},
-        advice=UNKNOWN_ADVICE[diagnosis.unknown.kind] if diagnosis.unknown else
+        advice=unknown_advice(diagnosis.unknown) if diagnosis.unknown else
+        " ".join(map(more_readings, diagnosis.suspected)) if diagnosis.suspected else
         "None of the candidate measurements would distinguish the effects from their alternatives."
         if any(rivals(effect) for effect in diagnosis.identified) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)

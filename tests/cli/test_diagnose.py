@@ -319,7 +319,7 @@ def test_impossible_amplitudes_are_refused_after_the_rest_is_written(
     gap = next(one for one in catalogue() if one.name == "azimuthal_gap")
     monkeypatch.setattr("halbach_fe.diagnosis.summary._steps", lambda study, _: [
         (gap.apply(study, gap.places(study)[0], [-1e-4]), "a gap")])
-    monkeypatch.setattr("halbach_fe.diagnosis.diagnose.find_unknown_cause", lambda *_: None)
+    monkeypatch.setattr("halbach_fe.diagnosis.diagnose.describe_unknown", lambda *_: None)
     out = tmp_path / "out"
     assert main(["diagnose", str(study), "--measurements", str(measured(tmp_path, 0.0)),
                  "-o", str(out), "--effects", "gain_x"]) == 3
@@ -338,7 +338,7 @@ def test_the_documentation_says_what_is_in_the_file():
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
         before=update, after=update, gross_errors=(), outliers=(), identified=(),
-        position_noise=None, solver_error=None, unknown=None, found_anything=False,
+        position_noise=None, solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, converged=True, positions=(), limits=None,
         floor_T=None, uncompared=None)

@@ -12,7 +12,7 @@ from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
-from halbach_fe.diagnosis.result import Hypothesis, UnknownCause
+from halbach_fe.diagnosis.result import Hypothesis, Suspicion, UnknownCause, UnknownPart
 from halbach_fe.diagnosis.summary import (
     amounts,
     diagnosis_summary,
@@ -104,7 +104,7 @@ def test_verdicts(flat):
     assert "A single cause outside the catalogue could equally well" in " ".join(
         verdict(replace(found, unknown=tie)))
     assert list(diagnosis_summary(replace(found, unknown=tie))["unknown"]) == [
-        "kind", "log_bayes_factor", "alone", "as_well", "largest_T", "at_m", "source_m"]
+        "kind", "log_bayes_factor", "alone", "as_well", "largest_T", "at_m", "source_m", "parts"]
     (one,) = found.identified
     usual = max(abs(one.values) / [parameter.sd for parameter in one.parameters])
     huge = replace(one, values=one.values * 30 / usual)
@@ -121,6 +121,24 @@ def test_verdicts(flat):
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
     assert verdict(alone)[0].startswith("Something outside the catalogue is missing")
     assert "near (200, 0, 0) mm" in verdict(alone)[1]
+    part = UnknownPart("positions", "angle", ("readings z",), ("x", "y"), False, 2e-4, 6e-4, 3e-4,
+                       40.0, 90.0)
+    (looks,) = [sentence for sentence in verdict(
+        replace(nothing, unknown=replace(unknown, alone=True, parts=(part,))))
+        if sentence.startswith("It looks like")]
+    assert looks == (
+        "It looks like an error of 0.3 mm rms of the probe's position along x, y, a rough function "
+        "of the azimuth that changes within some 40 ° (0.2 mT rms and 0.6 mT at most in the "
+        "readings; as well explained by readings along z).")
+    suspicion = Suspicion(("gain_x", "gain_y"), 0.9, Hypothesis(EFFECTS["gain_x"], Place()),
+                          (0.6, 0.3), 5.5)
+    doubt = replace(nothing, suspected=(suspicion,))
+    text = " ".join(verdict(doubt))
+    assert "Suspected with a probability of 90 % (odds 9.0 : 1)" in text
+    assert "Nothing is missing" not in text
+    assert "Measure the same map 2 times in all" in text
+    assert diagnosis_summary(doubt)["verdict"] == "suspected"
+    assert diagnosis_summary(doubt)["suspected"][0]["effects"] == {"gain_x": 0.6, "gain_y": 0.3}
     fine = replace(found.before, prior_conflict=1.0)
     assert verdict(replace(nothing, before=fine, after=fine))[0].startswith("Nothing is missing")
 

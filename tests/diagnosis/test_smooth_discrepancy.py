@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.smooth_discrepancy import (
-    harmonic_fields,
-    judge_smooth_terms,
-    sensor_errors,
-)
+from halbach_fe.diagnosis.flexible_causes import families, fit_family
+from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields
 from tests.conftest import circle
 
 STEP = 1e-5
@@ -43,9 +40,16 @@ def factors(field):
     noise = np.random.default_rng(3).standard_normal(field.size)
     residual = field.ravel() / SIGMA + noise
     marginal = Marginal.of(np.zeros((field.size, 1)))
-    return [judge_smooth_terms(marginal.evidence(
-        terms.fields.reshape(len(terms.fields), -1).T, residual), terms.fineness).log_bayes_factor
-        for terms in (harmonic_fields(POINTS), sensor_errors(POINTS))]
+    nothing = np.zeros_like(POINTS)  # no field: no gains, and no gradient
+    every = families(POINTS, np.linspace(0, 1, len(POINTS)), nothing, np.zeros((*POINTS.shape, 3)),
+                     SIGMA)
+    found = {}
+    for family in every:
+        fields = family.fields()
+        evidence = marginal.evidence(fields.reshape(len(fields), -1).T / SIGMA, residual)
+        kind = "field" if family.acts_on == "field" else "instrument"
+        found[kind] = max(found.get(kind, -np.inf), fit_family(family, evidence).log_bayes_factor)
+    return found["field"], found["instrument"]
 
 
 def test_a_coil_is_a_field():

@@ -1,0 +1,228 @@
+"""Causes of any shape that compete with the effects of the catalogue.
+
+What is outside the catalogue may be a field from a source that nobody listed, or an instrument that
+does what nobody listed. The first is any field that is harmonic in the bore. The second is any
+function of one coordinate (z, the azimuth, the radius, the time or the magnitude of the field) that
+is added to the readings, is a gain of the sensors, or displaces the probe. Each function is a
+Gaussian process, written as a cosine series whose amplitudes are independent (the spectral form of
+C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning, section 4.2): the
+evidence is averaged over its size and over spectra from smooth to rough.
+
+Such a family can explain much with many amplitudes, each of which costs evidence. An effect of the
+catalogue with one amplitude is the better explanation where both explain the readings equally well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from scipy import special
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.smooth_discrepancy import (
+    DECAY_RATES,
+    SmoothTerms,
+    harmonic_fields,
+    sensor_errors,
+)
+
+ActsOn = Literal["field", "readings", "gains", "positions"]
+
+SIZES = np.geomspace(0.1, 1000, 17)
+"""Candidate rms sizes, in units of the noise of a reading."""
+
+SMOOTH_WAVES = (2.0, 5.0)
+ROUGH_WAVES = (3.0, 15.0)
+"""Numbers of half waves over the range of a coordinate at which the spectrum of a smooth function
+(squared-exponential covariance) and of a rough one (exponential covariance) falls off."""
+
+MOST_WAVES = 48
+"""Largest number of half waves; finer structure is noise to this comparison."""
+
+AXES = ((0,), (1,), (2,), (0, 1, 2))
+"""Components on which a cause may act: one of them, or each by a function of its own."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Causes of one kind.
+
+    Attributes
+    ----------
+    acts_on : str
+        ``field``, ``readings``, ``gains`` or ``positions``.
+    along : str
+        Coordinate on which the functions depend; empty for fields.
+    fields : callable
+        Returns changes (k, n, 3) in T of the map's values by the terms, each with an rms of about
+        one reading's noise. They are large, and are computed whenever they are asked for.
+    axis : ndarray of int, shape (k,)
+        Component on which each term acts; -1 for terms that act on all.
+    spectra : ndarray, shape (spectra, k)
+        Relative standard deviations of the amplitudes, from smooth to rough.
+    smooth : tuple of bool
+        Whether the functions of each spectrum are smooth.
+    waves : ndarray, shape (k,)
+        Half waves of each term over the range of the coordinate (over 360 degrees of azimuth).
+    span : float
+        Range of the coordinate, in m, degrees, T or as a fraction of the map's time.
+    unit : float
+        Error of the readings in T, of the gains, or of the positions in m, by a term of amplitude
+        1; 0 for fields, whose size is that of `fields`.
+    """
+
+    acts_on: ActsOn
+    along: str
+    fields: Callable[[], Floats] = field(repr=False)
+    axis: np.ndarray[tuple[int], np.dtype[np.int_]] = field(repr=False)
+    spectra: Floats = field(repr=False)
+    smooth: tuple[bool, ...] = field(repr=False)
+    waves: Floats = field(repr=False)
+    span: float = 0.0
+    unit: float = 0.0
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A family at its likeliest components, spectrum and size.
+
+    Attributes
+    ----------
+    log_bayes_factor : float
+        Log Bayes factor over no such cause, averaged over components, spectra and sizes.
+    at_best : float
+        The same at the likeliest ones, without the average.
+    axes : tuple of int
+        Components on which it acts; empty for a field.
+    smooth : bool
+    deviations : ndarray, shape (k,)
+        Standard deviations of the amplitudes of all terms; 0 for terms that are left out.
+    mean : ndarray, shape (k,)
+        Posterior mean of the amplitudes.
+    """
+
+    log_bayes_factor: float
+    at_best: float
+    axes: tuple[int, ...]
+    smooth: bool
+    deviations: Floats
+    mean: Floats
+
+
+def fit_family(family: Family, evidence: Evidence) -> Fitted:
+    """Return the evidence of a family, from the evidence of its terms (and of nothing else)."""
+    factors: list[float] = []
+    best: tuple[float, tuple[int, ...], bool, Floats, Floats] | None = None
+    for axes in AXES if (family.axis >= 0).any() else ((),):
+        used = np.flatnonzero(np.isin(family.axis, axes)) if axes else np.arange(len(family.axis))
+        information = evidence.information[np.ix_(used, used)]
+        for spectrum, smooth in zip(family.spectra[:, used], family.smooth, strict=True):
+            values, vectors = np.linalg.eigh(spectrum[:, None] * information * spectrum)
+            score = vectors.T @ (spectrum * evidence.score[used])
+            grown = SIZES[:, None]**2 * np.maximum(values, 0.0)
+            shrunk = SIZES[:, None]**2 * score / (1 + grown)
+            some = (shrunk @ score - np.log1p(grown).sum(axis=1)) / 2
+            factors += some.tolist()
+            top = int(np.argmax(some))
+            if best is None or some[top] > best[0]:
+                deviations, mean = np.zeros(len(family.axis)), np.zeros(len(family.axis))
+                deviations[used] = SIZES[top] * spectrum
+                mean[used] = spectrum * (vectors @ shrunk[top])
+                best = float(some[top]), axes, smooth, deviations, mean
+    assert best is not None
+    return Fitted(float(special.logsumexp(factors) - np.log(len(factors))), *best)
+
+
+def families(
+    points: Floats, time: Floats, nominal: Floats, gradient: Floats, noise_T: float
+) -> list[Family]:
+    """Return all families for a map.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    time : ndarray, shape (n,)
+        From 0 to 1.
+    nominal : ndarray, shape (n, 3), in T
+        Field of the model.
+    gradient : ndarray, shape (n, 3, 3), in T/m
+        Its derivatives; the last axis is the direction.
+    noise_T : float
+        Noise of a reading.
+    """
+    angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    found = [_of_smooth_terms("field", "", harmonic_fields(points), noise_T, False,
+                              np.ptp(points[:, 2])),
+             _of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
+                              np.ptp(points[:, 2]))]
+    coordinates = {"z": points[:, 2], "angle": angle, "radius": radius, "time": time,
+                   "field": np.linalg.norm(nominal, axis=1)}
+    unit = np.eye(3)[:, None] * np.ones((len(points), 1))
+    shapes: dict[ActsOn, Floats] = {  # (axis, n, 3)
+        "readings": unit, "gains": unit * nominal, "positions": np.moveaxis(gradient, 2, 0)}
+    for name, coordinate in coordinates.items():
+        waves, functions = (_around if name == "angle" else _along)(coordinate)
+        if len(waves) < 2:
+            continue
+        spectra = np.array([
+            *(np.exp(-(waves / size)**2 / 4) for size in SMOOTH_WAVES),
+            *(1 / np.sqrt(1 + (waves / size)**2) for size in ROUGH_WAVES)])
+        spectra /= np.linalg.norm(spectra, axis=1)[:, None]
+        for acts_on, shape in shapes.items():
+            size = float(np.sqrt(np.mean(shape**2) * 3))
+            if not size > 0:
+                continue
+            found.append(Family(
+                acts_on, name, partial(_products, functions, shape * noise_T / size),
+                np.repeat(np.arange(3), len(waves)), np.tile(spectra, 3),
+                tuple(number < len(SMOOTH_WAVES) for number in range(len(spectra))),
+                np.tile(waves, 3), 360.0 if name == "angle" else float(np.ptp(coordinate)),
+                noise_T / size))
+    return found
+
+
+def _products(functions: Floats, shape: Floats) -> Floats:
+    """Return every function (k, n) times every shape (axes, n, 3), as (axes k, n, 3)."""
+    return (functions[None, :, :, None] * shape[:, None]).reshape(-1, *shape.shape[1:])
+
+
+def _of_smooth_terms(
+    acts_on: ActsOn, along: str, terms: SmoothTerms, noise_T: float, by_axis: bool,
+    span: float,
+) -> Family:
+    """Return the family of smooth terms of two dimensions."""
+    fineness, fields = terms.fineness, terms.fields
+    spectra = np.array([np.exp(-fineness @ decay) for decay in DECAY_RATES])
+    spectra /= np.linalg.norm(spectra, axis=1)[:, None]
+    axis = np.tile(np.arange(3), len(fields) // 3) if by_axis else np.full(len(fields), -1)
+    return Family(acts_on, along, lambda: noise_T * fields, axis, spectra,
+                  (True,) * len(spectra), fineness[:, 1], float(span), noise_T if by_axis else 0.0)
+
+
+def _along(coordinate: Floats) -> tuple[Floats, Floats]:
+    """Return half waves (k,) and cosines (k, n) of an rms of 1 over the range of a coordinate."""
+    span = np.ptp(coordinate)
+    different = len(np.unique((coordinate - coordinate.min()).round(9))) if span > 1e-9 else 1
+    waves = np.arange(min(different, MOST_WAVES + 1), dtype=float)
+    scaled = (coordinate - coordinate.min()) / (span or 1.0)
+    return waves, np.where(waves > 0, np.sqrt(2), 1.0)[:, None] * np.cos(
+        np.pi * waves[:, None] * scaled)
+
+
+def _around(angle: Floats) -> tuple[Floats, Floats]:
+    """Return half waves (k,) and the Fourier series (k, n) of an rms of 1 of the azimuth."""
+    turned = np.mod(angle - angle[0], 2 * np.pi)
+    different = len(np.unique(np.mod(turned.round(6), round(2 * np.pi, 6))))
+    orders = np.arange(1, min((different - 1) // 2, MOST_WAVES // 2) + 1)
+    waves = np.concatenate([[0.0], 2.0 * orders, 2.0 * orders])
+    series = np.vstack([np.ones((1, len(angle))), np.sqrt(2) * np.cos(orders[:, None] * turned),
+                        np.sqrt(2) * np.sin(orders[:, None] * turned)])
+    if different == len(waves) + 1:  # equal steps of an even number: the finest term has no sine
+        waves = np.append(waves, different)
+        series = np.vstack([series, np.cos(different // 2 * turned)])
+    return waves, series

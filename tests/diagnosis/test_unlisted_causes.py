@@ -1,0 +1,123 @@
+"""Causes outside the catalogue are called unknown; effects of the catalogue keep their names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.diagnosis import diagnose as module
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.unknown_cause import are_scattered
+from halbach_fe.report.diagnosis import verdict
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.hidden_effects import EFFECTS
+from halbach_fe.synthetic.simulate import simulate_campaign
+from halbach_fe.synthetic.unlisted_causes import families, random_function, rms, simulate_unlisted
+from tests.support.unlisted import STUDY, false_names
+
+SLOW = ("iron_ring", "iron_saturation", "neighbour_magnet")
+"""Effects whose signatures take long, and which no test here needs."""
+
+SOME = [effect for effect in catalogue() if effect.name not in SLOW]
+UNLISTED = {1: ("readings", "z", "smooth"), 2: ("positions", "angle", "rough"),
+            3: ("readings", "field", "smooth"), 4: ("source", "loop", "smooth")}
+"""Seeds, and the family of the cause."""
+
+
+@pytest.fixture(scope="module")
+def small():
+    """The study of the benchmark on fewer points."""
+    return parse_study(STUDY.model_dump() | {"observation": {
+        "quantity": "flux_density", "positions": {
+            "kind": "circles", "radius_m": [0.03, 0.05, 0.07], "angles": 12,
+            "z_min_m": -0.15, "z_max_m": 0.15, "count": 9}}})
+
+
+@pytest.mark.parametrize("seed", UNLISTED)
+def test_an_unlisted_cause_is_unknown(small, session, seed):
+    data, cause = simulate_unlisted(small, seed, UNLISTED[seed])
+    assert cause.rms_over_noise > 1  # else there is nothing to be seen
+    found = diagnose(small, data, session, effects=SOME)
+    assert false_names(found) == []
+    assert found.unknown is not None
+    assert found.unknown.alone
+    first = found.unknown.parts[0]
+    if cause.acts_on == "source":
+        assert found.unknown.kind != "instrument"
+        assert first.acts_on == "field"
+    else:
+        assert found.unknown.kind != "field"
+        ways = {f"{first.acts_on} {first.along}", *first.or_else}
+        assert f"{cause.acts_on} {cause.varies_along}" in ways
+        assert set(first.components) == {"xyz"[axis] for axis in cause.axes}
+    # the posterior mean has the size of what was added; the blocks absorb a part of it
+    assert first.rms_T == pytest.approx(np.sqrt(3) * cause.rms_T, rel=0.5)
+    text = " ".join(verdict(found))
+    assert "outside the catalogue is missing" in text
+    assert "It looks like" in text
+
+
+def test_without_the_competition_false_names_appear(small, session, monkeypatch):
+    """The control that must fail: the catalogue alone explains a cause that it does not have."""
+    data, _ = simulate_unlisted(small, 3, UNLISTED[3])
+    monkeypatch.setattr(module, "named_effects", lambda *given: given[3])
+    monkeypatch.setattr(module, "MAX_ROUNDS", 2)  # it would not come to rest
+    assert false_names(diagnose(small, data, session, effects=SOME))
+
+
+@pytest.mark.parametrize("names", [("drift",), ("block_missing",), ("arm_sag", "gain_z"), ()])
+def test_effects_of_the_catalogue_keep_their_names(small, session, names):
+    campaign = simulate_campaign(small, 5, hide=[(EFFECTS[name], None) for name in names])
+    found = diagnose(small, campaign.readings, session, campaign.blocks, effects=SOME)
+    named = [set(effect.selection.effects) for effect in found.identified]
+    assert len(named) == len(names)
+    assert all(any(name in each for each in named) for name in names)
+    assert found.unknown is None
+
+
+def test_a_missing_block_beside_an_unlisted_cause(small, session):
+    """What nothing of any shape could replace is named beside the unknown."""
+    with_block = simulate_campaign(small, 5, hide=[(EFFECTS["block_missing"], None)]).readings
+    z = with_block["z_m"].values
+    error = np.zeros(with_block["B_T"].shape)
+    error[:, 1] = 5e-4 * np.sin(2 * np.pi * z / 0.11 + 1)
+    found = diagnose(small, with_block.assign(B_T=with_block["B_T"] + error), session,
+                     effects=SOME)
+    assert [effect.hypothesis.effect.name for effect in found.identified] == ["block_missing"]
+    assert found.unknown is not None
+    assert not found.unknown.alone
+    assert "outside the catalogue remains" in " ".join(verdict(found))
+
+
+def test_scattered_sources():
+    around_one = [(0.0, 0.1, 0.12), (0.05, 0.0866, 0.12), (0.0757, 0.1311, 0.12)]
+    assert not are_scattered(around_one)
+    assert are_scattered([*around_one, (0.0, -0.1, 0.12)])
+    assert not are_scattered([(0.0, 0.1, 0.12), (0.0, -0.1, 0.12)])  # two may well be two
+
+
+def test_every_family_is_drawn_and_seen():
+    assert len(families()) == 23
+    drawn = [simulate_unlisted(STUDY, 7, family)[1] for family in families()]
+    assert [one.family for one in drawn] == ["-".join(family) for family in families()]
+    assert min(one.rms_over_noise for one in drawn) > 1
+
+
+def test_random_functions(generator):
+    coordinate = np.linspace(0, 1, 200)
+    for smooth, low, high in ((True, 0.98, 1.0), (False, 0.5, 0.97)):
+        value = random_function(coordinate, False, smooth, generator)
+        assert rms(value) == pytest.approx(1)
+        # neighbours 1/200 apart: smooth ones agree to (1/200/0.12)^2 / 2, rough ones to 1/200/0.04
+        assert low < np.corrcoef(value[1:], value[:-1])[0, 1] <= high
+    angle = np.linspace(-np.pi, np.pi, 41)
+    value = random_function(angle, True, True, generator)
+    assert value[0] == pytest.approx(value[-1], abs=1e-3)
+
+
+def test_seeds_are_reproducible():
+    first, second = (simulate_unlisted(STUDY, 9) for _ in range(2))
+    assert first[0].equals(second[0])
+    assert first[1] == second[1]
+    assert not first[0].equals(simulate_unlisted(STUDY, 10)[0])
