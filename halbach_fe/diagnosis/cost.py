@@ -20,12 +20,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.response.resource_estimate import (
-    OWN_SECONDS,
-    Estimate,
-    estimate_infer,
-    estimate_solve,
-)
+from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
 from halbach_fe.study.model import Study
 
 FEWEST_ROUNDS = 2
@@ -56,7 +51,7 @@ class DiagnosisEstimate:
 
     def seconds(self, rounds: int) -> float:
         """Return the time in s of so many rounds."""
-        return OWN_SECONDS + rounds * (self.update.seconds - OWN_SECONDS) + self.fields_s
+        return rounds * self.update.seconds + self.fields_s
 
     def as_dict(self) -> dict[str, Any]:
         """Return the estimate as plain data for JSON."""
@@ -94,8 +89,7 @@ def estimate_diagnosis(
         if asked:  # all places of an effect need fields of much the same cost
             fields += len(places) * len(asked)
             seconds += len(places) * sum(
-                estimate_solve(build_magnet(each), observation, jobs).seconds - OWN_SECONDS
-                for each in asked)
+                estimate_solve(build_magnet(each), observation, jobs).seconds for each in asked)
     return DiagnosisEstimate(estimate_infer(magnet, observation, jobs), signatures, fields,
                              seconds)
 
