@@ -67,7 +67,26 @@ study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrup
 
 # The measured magnets: raw map, Maxwell's check, where the map lies, the updated blocks.
 study-emphatic: results/emphatic/measured/report.html
-study-mri4all: results/mri4all/measured/report.html: results/mri4all/registered/registration.html
+study-mri4all: results/mri4all/measured/report.html
+
+results/emphatic/body.csv: studies/emphatic/measured/body_scan.csv | setup
+	.venv/bin/halbach-fe import-map $< -o $@ --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
+results/emphatic/fringe.csv: studies/emphatic/measured/small_aperture_fringe.csv | setup
+	.venv/bin/halbach-fe import-map $< -o $@ --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],-"
+results/emphatic/%/check.html: results/emphatic/%.csv
+	.venv/bin/halbach-fe check $< -o $(@D)
+results/mri4all/map.csv: studies/mri4all/measured/cube_10cm_11_steps.csv | setup
+	.venv/bin/halbach-fe import-map $< -o $@ "--columns=-,dx[mm],dy[mm],dz[mm],Bx[G],By[G],Bz[G],-,-"
+results/%/check/check.html: results/%/map.csv
+	.venv/bin/halbach-fe check $< -o $(@D)
+results/emphatic/registered/study.registered.toml: results/emphatic/body/check.html results/emphatic/fringe/check.html
+	.venv/bin/halbach-fe register studies/emphatic/measured/study.toml -o $(@D)
+results/mri4all/registered/registration.html: results/mri4all/check/check.html
+	.venv/bin/halbach-fe register studies/mri4all/measured/study.toml -o $(@D) \
+	    --measurements results/mri4all/check/corrected_map.csv
+results/emphatic/measured/report.html: results/emphatic/registered/study.registered.toml
+	.venv/bin/halbach-fe infer $< -o $(@D)
+results/mri4all/measured/report.html: results/mri4all/registered/registration.html
 	.venv/bin/halbach-fe infer results/mri4all/registered/study.registered.toml -o $(@D) \
 	    --measurements results/mri4all/check/corrected_map.csv
 
