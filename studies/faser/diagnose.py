@@ -209,9 +209,11 @@ def sentences(best: Answer, poses: list[Registration], answers: list[Answer],
                key=lambda each: each.registration.log_evidence)
     log_odds = (best.registration.log_evidence - axis.registration.log_evidence) / np.log(10)
     said = [
+        "The published profile is that of the axis, as it says."
+        if best is axis else
         f"The published profile is not that of the axis. It is the profile of B_x on a line "
         f"beside the axis, {radius:.1f} ± {radius_sd:.1f} mm from it and about {angle:.0f}° from "
-        f"the direction of the field, as are the mapper's circles of "
+        f"the direction of the field; the mapper's circles have a radius of "
         f"{1e3 * MAPPER_RADIUS_M:.0f} mm.",
         f"So read, the median relative error of held-out readings in the fringe field falls from "
         f"{paper[0]:.2f} in the paper to {here[0]:.3f}, and in the homogeneous field from "
@@ -233,11 +235,26 @@ def sentences(best: Answer, poses: list[Registration], answers: list[Answer],
             f"B_x of a dipole is even in x, y and z: {len(poses)} poses, lines in other quadrants "
             "or in the other direction, explain the profile equally well, and one component on "
             "one line cannot tell them apart.")
-    said.append(
-        "Step and length cannot be had apart either. The edges of the field say that the magnet "
-        "is some 97 steps long: with the drawing's 1.0 m a step is 10.3 mm, with a step of 10 mm "
-        "the magnet is 0.97 m long. The table has the odds.")
+    said += _step_or_length(answers)
     return said
+
+
+def _step_or_length(answers: list[Answer]) -> list[str]:
+    """Return a sentence on the answers in which only the step, or only the length, is open."""
+    alone = {key.key: each.registration for each in answers for key in (STEP, LENGTH)
+             if each.hypothesis.open_keys == (key,) and each.hypothesis.pose is ANYWHERE}
+    if len(alone) < 2:
+        return []
+    by_step, by_length = alone[STEP.key], alone[LENGTH.key]
+    step = Z_STEP_M * (1 + by_step.open_keys[STEP.key][0])
+    array = by_length.study.array
+    assert array.ring_length_m is not None
+    apart = (by_step.log_evidence - by_length.log_evidence) / np.log(10)
+    return [f"The edges of the field fix the ratio of the magnet's length to the step. Either a "
+            f"step is {1e3 * step:.2f} mm, or the magnet is "
+            f"{1e3 * array.rings * array.ring_length_m:.0f} mm long; by the stated noise and "
+            f"errors of blocks the {'step' if apart > 0 else 'length'} is the likelier by a "
+            f"factor of 10^{abs(apart):.0f}."]
 
 
 def profile_figure(answers: list[Answer], published: PublishedErrors) -> Figure:
