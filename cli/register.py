@@ -23,7 +23,7 @@ from halbach_fe.core.numbers import parse_number
 if TYPE_CHECKING:
     import xarray as xr
 
-    from halbach_fe.inference.registration import OpenKey, Registration
+    from halbach_fe.inference.pose_result import OpenKey, Registration
     from halbach_fe.study.model import Study
 
 
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _open_key(text: str) -> OpenKey:
-    from halbach_fe.inference.registration import OpenKey
+    from halbach_fe.inference.pose_result import OpenKey
 
     key, _, sd = text.partition("=")
     try:
@@ -71,7 +71,8 @@ def _open_keys(text: str) -> list[OpenKey]:
 def run(arguments: argparse.Namespace) -> int:
     """Register the map, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.inference.registration import PosePrior, register
+    from halbach_fe.inference.pose_result import PosePrior
+    from halbach_fe.inference.registration import register
     from halbach_fe.report.registration import registration_summary, write_registration
     from halbach_fe.study.reader import read_study
 

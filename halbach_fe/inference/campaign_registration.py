@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.registration import OpenKey, ProbePrior, Registration, register
+from halbach_fe.inference.pose_result import OpenKey, ProbePrior, Registration
+from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian

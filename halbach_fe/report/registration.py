@@ -11,7 +11,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
-from halbach_fe.inference.registration import Registration, axes_of_map, odds
+from halbach_fe.inference.pose_result import Registration
+from halbach_fe.inference.registration import axes_of_map, odds
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points

@@ -30,7 +30,8 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.registration import OpenKey, PosePrior, Registration, odds, register
+from halbach_fe.inference.pose_result import OpenKey, PosePrior, Registration
+from halbach_fe.inference.registration import odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import read_map

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.pose_result import OpenKey
 from halbach_fe.inference.pose_search import coarse_poses, right_angles
-from halbach_fe.inference.registration import OpenKey, odds, register
+from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study

@@ -1,0 +1,554 @@
+"""Least squares of a map's pose, its probe and open numbers, together with the blocks.
+
+The magnetizations of the blocks have the study's prior and are eliminated from the normal
+equations. On a line, where a wrong start is bent into shape by blocks, noise is added at first and
+taken away in steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.line_search import line_of
+from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
+from halbach_fe.inference.pose_search import NARROW
+from halbach_fe.inference.pose_space import (
+    LONGEST_M,
+    LONGEST_RAD,
+    Field,
+    moved_by,
+    right_angles,
+    share_of,
+)
+from halbach_fe.measurement.campaign import middle_of
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    remove_nonlinear_part,
+    sensor_matrix,
+    sensor_positions,
+)
+from halbach_fe.measurement.instrument_terms import (
+    DIFFERENCE_M,
+    STEADY,
+    by_terms,
+    field_at_sensors,
+    seen,
+    with_terms,
+)
+from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
+from halbach_fe.measurement.reading_noise import reading_noise
+from halbach_fe.response.block_variation import Variations, study_prior
+from halbach_fe.solver.exact_block_field import unit_fields
+from halbach_fe.solver.formulation_choice import field_function
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+
+ITERATIONS = 25
+"""Largest number of steps of a fit."""
+
+AT_REST, NO_BETTER = 0.02, 1e-3
+"""A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
+if a step decreases chi-squared by a smaller part than the second."""
+
+DEVIATION = 0.05
+"""Deviations of the blocks relative to their magnetization. Their columns are kept as long as a
+shift of the readings changes the field of such deviations by less than the noise."""
+
+SEEN = 0.1
+"""Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
+of a reading."""
+
+SMALL = 1e-5
+"""Step of finite differences by open keys of the instrument."""
+
+LONGEST_SD = 1.0
+"""Longest step of an open key, in prior standard deviations."""
+
+RENEWED = 0.7
+"""Change of an open key, in prior standard deviations, after which derivatives by open keys are
+computed anew."""
+
+BLURS = (1.0, 0.1, 0.01)
+"""Noise that is added on a line while the fit is on its way, in units of what the nominal blocks
+leave at first."""
+
+NEAR = 0.1
+"""Part of that shift up to which columns are kept on a line, where single blocks are near."""
+
+HALVINGS = 5
+"""Largest number of halvings of a step that does not improve the fit."""
+
+PROBE = 21
+"""Number of parameters of the probe: crosstalk, gains, offsets, and places of the sensors."""
+
+OFFSETS = slice(9, 12)
+"""Offsets among the parameters of the probe."""
+
+PART_OF_SD = 0.1
+"""Step of the finite differences by open keys, in prior standard deviations."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """What the fits of all poses share.
+
+    Attributes
+    ----------
+    points, readings : ndarray, shape (n, 3)
+        The map in m and T, by the study's units and axes.
+    training, held_out : ndarray of bool, shape (n, 3)
+    sigma : ndarray, shape (n, 3), in T
+        Noise of the readings, without that of positions; 1 T for those that are not used.
+    position_sd : ndarray, shape (3,), in m
+    base : Instrument
+        The study's instrument without its pose.
+    prior : Gaussian
+        Of all parameters of the blocks.
+    pose_sd : ndarray, shape (6,)
+        Prior standard deviations of the pose in m and rad.
+    derivatives : dict
+        Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
+    solved : dict
+        The last fields that were solved for, by the values of the open keys.
+    """
+
+    magnet: Magnet
+    points: Floats
+    readings: Floats
+    training: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
+    sigma: Floats
+    position_sd: Floats
+    session: Session
+    probe: ProbePrior
+    base: Instrument
+    open: tuple[OpenKey, ...]
+    pose_sd: Floats
+    variations: Variations | None
+    prior: Gaussian
+    derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
+    solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
+           open_keys: tuple[OpenKey, ...], pose: PosePrior, blocks: Gaussian | None) -> PoseFit:
+        """Prepare the fit of a map, as `halbach_fe.inference.registration.register` takes it."""
+        study = magnet.study
+        if magnet.dimension == 2:
+            raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
+                                     "2"))
+        for each in open_keys:
+            each.value(study)
+        base = study.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
+        data = in_si_and_magnet_axes(base, data)
+        points = points_of(data)
+        readings = remove_nonlinear_part(base, data)
+        measured = np.isfinite(readings) & ~excluded_components(study, len(points))
+        observation = observe(study.with_(instrument=base), points, measured)
+        if study.observation.quantity != "flux_density":
+            raise MeasurementError(must_be(
+                "observation", f"study {study.name}", "of flux_density, to register a map",
+                study.observation.quantity))
+        entries = observation.analysis.indices  # one component of one point each
+        apart = held_out_readings(study, observation)
+        held_out, training = (np.zeros(measured.size, bool) for _ in range(2))
+        held_out[entries[apart]], training[entries[~apart]] = True, True
+        # positions make readings noisy by the gradient where the map lies, which is not known yet
+        position = np.array(study.noise.position_sd_m or (0.0,)) if study.noise else np.zeros(1)
+        if study.noise is not None and study.noise.regions:
+            study = study.with_(noise=study.noise.with_(position_sd_m=None))
+        elif "sigma_T" in data:
+            study = study.with_(noise=None)
+        sigma = np.ones(measured.size)
+        sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
+        variations = Variations.of(magnet)
+        if blocks is None:
+            blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
+        return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
+                   held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
+                   session, probe, base, open_keys, pose.sd(magnet), variations, blocks)
+
+    @property
+    def smallest_sigma(self) -> float:
+        """Noise in T of the most exact reading."""
+        return float(self.sigma[self.training].min())
+
+    @cached_property
+    def on_a_line(self) -> bool:
+        """Whether the map lies on a line, so that it does not determine its pose."""
+        return line_of(self.points, NARROW * self.magnet.bore_radius) is not None
+
+    def prior_sd(self) -> Floats:
+        """Return the prior standard deviations of the parameters after the pose."""
+        probe = self.probe
+        return np.concatenate([np.full(6, probe.crosstalk), np.full(3, probe.gain),
+                               np.full(3, probe.offset_T), np.full(9, probe.sensor_m),
+                               np.array([each.sd for each in self.open])])
+
+    def instrument(self, pose: Floats, values: Floats) -> Instrument:
+        """Return the instrument of a pose (6,) and of the other parameters."""
+        base = self._base(values)
+        middle = self._origin(base)
+        return with_terms(base, middle, np.concatenate([
+            pose[:3] - middle, pose[3:], values[:PROBE], np.zeros(3)]))
+
+    def _origin(self, base: Instrument) -> Floats:
+        """Return the middle (3,) in m of the map, in the scale of an instrument without pose."""
+        return middle_of(sensor_positions(base.with_(
+            sensor_position_m=((0.0, 0.0, 0.0),) * 3), self.points)[:, 0])
+
+    def _base(self, values: Floats) -> Instrument:
+        """Return the instrument without its pose, with the values of the open keys."""
+        study = self.magnet.study.with_(instrument=self.base)
+        for each, value in zip(self.open, each_value(self, values), strict=True):
+            if each.of_instrument:
+                study = each.apply(study, value)
+        return study.instrument
+
+    def scaled(self, pose: Floats, values: Floats, start: Floats) -> Floats:
+        """Return all parameters (p,) less their prior means, in prior standard deviations.
+
+        The prior mean of the place across is the axis, that of the place along it is the one of
+        the pose ``start``; of the turns it is the nearest rotation by right angles.
+        """
+        turns = [Rotation.from_matrix(matrix) for matrix in right_angles()]
+        nearest = min(turns, key=lambda turn: (
+            Rotation.from_rotvec(start[3:]) * turn.inv()).magnitude())
+        turned = (Rotation.from_rotvec(pose[3:]) * nearest.inv()).as_rotvec()
+        place = pose[:3] - [0.0, 0.0, start[2]]
+        return np.concatenate([np.append(place, turned) / self.pose_sd, values / self.prior_sd()])
+
+    def study_of(self, pose: Floats, values: Floats) -> Study:
+        """Return the study of a pose and of the other parameters."""
+        return self._magnet(values).study.with_(instrument=self.instrument(pose, values))
+
+    def refined(self, pose: Floats) -> Registration:
+        """Return the registration to which least squares leads from a pose (6,)."""
+        prior_sd = self.prior_sd()
+        start, values = pose, np.zeros(len(prior_sd))
+        rows = self.training.ravel()
+        self.derivatives.clear()  # those of another pose belong to other places
+        columns = self._columns(pose, values)
+        state = self._state(pose, values, columns)
+        for blurred in self._blur(state):
+            # noise of positions grows with the gradient: a fit would look for one, so it is held
+            sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
+            at_rest = False
+
+            def reach(state: _State, blurred: float = blurred) -> float:
+                """Return how far in m the block columns hold; on a line only the noise counts."""
+                return state.reach * (
+                    NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
+
+            for _ in range(ITERATIONS):
+                state = state.with_noise(sigma)
+                step, sd, chi2 = state.step(rows, self.scaled(pose, values, start), self._damping)
+                if float(np.abs(step / sd).max()) < AT_REST:
+                    at_rest = True
+                    break
+                longest = LONGEST_SD * prior_sd[PROBE:]
+                step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
+                share = share_of(step)
+                for _ in range(HALVINGS):
+                    other, changed = moved_by(pose, share * step[:6]), values + share * step[6:]
+                    if self.is_possible(changed, other):
+                        moved = self._middle(other, changed) - columns.places
+                        near = columns if np.abs(moved).max() < reach(state) else (
+                            self._columns(other, changed))
+                        tried = self._state(other, changed, near).with_noise(sigma)
+                        now = tried.chi2(rows, self.scaled(other, changed, start))
+                        if now <= chi2:
+                            break
+                    share /= 2
+                else:
+                    break
+                pose, values, state, columns = other, changed, tried, near
+                if chi2 - now < NO_BETTER * chi2:
+                    at_rest = True
+                    break
+            state = state.with_noise(None)
+        scaled = self.scaled(pose, values, start)
+        sd = state.step(rows, scaled)[1]
+        updated, log_evidence, mean, covariance = state.updated(rows, scaled)
+        return Registration(
+            self.study_of(pose, values), pose[:3], sd[:3], sd[3:6], self.pose_sd,
+            {each.key: (value, error) for each, value, error in zip(
+                self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
+            _mean_square(updated / state.sigma, self.training),
+            _mean_square(updated / state.sigma, self.held_out),
+            _rms(updated, self.training), _rms(state.residual, self.training),
+            _rms(updated, self.held_out), _rms(state.residual, self.held_out),
+            log_evidence, at_rest, self._blocks(columns.directions, mean, covariance))
+
+    def _blocks(self, directions: Floats, mean: Floats, covariance: Floats) -> Gaussian:
+        """Return the updated blocks from mean (k,) and covariance (k, k) of their combinations."""
+        root = root_matrix(self.prior.root)
+        variances, axes = np.linalg.eigh(covariance)
+        return Gaussian(self.prior.mean + root @ (directions @ mean), CovarianceFactor(
+            root, directions @ axes, np.sqrt(np.clip(variances, 0.0, 1.0))))
+
+    @cached_property
+    def _damping(self) -> Floats:
+        """Inverse squares (p,) of the longest steps, which keep short what a line leaves open.
+
+        They are added to the information of a step: only where the map says little does it matter.
+        """
+        damping = np.zeros(6 + len(self.prior_sd()))
+        if self.on_a_line:
+            damping[:6] = np.repeat([LONGEST_M, LONGEST_RAD], 3)**-2.0
+        return damping
+
+    def _blur(self, state: _State) -> Sequence[float]:
+        """Return noise in T to be added to that of the readings, less and less; zero at last.
+
+        On a line, deviations of the blocks can take up what a wrong place or scale leaves. They
+        cannot as long as the noise is as large as what the nominal blocks leave.
+        """
+        if not self.on_a_line:
+            return (0.0,)
+        left = float(np.nanmax(_rms(state.residual, self.training)))
+        return (*(left * part for part in BLURS), 0.0)
+
+    def is_possible(self, values: Floats, pose: Floats | None = None) -> bool:
+        """Tell whether a valid study has these values, and all readings lie in air at a pose."""
+        try:
+            magnet = self._magnet(values)
+            if pose is None:
+                return True
+            sensors = sensor_positions(self.instrument(pose, values), self.points).reshape(-1, 3)
+        except HalbachError:
+            return False
+        around = np.concatenate([sensors + sign * DIFFERENCE_M * axis
+                                 for axis in np.eye(3) for sign in (1, -1)])
+        return not magnet.contains(around).any()
+
+    def _middle(self, pose: Floats, values: Floats) -> Floats:
+        """Return the mean positions (n, 3) in m of the sensors."""
+        return np.asarray(sensor_positions(self.instrument(pose, values), self.points).mean(axis=1))
+
+    def _columns(self, pose: Floats, values: Floats) -> _BlockColumns:
+        """Return the field of the blocks' magnetizations at a pose."""
+        middle = self._middle(pose, values)
+        fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
+            self.magnet.blocks, unit_fields(self.magnet.blocks, middle), strict=True)]
+        variations = self.variations
+        if variations is not None:
+            fields.append(variations.fields(middle))
+        root = root_matrix(self.prior.root)
+        whole = np.concatenate(fields, axis=2)
+        nominal = np.zeros(whole.shape[-1])
+        nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
+        flat = whole.reshape(-1, whole.shape[-1])
+        shift = (flat @ (self.prior.mean - nominal)).reshape(-1, 3)
+        flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
+        columns = flat.reshape(len(middle), 3, -1)
+        sizes, directions = np.linalg.eigh(flat.T @ flat)
+        kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
+        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept])
+
+    def _magnet(self, values: Floats) -> Magnet:
+        """Return the magnet with the values of the open keys."""
+        magnet = self.magnet
+        for each, value in zip(self.open, each_value(self, values), strict=True):
+            if not each.of_instrument:
+                magnet = magnet.with_study(each.apply(magnet.study, value))
+        return magnet
+
+    def _field(self, values: Floats) -> Field:
+        """Return the field of the nominal magnet with the values of the open keys."""
+        key = np.array([value for each, value in zip(self.open, values[PROBE:], strict=True)
+                        if not each.of_instrument]).tobytes()
+        if key not in self.solved:
+            while len(self.solved) > len(self.open) + 1:
+                del self.solved[next(iter(self.solved))]
+            self.solved[key] = field_function(self._magnet(values), self.session)
+        return self.solved[key]
+
+    def _by_open_keys(self, values: Floats, middle: Floats) -> list[Floats]:
+        """Return the derivatives (n, 3) of B at places (n, 3) in m by every key of the magnet."""
+        scaled = values[PROBE:] / self.prior_sd()[PROBE:]
+        known = self.derivatives.get("at")
+        if known is None or np.abs(scaled - known).max(initial=0.0) > RENEWED:
+            self.derivatives["at"] = scaled
+            here = self._field(values)(middle) if self.open else middle
+            for number, each in enumerate(self.open):
+                if each.of_instrument:
+                    continue
+                step = each.sd * PART_OF_SD * np.eye(len(values))[PROBE + number]
+                changed = values + step if self.is_possible(values + step) else values - step
+                self.derivatives[each.key] = (self._field(changed)(middle) - here) / (
+                    changed - values)[PROBE + number]
+        return [self.derivatives[each.key] for each in self.open if not each.of_instrument]
+
+    def _state(self, pose: Floats, values: Floats, near: _BlockColumns) -> _State:
+        """Return residual and derivatives of all readings at a pose and instrument."""
+        instrument = self.instrument(pose, values)
+        sensors = sensor_positions(instrument, self.points)
+        middle, count = sensors.mean(axis=1), len(self.points)
+        matrix = sensor_matrix(instrument)
+        here, gradient = field_at_sensors(self._field(values), sensors)
+        residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
+        columns = list(np.moveaxis(by_terms(
+            instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
+            gradient, STEADY), -1, 0))
+        magnets = iter(self._by_open_keys(values, middle))
+        for number, each in enumerate(self.open, start=PROBE):
+            if not each.of_instrument:
+                columns.append(next(magnets) @ matrix.T)
+                continue
+            step = SMALL * np.eye(len(values))[number]
+            other = self.instrument(pose, values + step)
+            moved = sensor_positions(other, self.points) - sensors
+            there = here + np.einsum("nsck,nsk->nsc", gradient, moved)
+            columns.append((seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL)
+        at_mean = gradient.mean(axis=1)
+        sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
+            "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
+        return _State(residual, np.stack(columns, axis=-1),
+                      np.einsum("ij,njk->nik", matrix, near.fields), sigma,
+                      np.concatenate([self.pose_sd, self.prior_sd()]),
+                      self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
+                          at_mean**2, axis=(1, 2)))))))
+
+
+@dataclass(frozen=True)
+class _BlockColumns:
+    """Fields of the blocks at the places of a map.
+
+    Attributes
+    ----------
+    places : ndarray, shape (n, 3), in m
+    fields : ndarray, shape (n, 3, k), in T
+        B per prior standard deviation of k combinations of the magnetizations.
+    shift : ndarray, shape (n, 3), in T
+        B of the prior's mean less that of the nominal magnet.
+    directions : ndarray, shape (columns of the prior's root, k)
+        The combinations.
+    """
+
+    places: Floats
+    fields: Floats
+    shift: Floats
+    directions: Floats
+
+
+@dataclass(frozen=True)
+class _State:
+    """Readings and their derivatives at one pose and instrument.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (n, 3), in T
+        Of the nominal blocks.
+    by_parameter : ndarray, shape (n, 3, p)
+        Derivatives by shifts, turns, and the other parameters.
+    by_block : ndarray, shape (n, 3, k), in T
+        Readings per prior standard deviation of the magnetizations.
+    sigma : ndarray, shape (n, 3), in T
+    prior_sd : ndarray, shape (p,)
+    reach : float, in m
+        Largest shift for which ``by_block`` holds, see `DEVIATION`.
+    noise : ndarray, shape (n, 3), in T, optional
+        Taken instead of ``sigma``, see `with_noise`.
+    """
+
+    residual: Floats
+    by_parameter: Floats
+    by_block: Floats
+    sigma: Floats
+    prior_sd: Floats
+    reach: float
+    noise: Floats | None = None
+
+    def with_noise(self, noise: Floats | None) -> _State:
+        """Return the state with another noise (n, 3) in T, or with its own if there is none."""
+        return dataclasses.replace(self, noise=noise)
+
+    def _whitened(self, rows: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
+        """Return residual (r,), derivatives (r, p) and block columns (r, k) of some readings."""
+        sigma = (self.sigma if self.noise is None else self.noise).ravel()[rows]
+        return (self.residual.ravel()[rows] / sigma,
+                self.by_parameter.reshape(len(rows), -1)[rows] / sigma[:, None],
+                self.by_block.reshape(len(rows), -1)[rows] / sigma[:, None])
+
+    def step(self, rows: NDArray[np.bool_], scaled: Floats, damping: Floats | None = None,
+             ) -> tuple[Floats, Floats, float]:
+        """Return the step (p,) to the most probable parameters, their sd (p,), and chi-squared.
+
+        The magnetizations are integrated out. ``scaled`` are the present parameters less their
+        prior means, in prior standard deviations; chi-squared is theirs. ``damping`` (p,) shortens
+        the step, not the standard deviations.
+        """
+        residual, derivative, blocks = self._whitened(rows)
+        inner = blocks.T @ blocks
+        inner[np.diag_indices(len(inner))] += 1.0
+        factor = cho_factor(inner, lower=True)
+
+        def kept(values: Floats) -> Floats:
+            return values - blocks @ cho_solve(factor, blocks.T @ values)
+
+        left, projected = kept(residual), kept(derivative)
+        information = derivative.T @ projected + np.diag(self.prior_sd**-2)
+        inverse = np.linalg.inv(information)
+        uphill = derivative.T @ left - scaled / self.prior_sd
+        step = inverse @ uphill if damping is None else np.asarray(np.linalg.solve(
+            information + np.diag(damping), uphill), np.float64)
+        return step, np.sqrt(np.diag(inverse)), float(residual @ left + scaled @ scaled)
+
+    def chi2(self, rows: NDArray[np.bool_], scaled: Floats) -> float:
+        """Return chi-squared with the magnetizations integrated out, see `step`."""
+        return self.step(rows, scaled)[2]
+
+    def updated(
+        self, rows: NDArray[np.bool_], scaled: Floats
+    ) -> tuple[Floats, float, Floats, Floats]:
+        """Return residual (n, 3) in T and log evidence, and mean and covariance of the blocks."""
+        residual, derivative, blocks = self._whitened(rows)
+        design = np.hstack([blocks, derivative * self.prior_sd])
+        inner = design.T @ design
+        inner[np.diag_indices(len(inner))] += 1.0
+        count = blocks.shape[1]
+        start = np.concatenate([np.zeros(count), scaled])
+        factor = cho_factor(inner, lower=True)
+        solution = cho_solve(factor, design.T @ residual - start)
+        updated = self.residual - self.by_block @ solution[:count] - self.by_parameter @ (
+            solution[count:] * self.prior_sd)
+        left = residual - design @ solution
+        chi2 = float(left @ left + np.sum((solution + start)**2))
+        return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
+            np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
+                factor, np.eye(len(inner)))[:count, :count]
+
+
+def each_value(fit: PoseFit, values: Floats) -> list[float]:
+    """Return the values of the open keys among the parameters after the pose."""
+    return [each.value(fit.magnet.study) + float(change)
+            for each, change in zip(fit.open, values[PROBE:], strict=True)]
+
+
+def _rms(residual: Floats, rows: NDArray[np.bool_]) -> Floats:
+    """Return the rms (3,) of the chosen residuals of each component; NaN if there are none."""
+    count = rows.sum(axis=0)
+    total = np.sum(np.where(rows, residual, 0.0)**2, axis=0)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def _mean_square(values: Floats, rows: NDArray[np.bool_]) -> float:
+    """Return the mean square of the chosen values (n, 3); NaN if there are none."""
+    return float(np.mean(values[rows]**2)) if rows.any() else float("nan")

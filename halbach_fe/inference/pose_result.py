@@ -1,0 +1,185 @@
+"""What is known about a map's pose before and after its registration."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+
+DEGREES = ("shift along x", "shift along y", "shift along z",
+           "turn about x", "turn about y", "turn about z")
+"""Degrees of freedom of a pose, along and about the axes of the magnet."""
+
+UNDETERMINED = 0.5
+"""Standard deviation, in units of the prior's, from which the map does not determine a degree of
+freedom."""
+
+EXPLAINED = 3.0
+"""Chi-squared per reading up to which the updated magnet explains a map. Unlike a wrong magnet,
+noise that the study takes for 1.7 times too small does not pass it."""
+
+
+@dataclass(frozen=True)
+class ProbePrior:
+    """Prior standard deviations of the instrument, apart from its pose.
+
+    Attributes
+    ----------
+    crosstalk : float
+        Of the probe's axes against those of the stage.
+    gain : float
+    offset_T : float
+    sensor_m : float
+        Of a sensor's place along each axis.
+    """
+
+    crosstalk: float = 0.03
+    gain: float = 0.003
+    offset_T: float = 1e-3
+    sensor_m: float = 1e-4
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Prior standard deviations of the pose, which matter where the map does not determine it.
+
+    Attributes
+    ----------
+    across_m : float, optional
+        Of the middle of the map from the magnet's axis along x and y; by default the outer radius
+        of the blocks.
+    turn_rad : float
+        Of the turns about the magnet's axes from the nearest rotation by right angles.
+    """
+
+    across_m: float | None = None
+    turn_rad: float = 0.1
+
+    def sd(self, magnet: Magnet) -> Floats:
+        """Return the standard deviations (6,) of shifts in m and turns in rad.
+
+        That along the axis is the magnet's half length, about where the search has found the map.
+        """
+        across = self.across_m if self.across_m is not None else magnet.array_outer_radius
+        return np.array([across, across, magnet.half_length, *[self.turn_rad] * 3])
+
+
+@dataclass(frozen=True)
+class OpenKey:
+    """A number of the study that a drawing leaves open, to be fitted with the pose.
+
+    Attributes
+    ----------
+    key : str
+        Such as ``demagnetization.squareness``, or ``instrument.z_scale`` for the step of the map.
+    sd : float
+        Prior standard deviation about the value in the study.
+    """
+
+    key: str
+    sd: float
+
+    def value(self, study: Study) -> float:
+        """Return the number in a study.
+
+        Raises
+        ------
+        StudyError
+            If the key is not one number.
+        """
+        found: object = study
+        for name in self.key.split("."):
+            found = getattr(found, name, None)
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            raise StudyError(must_be(f"`{self.key}`", f"study {study.name}",
+                                     "a number that is given, to be fitted", f"'{found}'"))
+        return float(found)
+
+    @property
+    def of_instrument(self) -> bool:
+        """Whether the number belongs to the mapper, not to the magnet."""
+        return self.key.startswith("instrument.")
+
+    def apply(self, study: Study, value: float) -> Study:
+        """Return the study with another number."""
+        return study.with_(**{self.key.replace(".", "__"): value})
+
+
+@dataclass(frozen=True)
+class Registration:
+    """One pose of a map in the magnet.
+
+    Attributes
+    ----------
+    study : Study
+        The study with the pose, axes, gains, offsets and sensors of its instrument, and with the
+        open keys.
+    middle_m : ndarray, shape (3,)
+        Where the middle of the map lies in the magnet, see `middle_of`.
+    translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
+        Standard deviations of that place, and of the turns about the magnet's axes.
+    prior_sd : ndarray, shape (6,)
+        Prior standard deviations of that place in m and of the turns in rad. Where the standard
+        deviations are nearly as large, the map does not determine the pose.
+    open_keys : dict of str to (float, float)
+        Value and standard deviation of each open key.
+    chi2 : float
+        Chi-squared per reading of the readings that were fitted, by the updated blocks.
+    held_out_chi2 : float
+        The same of the readings that the study holds out; NaN if there are none.
+    rms_T : ndarray, shape (3,)
+        Rms residual of the readings along each axis that were fitted, by the updated blocks.
+    nominal_rms_T : ndarray, shape (3,)
+        The same of the nominal blocks.
+    held_out_rms_T, held_out_nominal_rms_T : ndarray, shape (3,)
+        The same of the readings that the study holds out; NaN if there are none.
+    log_evidence : float
+        Log probability of the readings, up to a constant that all poses share.
+    at_rest : bool
+        Whether the fit came to rest.
+    blocks : Gaussian
+        Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
+        They serve to register another map of the same magnet: what permeable blocks answer to a
+        change of others is left out.
+    """
+
+    study: Study
+    middle_m: Floats
+    translation_sd_m: Floats
+    rotation_sd_rad: Floats
+    prior_sd: Floats
+    open_keys: dict[str, tuple[float, float]]
+    chi2: float
+    held_out_chi2: float
+    rms_T: Floats
+    nominal_rms_T: Floats
+    held_out_rms_T: Floats
+    held_out_nominal_rms_T: Floats
+    log_evidence: float
+    at_rest: bool
+    blocks: Gaussian = dataclasses.field(repr=False)
+
+    @property
+    def instrument(self) -> Instrument:
+        """The registered instrument."""
+        return self.study.instrument
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Shifts and turns that the map does not determine, which the prior holds."""
+        sd = np.concatenate([self.translation_sd_m, self.rotation_sd_rad])
+        return tuple(name for name, one, prior in zip(DEGREES, sd, self.prior_sd, strict=True)
+                     if one > UNDETERMINED * prior)
+
+    @property
+    def explains(self) -> bool:
+        """Whether the updated magnet leaves about the noise of the readings that were fitted."""
+        return self.chi2 < EXPLAINED
