@@ -58,9 +58,9 @@ SLOW_SHARE = 1.0
 
 The field at the edges of neighbouring blocks has no limit. In one magnet of rings of 12 cuboids,
 relative to losses that magpylib found in 4 cells a side: where these made 3 mT, the changes from 2
-to 3, 4 and 5 cells were 0.58, 0.29 and 0.15 of the losses' field, so that as much is left as the last
-one. Where they made 0.5 mT, the changes up to 6 cells were 0.28, 0.54, 0.41 and 0.28: of losses as
-small as that the bar is too short.
+to 3, 4 and 5 cells were 0.58, 0.29 and 0.15 of the losses' field, so that as much is left as the
+last one. Where they made 0.5 mT, the changes up to 6 cells were 0.28, 0.54, 0.41 and 0.28: of
+losses as small as that the bar is too short.
 """
 
 NEAREST_CELLS = 8
