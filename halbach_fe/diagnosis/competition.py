@@ -231,6 +231,8 @@ class Competition:
             taken = {self.candidates[k].effect for k in kept if self.candidates[k].unique}
             odds[[number for number, candidate in enumerate(self.candidates)
                   if number in kept or candidate.effect in taken]] = -np.inf
+            if not len(odds):  # there was no time for any hypothesis
+                break
             best = int(np.argmax(odds))
             if odds[best] < DETECTION_LOG_ODDS:
                 break
