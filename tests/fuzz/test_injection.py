@@ -39,6 +39,8 @@ FIELDS = {
     "iron_ring.curve.name": lambda text: {"iron_ring": {
         "inner_radius_m": 0.2, "outer_radius_m": 0.24, "curve": {"kind": "steel", "name": text}}},
     "array.material": lambda text: {"array__material": text},
+    "maps.name": lambda text: {"maps": [{"name": text, "file": "map.csv"}]},
+    "maps.probe": lambda text: {"maps": [{"name": "a", "file": "map.csv", "probe": text}]},
     "array.ring.material": lambda text: {"array__ring": [{"material": text}]},
 }
 """All free text of a study, with what makes a study of it; names of files have tests below."""
@@ -60,7 +62,8 @@ def test_there_is_no_other_text():
     """Whoever adds a field of text to the study decides here where it may go."""
     assert set(text_fields(Study.model_json_schema())) == {
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
-        "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file"}
+        "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file", "MapSettings.name",
+        "MapSettings.file", "MapSettings.probe"}
 
 
 def hostile_studies():
@@ -95,7 +98,8 @@ def test_nothing_of_a_study_becomes_code_of_getdp(staged):
         for name, content in files.items():
             content = content.replace(f"study {study.name},", "study dipole,")
             assert content == harmless[name], (field, text)
-    assert taken == {"name", "description", "noise.regions.name", "prior.types"}
+    assert taken == {"name", "description", "noise.regions.name", "prior.types", "maps.name",
+                     "maps.probe"}
     assert refused == set(FIELDS)
     for payload in ("}; Exit; Group {", "../../../etc/passwd", "a\nb", "<< 7*7 >>"):
         with pytest.raises(StudyError):
