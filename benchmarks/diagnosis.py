@@ -13,7 +13,7 @@ COUNTED = {
     "naming_rate_single": "single_cases", "naming_rate_pairs": "pair_cases",
     "false_alarm_rate": "clean_cases",
     "heldout_recovered_rate": "recovered_of", "iron_fringe_reduction": "iron_cases",
-    "others_named_per_case": "effects_cases"}
+    "others_named_per_case": "effects_cases", "naming_ece": "naming_statements"}
 """Rates, and of how many cases they are."""
 
 
@@ -22,7 +22,7 @@ def run(note: Note) -> None:
     if not SUMMARY.exists():
         raise StudyError(f"There is no {SUMMARY}. Run make verify-diagnosis first.")
     rates = json.loads(SUMMARY.read_text(encoding="utf-8"))["rates"]
-    unknown = [name for name in COUNTED if rates[name] is None]
+    unknown = [name for name in COUNTED if rates.get(name) is None]
     if unknown:
         raise StudyError(f"{SUMMARY} lacks {', '.join(unknown)}. Run all of make verify-diagnosis.")
     for name, count in COUNTED.items():

@@ -15,6 +15,7 @@ import platform
 from pathlib import Path
 
 from benchmarks import (
+    calibration,
     diagnosis,
     inference,
     iron3d,
@@ -34,10 +35,10 @@ RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
-         "unknown": unknown.run, "suspicion": suspicion.run,
+         "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
          "real": real.emphatic, "real_mri": real.mri, "faser": real.faser}
-ALONE = ("recovery", "scaling", "moments", "iron3d", "unknown", "suspicion", "real", "real_mri",
-         "faser")
+ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion", "real",
+         "real_mri", "faser")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -32,12 +32,12 @@ from halbach_fe.diagnosis.model_selection import (
     with_candidates,
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
 from halbach_fe.diagnosis.unknown_cause import SUSPECTED, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import map_time
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.hidden_effects import EFFECTS
@@ -100,13 +100,13 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
         data, _ = simulated(0)
         update = infer(build_magnet(STUDY), data, session, None)
         effects = [effect for effect in catalogue() if effect.name in NAMES]
-        base = score_hypotheses(STUDY, (), update, update.prior.mean, map_time(data),
+        base = score_hypotheses(STUDY, (), update, update.prior.mean, Campaign.of(STUDY, data),
                                 NominalSolver(session), effects, (), {})
         flexible = families_of(base, update)
         for seed in range(len(found), count):
             data, name = simulated(seed)
             search = with_readings(base, update, data)
-            named = identify_effects(STUDY, search, update.observation.map_points)
+            named = identify_effects(STUDY, search)
             suspected: list[list[Any]] = []
             if probability_at_most(search, named) >= SUSPECTED:
                 judgement = judge(search, update, named, flexible)

@@ -15,11 +15,12 @@ import argparse
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("map", type=Path, metavar="MAP",
+    parser.add_argument("map", type=InputFile, metavar="MAP",
                         help="field map (CSV, HDF5 or VTU); see import-map for other formats")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR",
                         help="folder for the page and its files")
@@ -30,15 +31,21 @@ def run(arguments: argparse.Namespace) -> int:
     """Check the map, write the results, print a summary."""
     from halbach_fe.measurement.field_map import read_map
     from halbach_fe.measurement.map_check import check_map
-    from halbach_fe.report.map_check import instrument_table, sentences, write_map_check
+    from halbach_fe.report.map_check import (
+        check_summary,
+        instrument_table,
+        sentences,
+        write_map_check,
+    )
 
     data = read_map(arguments.map)
     check = check_map(data, say=(lambda _: None) if arguments.json else common.say)
     if arguments.output is not None:
+        common.own_folder(arguments, "halbach-fe check")
         write_map_check(data, check, arguments.output, {
             "map": common.digest(arguments.map)})
     if arguments.json:
-        common.print_json(check.plain())
+        common.print_json(check_summary(data, check))
         return 0
     for sentence in sentences(check):
         common.say(sentence)

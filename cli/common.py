@@ -7,36 +7,26 @@ delay. Functions that compute something import the modules that they need themse
 from __future__ import annotations
 
 import argparse
-import errno
 import hashlib
 import json
 import math
-import mmap
 import multiprocessing
 import os
-import resource
-import signal
 import sys
 import threading
 import time
-import traceback
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from halbach_fe.core.errors import (
-    MAX_QUOTED,
-    OUT_OF_MEMORY,
-    HalbachError,
-    HalbachWarning,
-    StudyError,
-    must_be,
-    printable,
-)
+from halbach_fe.cli.guard import claim_buffers, guarded
+from halbach_fe.cli.streams import say as say
+from halbach_fe.cli.streams import show
+from halbach_fe.core.errors import MAX_QUOTED, OutputError, StudyError, must_be, printable
+from halbach_fe.core.files import InputFile
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,15 +38,21 @@ if TYPE_CHECKING:
     from halbach_fe.solver.session import Session
     from halbach_fe.study.model import Study
 
-BLAS_BUFFER_BYTES = 128 * 2**20
-"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
-and library, on two threads."""
-
 GETDP_LIMIT_S = 3600.0
 """Time limit of each GetDP process, unless another is asked for."""
 
 MAX_ORDER = 100
 """Highest order of a multipole. Higher orders are negligible in the bore."""
+
+
+MOST_MPI = 1024
+"""Largest number of MPI processes of a run."""
+
+Number = TypeVar("Number", int, float)
+
+LIMITS = 1e-6, 1e6
+"""Smallest and largest limit of unwanted multipoles in units of 1e-4 of the main one: from 1e-10 of
+it, below all errors, to a hundred times it."""
 
 
 def add_study_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
@@ -71,8 +67,18 @@ def add_study_arguments(parser: argparse.ArgumentParser, time_limit: bool = True
 
 def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
     """Add --dry-run."""
-    parser.add_argument("--dry-run", action="store_true",
-                        help="estimate memory, time and disk; nothing is solved or written")
+    output = next(action for action in parser._actions if action.dest == "output")
+
+    class DryRun(argparse.Action):
+        """The option, with which no folder for results is needed."""
+
+        def __call__(self, parser: object, namespace: argparse.Namespace, *_: object) -> None:
+            output.required = False
+            namespace.dry_run = True
+
+    parser.add_argument("--dry-run", action=DryRun, nargs=0, default=False,
+                        help="estimate memory, time and disk; nothing is solved or written, and -o "
+                        "is not needed")
 
 
 def print_estimate(estimate: Estimate, as_json: bool) -> int:
@@ -108,7 +114,7 @@ def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = Tru
     parser.add_argument("--jobs", type=positive, metavar="N",
                         help="number of GetDP runs at a time (default: 2, or with --scheduler the "
                         "number of cores of its workers)")
-    parser.add_argument("--mpi", type=positive, default=1, metavar="N",
+    parser.add_argument("--mpi", type=within(positive, 1, MOST_MPI), default=1, metavar="N",
                         help="number of MPI processes that share each run, for solves that are too "
                         "large for a single process (default: %(default)s)")
     parser.add_argument("--scheduler", metavar="ADDRESS",
@@ -127,7 +133,7 @@ def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = Tru
 
 def add_study_and_output(parser: argparse.ArgumentParser) -> None:
     """Add STUDY and -o."""
-    parser.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    parser.add_argument("study", type=InputFile, metavar="STUDY", help="study file (TOML)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
                         help="folder for results; made if it does not exist")
 
@@ -141,13 +147,56 @@ def run_study(
     ``options`` adds the study's own options to the parser.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.set_defaults(study=study)
+    parser.set_defaults(study=InputFile(study))
     parser.add_argument("-o", "--output", type=Path, default=Path("results", output),
                         metavar="DIR", help="folder for results (default: %(default)s)")
     add_solver_arguments(parser)
     options(parser)
     arguments = parser.parse_args()
-    return guarded(lambda: run(arguments))
+
+    def whole(arguments: argparse.Namespace) -> int:
+        own_folder(arguments, f"study {output}")
+        return run(arguments)
+
+    return guarded(lambda: with_folder(whole, arguments))
+
+
+def with_folder(
+    run: Callable[[argparse.Namespace], int], arguments: argparse.Namespace
+) -> int:
+    """Call ``run`` and return its exit code; then give back what `own_folder` took meanwhile."""
+    with ExitStack() as stack:
+        arguments.at_end = stack
+        return int(run(arguments))
+
+
+def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> None:
+    """Take the output folder for this command and study until the end of the run.
+
+    It is called before the first file is written, and after the input was read, so that a refused
+    input leaves no folder. See `halbach_fe.core.result_folder.result_folder`.
+    """
+    from halbach_fe.core.result_folder import result_folder
+
+    inputs = [value for value in (*vars(arguments).values(),
+                                  *getattr(arguments, "listed_maps", {}).values())
+              if isinstance(value, InputFile)]
+    arguments.at_end.enter_context(result_folder(arguments.output, command, study, inputs))
+
+
+def keep_input(output: Path, *inputs: Path) -> None:
+    """Refuse to write a file over one that is read.
+
+    Raises
+    ------
+    OutputError
+        If ``output`` is one of the inputs. A link at ``output`` would be replaced, not followed.
+    """
+    for path in inputs:
+        if not output.is_symlink() and output.exists() and path.exists() and (
+                path.samefile(output)):
+            raise OutputError(must_be("-o", "the command line", "a file other than the input",
+                                      str(output), "Name another file."))
 
 
 def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +206,7 @@ def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def digest(path: Path) -> str:
-    """Return the name of a file and its SHA-256, for the provenance of a page."""
+    """Return the name of a file and the SHA-256 of what was read, for the provenance of a page."""
     return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
 
 
@@ -182,7 +231,7 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
                         help="in 3D: multipoles on the circle at Z in m, instead of those of the "
                         "field integrated along z")
-    parser.add_argument("--limit-units", type=positive_number, metavar="U",
+    parser.add_argument("--limit-units", type=within(positive_number, *LIMITS), metavar="U",
                         help="largest unwanted multipole that is allowed, in units of 1e-4 of the "
                         "main multipole")
 
@@ -197,17 +246,17 @@ def reference(arguments: argparse.Namespace) -> MultipoleReference:
 
 def add_measurement_arguments(parser: argparse.ArgumentParser, several: bool = False) -> None:
     """Add --measurements and --blocks; ``several`` maps may be listed by the study instead."""
-    parser.add_argument("--measurements", type=Path, required=not several, metavar="MAP",
+    parser.add_argument("--measurements", type=InputFile, required=not several, metavar="MAP",
                         help="measured field map (CSV or HDF5)"
                         + (", unless the study lists maps" if several else ""))
-    parser.add_argument("--blocks", type=Path, metavar="CSV",
+    parser.add_argument("--blocks", type=InputFile, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
 
 
 def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
     """Add --held-out."""
-    parser.add_argument("--held-out", type=Path, metavar="MAP",
+    parser.add_argument("--held-out", type=InputFile, metavar="MAP",
                         help="another map at other positions, which is predicted but does not "
                         "update the model")
 
@@ -226,11 +275,10 @@ def blocks_and_held_out(
 ) -> tuple[BlockTable | None, xr.Dataset | None]:
     """Read the block table and the held-out map; None stands for a file not given."""
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.measurement.field_map import read_map
 
     held_out = getattr(arguments, "held_out", None)
     return (read_blocks(arguments.blocks) if arguments.blocks else None,
-            read_map(held_out) if held_out else None)
+            read_one(arguments, held_out) if held_out else None)
 
 
 def read_measurements(
@@ -243,8 +291,7 @@ def read_measurements(
     StudyError
         If both or neither are given.
     """
-    from halbach_fe.measurement.campaign import read_maps
-    from halbach_fe.measurement.field_map import read_map
+    from halbach_fe.measurement.campaign import different_maps
 
     if bool(study.maps) == (arguments.measurements is not None):
         raise StudyError(must_be(
@@ -252,15 +299,41 @@ def read_measurements(
             "both" if study.maps else "neither",
             "Leave --measurements out." if study.maps else "Add --measurements, or [[maps]]."))
     if study.maps:
-        return read_maps(study, arguments.study.parent)
-    return read_map(arguments.measurements)
+        return different_maps(study, _listed(arguments, study))
+    return read_one(arguments, arguments.measurements)
+
+
+def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
+    """Read a map, in halbach-fe's own columns or as the options of `import-map` describe it."""
+    from halbach_fe.measurement.field_map import read_map
+
+    if not hasattr(arguments, "columns"):
+        return read_map(path)
+    from halbach_fe.cli.format_options import declared_format
+    from halbach_fe.measurement.formats.declared import DeclaredFormat
+    from halbach_fe.measurement.formats.files import import_map
+
+    declared = declared_format(arguments)
+    if declared == DeclaredFormat() and not arguments.format:
+        return read_map(path)
+    data = import_map(path, declared, arguments.format).data
+    data.encoding["source"] = str(path)
+    return data
 
 
 def map_files(arguments: argparse.Namespace, study: Study) -> dict[str, Path | None]:
     """Return the files of the maps by their description in the provenance of a page."""
     if not study.maps:
         return {"measurements": arguments.measurements}
-    return {f"map {one.name}": arguments.study.parent / one.file for one in study.maps}
+    return {f"map {name}": file for name, file in _listed(arguments, study).items()}
+
+
+def _listed(arguments: argparse.Namespace, study: Study) -> dict[str, InputFile]:
+    """Return the files of the maps that the study lists, the same objects whenever it is called."""
+    if not hasattr(arguments, "listed_maps"):
+        arguments.listed_maps = {
+            one.name: InputFile(arguments.study.parent / one.file) for one in study.maps}
+    return dict(arguments.listed_maps)
 
 
 def add_seed_argument(parser: argparse.ArgumentParser) -> None:
@@ -271,13 +344,31 @@ def add_seed_argument(parser: argparse.ArgumentParser) -> None:
 
 def orders(text: str) -> tuple[int, ...]:
     """Parse orders of multipoles: ``2..10``, ``3,5,7``, or both."""
-    numbers: list[int] = []
+    numbers = set[int]()
     for part in text.split(","):
-        first, _, last = part.partition("..")
-        numbers += range(int(first), int(last or first) + 1)
-    if not numbers or min(numbers) < 1 or max(numbers) > MAX_ORDER:
-        raise argparse.ArgumentTypeError(f"must be orders from 1 to {MAX_ORDER}, not {text}")
-    return tuple(sorted(set(numbers)))
+        first, dots, last = part.partition("..")
+        ends = [first, last if dots else first]
+        if not all(end.isdecimal() and 1 <= int(end[:9]) <= MAX_ORDER for end in ends) or (
+                int(ends[0]) > int(ends[1])):
+            raise argparse.ArgumentTypeError(
+                f"must be orders from 1 to {MAX_ORDER}, such as 2..10 or 3,5,7, not "
+                f"{printable(text, MAX_QUOTED)!r}")
+        numbers.update(range(int(ends[0]), int(ends[1]) + 1))
+    return tuple(sorted(numbers))
+
+
+def within(
+    parse: Callable[[str], Number], least: float, most: float
+) -> Callable[[str], Number]:
+    """Return a function that parses a number, and refuses one below ``least`` or above ``most``."""
+    def parsed(text: str) -> Number:
+        value = parse(text)
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(
+                f"must be from {least:g} to {most:g}, not {printable(text, MAX_QUOTED)}")
+        return value
+
+    return parsed
 
 
 def count(text: str) -> int:
@@ -287,7 +378,7 @@ def count(text: str) -> int:
 
 def finite_number(text: str) -> float:
     """Parse a finite number."""
-    value = float(text)
+    value = _number(text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"must be finite, not {text}")
     return value
@@ -299,97 +390,45 @@ def positive(text: str) -> int:
 
 
 def _at_least(least: int, text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number, not {printable(text, MAX_QUOTED)!r}") from None
     if value < least:
         raise argparse.ArgumentTypeError(f"must be at least {least}, not {value}")
     return value
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"must be a number, not {printable(text, MAX_QUOTED)!r}") from None
+
+
 def positive_number(text: str) -> float:
     """Parse a number above 0."""
-    value = float(text)
+    value = _number(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
     return value
 
 
-def guarded(run: Callable[[], int]) -> int:
-    """Call a function and return its exit code; print errors as a single sentence on stderr.
-
-    SIGTERM and the closing of the terminal act like Ctrl-C: GetDP is stopped, and no result is left
-    half-written.
-    """
-    signals = (signal.SIGTERM, signal.SIGHUP)
-    previous = [signal.signal(number, signal.default_int_handler) for number in signals]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("once", HalbachWarning)
-            warnings.showwarning = lambda message, *_: say(f"warning: {message}")
-            _claim_buffers()
-            return run()
-    except HalbachError as error:
-        say(f"error: {error}")
-        return error.exit_code
-    except KeyboardInterrupt:
-        say("interrupted")
-        return 130
-    except BrokenPipeError:
-        return 0
-    except Exception as error:
-        if _is_out_of_memory(error):
-            say(f"error: There is not enough memory ({str(error) or 'it ran out'}). --dry-run "
-                "estimates what solve, infer and verify need; use a coarser mesh, fewer readings "
-                "or --jobs 1.")
-            return OUT_OF_MEMORY
-        traceback.print_exc()
-        say("error: this is a bug in halbach-fe; please report it with the above.")
-        return 1
-    finally:
-        for number, handler in zip(signals, previous, strict=True):
-            signal.signal(number, handler)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Tell whether an error means that memory ran out.
-
-    Errors of loading a library and of starting a thread are recognized by their text only.
-    """
-    return (isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
-            or any(text in str(error) for text in (
-                "failed to map segment", "can't start new thread")))
-
-
-def _claim_buffers() -> None:
-    """If the memory of this process is limited, have OpenBLAS allocate its buffers now.
-
-    OpenBLAS keeps its buffers. If it cannot allocate them, it retries forever; so the memory for
-    them is asked for here first.
-
-    Raises
-    ------
-    MemoryError
-        If there is not enough for the buffers.
-    """
-    if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
-        import numpy as np
-        import scipy.linalg as linalg
-
-        try:
-            mmap.mmap(-1, BLAS_BUFFER_BYTES).close()
-        except OSError:
-            raise MemoryError("the limit leaves too little for the linear algebra") from None
-        matrix = np.eye(200)
-        linalg.cholesky(matrix @ matrix)  # numpy and scipy each have their own OpenBLAS
-
-
 @contextmanager
-def session(arguments: argparse.Namespace) -> Iterator[Session]:
-    """Open a session in the output folder; show its progress on stderr if that is a terminal."""
+def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterator[Session]:
+    """Open a session in the output folder; show its progress on stderr if that is a terminal.
+
+    The folder becomes that of this verb and ``study``; shipped studies own theirs already.
+    """
     from halbach_fe.solver.dask_cluster import connected
     from halbach_fe.solver.getdp import find_getdp
     from halbach_fe.solver.session import Session
 
     getdp = find_getdp(arguments.getdp)
+    if study is not None:
+        own_folder(arguments, f"halbach-fe {arguments.verb}", study.name)
     with progress_bar("solving") as show, ExitStack() as stack:
         opened = Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
@@ -432,7 +471,7 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
 
 def _begin_worker(parent: int) -> None:
     """Prepare a worker process that ends itself once its parent has ended for whatever reason."""
-    _claim_buffers()
+    claim_buffers()
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -478,7 +517,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 def print_json(value: object) -> None:
     """Print machine-readable results on stdout."""
-    sys.stdout.write(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    show(json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
@@ -499,9 +538,6 @@ def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
         table.add_column(cell(name), justify="left" if number < 2 else "right")
     for row in rows:
         table.add_row(*map(cell, row.values()))
-    console.print(table)
-
-
-def say(text: str) -> None:
-    """Print a message that is not a result on stderr."""
-    sys.stderr.write(text + "\n")
+    with console.capture() as captured:
+        console.print(table)
+    show(captured.get())

@@ -8,9 +8,10 @@ For bash:
 from __future__ import annotations
 
 import argparse
-import sys
 
 import shtab
+
+from halbach_fe.cli.streams import show
 
 SHELLS = ("bash", "zsh", "tcsh")
 
@@ -22,8 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    import halbach_fe.cli  # here, because the command line itself imports this module
+    from halbach_fe.cli import verbs  # here, because verbs imports this module
 
-    whole = halbach_fe.cli.parser()
-    sys.stdout.write(shtab.complete(whole, shell=arguments.shell) + "\n")
+    show(shtab.complete(verbs.parser(), shell=arguments.shell) + "\n")
     return 0

@@ -11,11 +11,14 @@ import argparse
 
 from halbach_fe.cli import common
 
+MOST_CELLS = 100
+"""Most cells across a block: their number in a block grows with the third power."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--across", type=common.positive, metavar="N",
+    parser.add_argument("--across", type=common.within(common.positive, 1, MOST_CELLS), metavar="N",
                         help="cells across the thickness of a block (default: 6)")
 
 
@@ -31,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
-    with common.session(arguments) as session:
+    with common.session(arguments, magnet.study) as session:
         result = demagnetization_map(magnet, session, arguments.across or ACROSS)
     write_demagnetization(result, arguments.output)
     summary = demagnetization_summary(result)

@@ -1,4 +1,7 @@
-"""Find which effects a study lacks to explain a measured field map, and add them to the study.
+"""Find which effects a study lacks to explain measured field maps, and add them to the study.
+
+If the study lists maps, all of them are diagnosed together: an effect of the magnet must explain
+all maps, and one of an instrument is named with its map, or with the probe that maps share.
 
 Writes diagnosis.html and its figures, diagnosis.json, and study.diagnosed.toml: the study's own
 file with the identified effects added, which `halbach-fe solve` and `halbach-fe infer` can use
@@ -11,32 +14,37 @@ import argparse
 import difflib
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.files import InputFile
 from halbach_fe.study.types import COMPONENTS
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from halbach_fe.diagnosis.cost import DiagnosisEstimate
     from halbach_fe.diagnosis.effects.base import Effect
-    from halbach_fe.diagnosis.result import Diagnosis
+    from halbach_fe.diagnosis.result import Diagnosis, Floor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser, time_limit=False)
     common.add_dry_run_argument(parser)
-    common.add_measurement_arguments(parser)
+    common.add_measurement_arguments(parser, several=True)
     common.add_held_out_argument(parser)
     parser.add_argument("--time-limit", dest="diagnosis_limit", type=common.positive_number,
                         metavar="SECONDS",
                         help="time in s after which the search ends with what it has so far; the "
                         "step under way is finished (default: none)")
-    parser.add_argument("--check", type=Path, metavar="JSON",
+    parser.add_argument("--check", action="append", metavar="[MAP=]JSON",
                         help="check.json of halbach-fe check for this map, whose model-free "
-                        "floor is shown beside the results")
+                        "floor is shown beside the results; for each map that the study lists, "
+                        "with its name")
     parser.add_argument("--effects", type=effects_of, metavar="NAME,NAME...",
                         help="candidate effects (default: all effects of the catalogue)")
 
@@ -56,23 +64,58 @@ def effects_of(text: str) -> list[Effect]:
     return [effect_by_name[name] for name in dict.fromkeys(text.split(","))]
 
 
-def floor_of(path: Path) -> dict[str, float]:
-    """Return the model-free floor in T by component from a check.json.
+def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
+    """Return the model-free floor in T by component from the check.json of a map.
 
     Raises
     ------
     MeasurementError
-        If the file is not one of `halbach-fe check`.
+        If the file is not one of `halbach-fe check`, or belongs to another map.
     """
+    from halbach_fe.measurement.field_map import readings_sha256
+
     try:
-        floor = [float(value) for value in json.loads(path.read_text("utf-8"))["floor_T"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        floor = []
-    if len(floor) != len(COMPONENTS) or not all(map(math.isfinite, floor)):
+        found = json.loads(path.read_text("utf-8"))
+        floor = [float(value) for value in found["floor_T"]]
+        maps = set(found["maps_sha256"].values())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        floor, maps = [], set[str]()
+    if len(floor) != len(COMPONENTS) or not all(0 <= value < math.inf for value in floor):
         raise MeasurementError(must_be(
             "file --check", str(path), "a check.json that `halbach-fe check` wrote",
-            "a file without a floor of three components"))
+            "a file without a floor of three components and the hashes of its maps"))
+    if readings_sha256(data) not in maps:
+        raise MeasurementError(must_be(
+            "file --check", str(path), "that of the map that is diagnosed", "that of another map",
+            "Run `halbach-fe check` with this map."))
     return {f"B{name}": value for name, value in zip(COMPONENTS, floor, strict=True)}
+
+
+def floors_of(
+    given: Sequence[str] | None, data: xr.Dataset | dict[str, xr.Dataset]
+) -> Floor | None:
+    """Return the model-free floor of the map, or of each map that a study lists, by name.
+
+    Raises
+    ------
+    MeasurementError
+        If a file is not one of `halbach-fe check` or belongs to another map, or the names of the
+        maps are not those of the study.
+    """
+    if not given:
+        return None
+    if not isinstance(data, dict) and len(given) == 1:
+        return floor_of(InputFile(given[0]), data)
+    maps = data if isinstance(data, dict) else {}
+    pairs = [text.partition("=") for text in given]
+    wrong = [text for text, (name, sign, _) in zip(given, pairs, strict=True)
+             if not sign or name not in maps]
+    if wrong or len({name for name, *_ in pairs}) < len(pairs):
+        raise MeasurementError(must_be(
+            "--check", "the command line", "given once for each map, as NAME=JSON" if maps
+            else "given once, since there is one map", " ".join(wrong or given),
+            f"The study's maps are {', '.join(maps)}." if maps else ""))
+    return {name: floor_of(InputFile(path), maps[name]) for name, _, path in pairs}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -84,9 +127,10 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
-    text = arguments.study.read_text(encoding="utf-8")
-    data, blocks, validation_map = common.measurements(arguments)
-    floor = floor_of(arguments.check) if arguments.check else None
+    text = arguments.study.read_text(encoding="utf-8-sig")
+    data = common.read_measurements(arguments, study)
+    blocks, validation_map = common.blocks_and_held_out(arguments)
+    floor = floors_of(arguments.check, data)
     if arguments.dry_run:
         from halbach_fe.diagnosis.cost import estimate_diagnosis
 
@@ -95,11 +139,12 @@ def run(arguments: argparse.Namespace) -> int:
                           arguments.json)
     # no process may take longer than GetDP's own limit, unless the whole diagnosis may
     arguments.time_limit = max(common.GETDP_LIMIT_S, arguments.diagnosis_limit or 0.0)
-    with common.session(arguments) as session:
+    with common.session(arguments, study) as session:
         diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
                              common.say, floor_T=floor, time_limit_s=arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
-    write_diagnosis(diagnosis, separating, study, text, arguments.output)
+    write_diagnosis(diagnosis, separating, study, text, arguments.output,
+                    origin=arguments.study.parent)
     if arguments.json:
         common.print_json(diagnosis_summary(diagnosis, separating))
     else:

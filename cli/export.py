@@ -11,13 +11,15 @@ blocks where and as they are, with their exceptions. A study reads it as array.f
 from __future__ import annotations
 
 import argparse
+import tomllib
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.block_export import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.measurement.formats import WRITERS, export_map
+from halbach_fe.measurement.formats.files import WRITERS, export_map
 from halbach_fe.study.free_blocks_file import write_free_blocks
 from halbach_fe.study.reader import read_study
 
@@ -27,7 +29,7 @@ BLOCKS = "blocks"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("input", type=Path, metavar="MAP",
+    parser.add_argument("input", type=InputFile, metavar="MAP",
                         help="map in m and T (CSV, HDF5 or VTU); for the format blocks, a study")
     parser.add_argument("--format", choices=(*WRITERS, BLOCKS), required=True,
                         help="format of FILE")
@@ -35,10 +37,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="file to write")
 
 
+def free_blocks_files(study: Path) -> list[Path]:
+    """Return the file of the free blocks of a valid study, if it has one.
+
+    Written over it, a table would have the study's exceptions, which the study then adds again.
+    """
+    table = tomllib.loads(study.read_text("utf-8-sig"))["array"].get("free_blocks", {})
+    return [study.parent / table["file"]] if "file" in table else []
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Read the map or study, write it in the other format, and report its size."""
+    common.keep_input(arguments.output, arguments.input)
     if arguments.format == BLOCKS:
         columns = blocks_table(build_magnet(read_study(arguments.input)))
+        common.keep_input(arguments.output, *free_blocks_files(arguments.input))
         write_free_blocks(columns, arguments.output)
         common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
         return 0

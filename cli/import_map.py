@@ -14,50 +14,26 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.cli.format_options import add_format_arguments, declared_format
+from halbach_fe.core.files import InputFile
 from halbach_fe.measurement.field_map import points_of, write_map
-from halbach_fe.measurement.formats import READERS, ImportedFile, import_map
-from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.units import ANGLES, FIELDS, LENGTHS
+from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="map as it was delivered")
+    parser.add_argument("file", type=InputFile, metavar="FILE", help="map as it was delivered")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="MAP",
                         help="map to write: .csv, .h5 or .vtu")
-    parser.add_argument("--format", choices=READERS, default="",
-                        help="format of FILE (default: recognized from its beginning)")
-    parser.add_argument("--length-unit", choices=LENGTHS, default="", help="unit of the positions")
-    parser.add_argument("--field-unit", choices=FIELDS, default="", help="unit of B")
-    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
-    parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
-                        help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
-                        "dx, dy, dz (moves of a stage from reading to reading), t (time), or - "
-                        "for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
-    parser.add_argument("--component", choices=COMPONENTS, default="",
-                        help="component of the field in a column B")
-    parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",
-                        help="constant coordinates in m that the file does not contain, for "
-                        "example x=0,y=0")
-    parser.add_argument("--origin-m", type=point, metavar="X,Y,Z",
-                        help="position in m of the file's origin, along the magnet's axes; with a "
-                        "negative number write --origin-m=-0.5,0,0")
-    parser.add_argument("--decimal-comma", action="store_true",
-                        help="numbers have a decimal comma, as in 0,5")
-    parser.add_argument("--encoding", default=DeclaredFormat.encoding,
-                        help="encoding of a text file (default: UTF-8)")
+    add_format_arguments(parser)
     common.add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the file, convert it, write the map, and print how the file was understood."""
-    declared = DeclaredFormat(
-        length_unit=arguments.length_unit, field_unit=arguments.field_unit,
-        angle_unit=arguments.angle_unit, columns=arguments.columns,
-        component=arguments.component, at=arguments.at, origin_m=arguments.origin_m,
-        decimal_comma=arguments.decimal_comma, encoding=arguments.encoding)
-    imported = import_map(arguments.file, declared, arguments.format)
+    imported = import_map(arguments.file, declared_format(arguments), arguments.format)
+    common.keep_input(arguments.output, arguments.file)
     write_map(imported.data, arguments.output)
     properties = summary(imported)
     if arguments.json:
@@ -91,35 +67,3 @@ def text(value: object) -> str:
         return ", ".join(
             f"{element:.6g}" if isinstance(element, float) else str(element) for element in value)
     return str(value)
-
-
-def names(text: str) -> tuple[str, ...]:
-    """Parse a comma-separated list of names of columns."""
-    return tuple(name.strip() for name in text.split(","))
-
-
-def coordinates(text: str) -> dict[str, float]:
-    """Parse coordinates such as ``x=0,y=0``."""
-    values: dict[str, float] = {}
-    for part in text.split(","):
-        axis, _, value = part.partition("=")
-        if axis.strip() not in COMPONENTS:
-            raise argparse.ArgumentTypeError(f"must be like x=0,y=0, not {text}")
-        values[axis.strip()] = coordinate(value)
-    return values
-
-
-def point(text: str) -> tuple[float, float, float]:
-    """Parse a point ``X,Y,Z``."""
-    values = [coordinate(part) for part in text.split(",")]
-    if len(values) != 3:
-        raise argparse.ArgumentTypeError(f"must be three numbers, not {text}")
-    return values[0], values[1], values[2]
-
-
-def coordinate(text: str) -> float:
-    """Parse a finite number."""
-    value = float(text)
-    if not np.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be finite, not {text}")
-    return value

@@ -18,10 +18,15 @@ from halbach_fe.core.errors import StudyError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_format_arguments
+
     common.add_study_arguments(parser)
     common.add_dry_run_argument(parser)
     common.add_measurement_arguments(parser, several=True)
     common.add_held_out_argument(parser)
+    add_format_arguments(parser.add_argument_group(
+        "maps in other columns", "of --measurements and --held-out, as halbach-fe import-map "
+        "reads them, in the axes of the magnet"))
     parser.add_argument("--samples", type=common.positive, metavar="N",
                         help="for iron with an H(B) curve: sample the non-linear posterior by four "
                         "Markov chains of N draws each, instead of linearizing")
@@ -58,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         observation = observation_of(magnet, data, blocks, validation_map)
         return common.print_estimate(
             estimate_infer(magnet, observation, common.jobs(arguments)), arguments.json)
-    with common.session(arguments) as session:
+    with common.session(arguments, study) as session:
         result = infer(magnet, data, session, blocks, linearized_only=bool(arguments.samples),
                        validation_map=validation_map)
         if arguments.samples:
@@ -72,8 +77,14 @@ def run(arguments: argparse.Namespace) -> int:
             write_sampled(sampled, arguments.output)
     if result.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
-    from halbach_fe.report.campaign_inference import overlap_table, term_table, write_updated_study
+    from halbach_fe.report.campaign_inference import (
+        overlap_table,
+        pose_table,
+        term_table,
+        write_updated_study,
+    )
     from halbach_fe.report.inference import score_table, write_inference_report
+    from halbach_fe.report.inference_answer import answer
 
     write_inference(result, arguments.output)
     write_inference_report(result, arguments.output, provenance={
@@ -85,10 +96,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(inference_summary(result))
     else:
+        for sentence in answer(result):
+            common.say(sentence)
         if result.disagreement:
             common.say(f"Model and measurement disagree. {result.disagreement}")
         common.print_table(score_table(result), "Median relative error, before and after")
         common.print_table(term_table(result), "The instruments, estimated with the blocks")
+        common.print_table(pose_table(result), "Where the maps lie in the magnet")
         common.print_table(overlap_table(result), "Maps where they overlap")
         common.say(f"Report: {arguments.output / 'report.html'}")
     return 0

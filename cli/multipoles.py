@@ -9,15 +9,15 @@ figures.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--posterior", type=Path, metavar="H5",
+    parser.add_argument("--posterior", type=InputFile, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     common.add_multipole_arguments(parser)
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     study, limit = read_study(arguments.study), arguments.limit_units
     magnet = build_magnet(study)
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
-    with common.session(arguments) as session:
+    with common.session(arguments, study) as session:
         tables = multipoles(magnet, session, common.reference(arguments), posterior).tables
     write_multipoles(study, tables, limit, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(

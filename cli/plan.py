@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
-    with common.session(arguments) as session:
+    with common.session(arguments, magnet.study) as session:
         plan = plan_measurement(magnet, session, arguments.points)
     write_plan(magnet, plan, arguments.output)
     if arguments.json:

@@ -7,15 +7,15 @@ Writes prior.h5 (mean and covariance), prior.json, prior.html and its figure. `h
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_and_output(parser)
-    parser.add_argument("blocks", type=Path, metavar="BLOCKS",
+    parser.add_argument("blocks", type=InputFile, metavar="BLOCKS",
                         help="table of measured blocks (CSV)")
     common.add_json_argument(parser)
 
@@ -30,6 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     magnet = build_magnet(read_study(arguments.study))
     prior = prior_from_blocks(magnet, read_blocks(arguments.blocks))
+    common.own_folder(arguments, "halbach-fe prior", magnet.study.name)
     write_prior(magnet, prior, arguments.output)
     if arguments.json:
         common.print_json(prior_summary(magnet, prior))

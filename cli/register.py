@@ -14,10 +14,11 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--measurements", type=Path, metavar="MAP",
+    parser.add_argument("--measurements", type=InputFile, metavar="MAP",
                         help="measured field map (CSV or HDF5), unless the study lists maps")
     parser.add_argument("--fit", type=_open_key, action="append", default=[], metavar="KEY=SD",
                         help="a number of the study that is open, with its standard deviation, "
@@ -45,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--across-m", type=common.positive_number, metavar="SD",
                         help="prior standard deviation of the map's distance from the axis, for a "
                         "map that does not determine it (default: the blocks' outer radius)")
-    parser.add_argument("--turn-rad", type=common.positive_number, metavar="SD", default=0.1,
+    parser.add_argument("--turn-rad", type=common.positive_number, metavar="SD",
                         help="prior standard deviation of the map's turns from right angles, for a "
-                        "map that does not determine them (default: %(default)s)")
+                        "map that does not determine them (default: 0.1)")
 
 
 def _open_key(text: str) -> OpenKey:
@@ -78,14 +79,21 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     data = common.read_measurements(arguments, study)
-    text = arguments.study.read_text(encoding="utf-8")
+    text = arguments.study.read_text(encoding="utf-8-sig")
     say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     if isinstance(data, dict):
+        for name in ("alternative", "most", "across_m", "turn_rad"):
+            if getattr(arguments, name):
+                option = f"--{name.replace('_', '-')}"
+                raise StudyError(must_be(
+                    option, "the command line", "left out for a study that lists several maps",
+                    "given", "Register one of the maps alone with it."))
         return _run_campaign(arguments, study, text, data, say)
-    with common.session(arguments) as session:
+    pose = PosePrior(arguments.across_m, arguments.turn_rad or PosePrior.turn_rad)
+    with common.session(arguments, study) as session:
         found = register(build_magnet(study), data, session, open_keys=arguments.fit,
-                         alternatives=arguments.alternative, most=arguments.most,
-                         pose=PosePrior(arguments.across_m, arguments.turn_rad), say=say)
+                         alternatives=arguments.alternative, most=arguments.most, pose=pose,
+                         say=say)
     write_registration(study, text, data, found, arguments.output, common.digests({
         "study file": arguments.study, "measurements": arguments.measurements}))
     if arguments.json:
@@ -111,7 +119,7 @@ def _run_campaign(
     )
 
     maps = maps_of(study, data)
-    with common.session(arguments) as session:
+    with common.session(arguments, study) as session:
         found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say)
     registered = with_paths_from(registered_study(study, maps, found), arguments.study.parent,
                                  arguments.output)

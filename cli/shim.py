@@ -8,18 +8,18 @@ with the blocks in their new places.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError
+from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--measurements", type=Path, required=True, metavar="MAP",
+    parser.add_argument("--measurements", type=InputFile, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
-    parser.add_argument("--blocks", type=Path, metavar="CSV",
+    parser.add_argument("--blocks", type=InputFile, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
     common.add_multipole_arguments(parser)
@@ -31,21 +31,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replace", type=common.count, default=0, metavar="N",
                         help="largest number of blocks replaced by blocks of the stock, or without "
                         "--stock by new ones (default: %(default)s)")
-    parser.add_argument("--stock", type=Path, metavar="CSV",
-                        help="table of measured blocks that may replace others")
+    parser.add_argument("--stock", type=InputFile, metavar="CSV",
+                        help="table of measured blocks that may replace others: blocks "
+                        "that are not in the magnet, without ring and slot")
     common.add_seed_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Infer, choose the moves, write the results, print moves and multipoles."""
     from halbach_fe.api import shim
-    from halbach_fe.design.shimming import check_shimming
+    from halbach_fe.design.shimming import check_shimming, check_stock
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.campaign import refuse_several_maps
     from halbach_fe.report.shimming import move_table, shim_summary, write_shim
-    from halbach_fe.response.multipoles import text_table
+    from halbach_fe.response.multipoles import text_table, unwanted_orders
     from halbach_fe.study.reader import read_study
 
     if arguments.stock and not arguments.replace:
@@ -56,15 +57,17 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_several_maps(magnet.study, "shim")
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
-    with common.session(arguments) as session:
+    unwanted_orders(magnet, common.reference(arguments))  # refuse before the solves, which may
+    if stock:  # take long, what does not fit the study
+        check_stock(magnet, stock, blocks.serial if blocks else None)
+    with common.session(arguments, magnet.study) as session:
         result = infer(magnet, data, session, blocks)
         moves = shim(result, session, common.reference(arguments), arguments.swaps,
                      arguments.turns, arguments.replace, arguments.limit_units, stock,
                      arguments.seed)
-    if result.prior_conflict > result.conflict_limit:
-        common.say("warning: prior and map conflict, so that the error bars are not reliable: an "
-                   "effect is missing from the model. Run halbach-fe diagnose.")
-    write_shim(moves, result, arguments.study.read_text(encoding="utf-8"), arguments.output)
+    if result.disagreement:
+        common.say(f"warning: Model and measurement disagree. {result.disagreement}")
+    write_shim(moves, result, arguments.study.read_text(encoding="utf-8-sig"), arguments.output)
     if arguments.json:
         common.print_json(shim_summary(moves, result))
     else:

@@ -14,6 +14,7 @@ import argparse
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -33,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_and_output(parser)
     parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
                         help="seed of the random numbers (default: %(default)s)")
-    parser.add_argument("--coil-sd", type=common.positive_number, default=COIL_SD, metavar="F",
+    parser.add_argument("--coil-sd", type=common.within(common.positive_number, 1e-9, 0.3),
+                        default=COIL_SD, metavar="F",
                         help="noise of the measured moment of a block, relative to the moment "
                         "(default: %(default)g)")
     parser.add_argument("--hide", type=_effect, action="append", default=[],
@@ -43,10 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
                         help="hide K effects of the field or the instrument that are drawn at "
                         "random")
-    parser.add_argument("--element-size", type=common.positive_number, metavar="M",
+    parser.add_argument("--element-size", type=common.within(common.positive_number, 1e-5, 10),
+                        metavar="M",
                         help="size in m of the largest elements of NGSolve (default: a third of "
                         "the blocks' thickness, in 2D half of that)")
-    parser.add_argument("--order", type=common.positive, metavar="N",
+    parser.add_argument("--order", type=common.within(common.positive, 1, 10), metavar="N",
                         help="order of NGSolve's elements (default: 3 in 3D, 5 in 2D)")
     common.add_json_argument(parser)
 
@@ -64,10 +67,12 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.campaign import write_campaign_page  # imports matplotlib
 
     study = read_study(arguments.study)
+    build_magnet(study)  # refuses, as every command does, what cannot be built
     elements = Elements(arguments.element_size, arguments.order)
     with common.progress_bar("magpylib") as show:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
                             arguments.hide_random, elements, show)
+    common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
     written = write_campaign(campaign, arguments.output)
     write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,
                         arguments.output, [common.digest(path) for path in written])

@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         return common.print_estimate(
             estimate_solve(magnet, study_observation(magnet), common.jobs(arguments)),
             arguments.json)
-    with common.session(arguments) as session:
+    with common.session(arguments, magnet.study) as session:
         solution = solve(magnet, session)
     write_solution(solution, arguments.output)
     summary = solution.summary() | {

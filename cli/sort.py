@@ -8,15 +8,15 @@ figures.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("blocks", type=Path, metavar="BLOCKS",
+    parser.add_argument("blocks", type=InputFile, metavar="BLOCKS",
                         help="table of measured blocks (CSV); ring and slot may be missing")
     common.add_multipole_arguments(parser)
     common.add_seed_argument(parser)
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     magnet = build_magnet(read_study(arguments.study))
     table = read_blocks(arguments.blocks)
-    with common.session(arguments) as session, common.progress_bar("sorting") as show:
+    with common.session(arguments, magnet.study) as session, common.progress_bar("sorting") as show:
         assignment = sort(magnet, table, session, common.reference(arguments), arguments.seed, show)
     write_sorted(assignment, arguments.limit_units, arguments.output)
     if arguments.json:

@@ -7,19 +7,24 @@ tolerance.html and its figures.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
+
+MOST_DRAWS = 1_000_000
+"""Largest number of magnets. It determines a share of 1 % to 1 % of itself, and needs 1 GB for 100
+multipoles."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--blocks", type=Path, metavar="CSV",
+    parser.add_argument("--blocks", type=InputFile, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
     common.add_multipole_arguments(parser)
-    parser.add_argument("--draws", type=common.positive, default=10_000, metavar="N",
+    parser.add_argument("--draws", type=common.within(common.positive, 1, MOST_DRAWS),
+                        default=10_000, metavar="N",
                         help="number of magnets to draw (default: %(default)s)")
     common.add_seed_argument(parser)
 
@@ -34,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     magnet = build_magnet(read_study(arguments.study))
     blocks = read_blocks(arguments.blocks) if arguments.blocks else None
-    with common.session(arguments) as session:
+    with common.session(arguments, magnet.study) as session:
         result = tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
                            arguments.limit_units, arguments.seed)
     write_tolerance(result, arguments.output)

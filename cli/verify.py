@@ -1,6 +1,6 @@
 """Estimate the error of a study's field: refinement, a farther boundary, the dual formulation.
 
-Solves the nominal array at the study's positions on a coarser mesh, the study's own and a finer
+Solves the nominal array at the study's positions on two coarser meshes, the study's own and a finer
 one, with the boundary farther away, and by the dual formulation if the route has one. Writes
 verification.json, verification.csv (changes of the field at every point), verification.html and
 its figures.
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         return common.print_estimate(estimate_verify(magnet, common.jobs(arguments)),
                                      arguments.json)
-    with common.session(arguments) as session:
+    with common.session(arguments, magnet.study) as session:
         verification = verify(magnet, session,
                               say=lambda purpose: common.say(f"solving {purpose}"))
     write_verification(magnet, verification, arguments.output, {

@@ -6,7 +6,7 @@ import argparse
 import inspect
 from pathlib import Path
 
-from halbach_fe.cli import VERBS, parser
+from halbach_fe.cli.verbs import VERBS, parser
 from halbach_fe.study.model import Study
 
 MODULES = (

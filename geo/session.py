@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -11,6 +13,7 @@ from pathlib import Path
 import gmsh
 
 from halbach_fe.core.errors import HalbachError, MeshError
+from halbach_fe.core.files import atomic, is_full
 
 _GMSH_LOCK = threading.Lock()
 """Held during a session, because all threads of a process share one Gmsh."""
@@ -45,6 +48,8 @@ def _session(name: str) -> Iterator[None]:
     except HalbachError:
         raise
     except Exception as error:
+        if "alloc" in str(error):  # C++ says std::bad_alloc
+            raise MemoryError(f"Gmsh: {error}") from None
         raise MeshError(
             f"Gmsh could not mesh study '{name}': {error}. Check radii, gaps and element sizes."
         ) from error
@@ -53,10 +58,18 @@ def _session(name: str) -> Iterator[None]:
 
 
 def write_mesh(path: Path) -> None:
-    """Write the current model atomically: the file appears complete or not at all."""
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
-    try:
+    """Write the current model atomically: the file appears complete or not at all.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written. Gmsh itself does not notice a full disk.
+    """
+    with atomic(path) as temporary:
         gmsh.write(str(temporary))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        with temporary.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(-min(size, 32), os.SEEK_END)
+            if not file.read().rstrip().endswith(b"$EndElements"):
+                number = errno.ENOSPC if is_full(path.parent) else errno.EFBIG
+                raise OSError(number, f"{os.strerror(number)}; only {size} bytes could be written")

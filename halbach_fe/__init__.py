@@ -15,12 +15,17 @@ Examples
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # that of typing, whose import would be half of the time before `cli.main`
 if TYPE_CHECKING:
+    from typing import Any
+
+    from halbach_fe.api import HomogeneityResult as HomogeneityResult
     from halbach_fe.api import MultipoleTables as MultipoleTables
     from halbach_fe.api import demagnetization as demagnetization
     from halbach_fe.api import diagnose as diagnose
+    from halbach_fe.api import forces as forces
+    from halbach_fe.api import homogeneity as homogeneity
     from halbach_fe.api import multipoles as multipoles
     from halbach_fe.api import plan as plan
     from halbach_fe.api import shim as shim
@@ -30,6 +35,7 @@ if TYPE_CHECKING:
     from halbach_fe.core.errors import HalbachError as HalbachError
     from halbach_fe.core.errors import HalbachWarning as HalbachWarning
     from halbach_fe.design.demagnetization import DemagnetizationMap as DemagnetizationMap
+    from halbach_fe.design.forces import Forces as Forces
     from halbach_fe.design.measurement_plan import MeasurementPlan as MeasurementPlan
     from halbach_fe.design.shimming import Shim as Shim
     from halbach_fe.design.sorting import SortedBlocks as SortedBlocks
@@ -46,6 +52,7 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.map_check import MapCheck as MapCheck
     from halbach_fe.measurement.map_check import check_map as check_map
     from halbach_fe.report.result_files import write_report as write_report
+    from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.mesh_convergence import Verification as Verification
     from halbach_fe.response.mesh_convergence import verify as verify
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
@@ -62,7 +69,9 @@ _HOME = {
     "read_blocks": "measurement.block_table",
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
-    "verify": "response.mesh_convergence", "multipoles": "api", "plan": "api", "shim": "api",
+    "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
+    "forces": "api",
+    "plan": "api", "shim": "api",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
     "write_report": "report.result_files",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
@@ -70,6 +79,8 @@ _HOME = {
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
     "Verification": "response.mesh_convergence",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
+    "Region": "response.homogeneity", "HomogeneityResult": "api",
+    "Forces": "design.forces",
     "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
     "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",
     "DemagnetizationMap": "design.demagnetization", "SimulatedCampaign": "synthetic.simulate",

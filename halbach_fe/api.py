@@ -18,19 +18,28 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
+from halbach_fe.design.forces import Forces, block_forces
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
 from halbach_fe.design.shimming import Kind, Shim
 from halbach_fe.design.shimming import shim as choose_moves
-from halbach_fe.design.sorting import SortedBlocks, sort_blocks
+from halbach_fe.design.sorting import SortedBlocks, sort_blocks, sortable
 from halbach_fe.design.tolerance import Tolerance, assembled_prior, predict_tolerance
 from halbach_fe.diagnosis import diagnose as diagnosis_room
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import Say
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.response.homogeneity import (
+    SHOWN_DEGREES,
+    Homogeneity,
+    HomogeneityModel,
+    Region,
+    default_region,
+    homogeneity_model,
+)
 from halbach_fe.response.multipoles import (
     MultipoleModel,
     MultipoleReference,
@@ -38,7 +47,7 @@ from halbach_fe.response.multipoles import (
     multipole_model,
     multipole_models,
 )
-from halbach_fe.solver.session import Progress, Session
+from halbach_fe.solver.session import Progress, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
@@ -70,20 +79,53 @@ class MultipoleTables(ShownInNotebook):
     tables: Sequence[tuple[MultipoleModel, Mapping[str, Multipoles]]]
 
 
+@dataclass(frozen=True)
+class HomogeneityResult(ShownInNotebook):
+    """How homogeneous the field of a magnet is in a region.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    model : HomogeneityModel
+        The linear model of the field in the region.
+    by_name : mapping of str to Homogeneity
+        By the name of the distribution of the magnetizations: ``prior``, or ``prior`` and
+        ``posterior``.
+    distributions : mapping of str to Gaussian
+        These distributions, in A/m.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> found = hf.homogeneity(magnet, hf.Session.open("results"), hf.Region.sphere(0.005))
+    >>> found.by_name["prior"].harmonics[0].name
+    'Z'
+    """
+
+    magnet: Magnet
+    model: HomogeneityModel
+    by_name: Mapping[str, Homogeneity]
+    distributions: Mapping[str, Gaussian]
+
+
+@alone
 def diagnose(
-    magnet: Magnet, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
-    effects: Sequence[str] | None = None, validation_map: xr.Dataset | None = None,
-    say: Say = lambda text: None, floor_T: dict[str, float] | None = None,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
+    blocks: BlockTable | None = None, effects: Sequence[str] | None = None,
+    validation_map: xr.Dataset | None = None, say: Say = lambda text: None,
+    floor_T: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
     time_limit_s: float | None = None,
 ) -> Diagnosis:
-    """Find which effects the study lacks to explain a measured map, and add them to the model.
+    """Find which effects the study lacks to explain measured maps, and add them to the model.
 
     Parameters
     ----------
     magnet : Magnet
         The magnet of the study that is examined.
-    data : Dataset
-        The measured map, see `halbach_fe.read_map`.
+    data : Dataset or dict of str to Dataset
+        The measured map, see `halbach_fe.read_map`; or all maps that the study lists, see
+        `halbach_fe.read_maps`.
     session : Session
         Its folder receives a subfolder for each round of solving and searching.
     blocks : BlockTable, optional
@@ -94,9 +136,9 @@ def diagnose(
         Another map, which is predicted but does not update the model.
     say : callable, optional
         Called with a line of text about each step, to report progress.
-    floor_T : dict of str to float, optional
-        The model-free floor of the map by component (``Bx``), see `halbach_fe.check_map`; it is
-        shown beside the results.
+    floor_T : dict, optional
+        The model-free floor of the map by component (``Bx``), see `halbach_fe.check_map`; of maps
+        that the study lists, by map and component. It is shown beside the results.
     time_limit_s : float, optional
         Time after which the search ends with what it has so far.
 
@@ -134,6 +176,7 @@ def diagnose(
                                    floor_T=floor_T, time_limit_s=time_limit_s)
 
 
+@alone
 def multipoles(
     magnet: Magnet, session: Session, reference: MultipoleReference | None = None,
     posterior: Mapping[str, Gaussian] | InferenceResult | None = None,
@@ -186,6 +229,96 @@ def multipoles(
         for model in models])
 
 
+@alone
+def homogeneity(
+    magnet: Magnet, session: Session, region: Region | None = None,
+    posterior: Mapping[str, Gaussian] | InferenceResult | None = None,
+    degrees: int = SHOWN_DEGREES,
+) -> HomogeneityResult:
+    """Compute mean field, homogeneity in ppm and spherical harmonics, with error bars.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+        Its folder receives the runs of GetDP and the response matrix.
+    region : Region, optional
+        By default the sphere about the origin of half the radius of the bore.
+    posterior : mapping of str to Gaussian, or InferenceResult, optional
+        Distributions of the magnetizations in A/m by name. By default the study's prior of an
+        assembled magnet is the only distribution.
+    degrees : int, optional
+        Largest degree of the spherical harmonics.
+
+    Returns
+    -------
+    HomogeneityResult
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section, or the region reaches into material.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> region = hf.Region("cylinder", (0.005, 0.005, 0.01))
+    >>> known = hf.homogeneity(magnet, hf.Session.open("results"), region).by_name["prior"]
+    >>> known.peak_to_peak_ppm > known.rms_ppm > 0
+    True
+    """
+    model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
+    if isinstance(posterior, InferenceResult):
+        posterior = {"prior": posterior.prior, "posterior": posterior.posterior}
+    distributions = posterior or {"prior": assembled_prior(magnet, model.response.nominal)}
+    return HomogeneityResult(magnet, model, {
+        name: model.of(distribution) for name, distribution in distributions.items()},
+        distributions)
+
+
+@alone
+def forces(
+    magnet: Magnet, session: Session, order: Sequence[str] | None = None,
+    density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
+) -> Forces:
+    """Compute forces and torques on every block, in place and as it is inserted.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+        Its folder receives the runs of GetDP, if the magnet has iron.
+    order : sequence of str, optional
+        Names of all blocks in the order in which they are inserted; by default ring by ring, slot
+        by slot.
+    density_kg_per_m3 : float, optional
+        Density of all blocks; by default that of their grade, or 7500 (NdFeB).
+    price_per_kg : float, optional
+        Price of the blocks, from which their total cost follows.
+
+    Returns
+    -------
+    Forces
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section, the iron is not coaxial, or ``order`` does not name every
+        block once.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> found = hf.forces(magnet, hf.Session.open("results"))
+    >>> found.in_place.force_N.shape, bool(found.mass_kg.sum() > 0)
+    ((36, 3), True)
+    """
+    return block_forces(magnet, session, order, density_kg_per_m3, price_per_kg)
+
+
+@alone
 def plan(magnet: Magnet, session: Session, points: int | None = None) -> MeasurementPlan:
     """Choose the positions whose readings carry most information about the magnetizations.
 
@@ -220,6 +353,7 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
     return plan_measurement(magnet, session, points)
 
 
+@alone
 def shim(
     result: InferenceResult, session: Session, reference: MultipoleReference | None = None,
     swaps: int = 8, turns: int = 8, replacements: int = 0, limit_units: float | None = None,
@@ -256,7 +390,7 @@ def shim(
     StudyError
         If ``stock`` is given without ``replacements``, or the reference does not fit the study.
     MeasurementError
-        If the stock does not fit the study.
+        If the stock does not fit the study, or its blocks are in the magnet.
 
     Examples
     --------
@@ -276,6 +410,7 @@ def shim(
     return choose_moves(result, model, np.random.default_rng(seed), budget, limit_units, stock)
 
 
+@alone
 def sort(
     magnet: Magnet, blocks: BlockTable, session: Session,
     reference: MultipoleReference | None = None, seed: int = 1, progress: Progress | None = None,
@@ -318,11 +453,13 @@ def sort(
     >>> assignment.left_over
     2
     """
+    blocks = sortable(magnet, blocks)  # before the solves, which may take long
     model = multipole_model(magnet, reference or MultipoleReference(), session)
     return sort_blocks(magnet, blocks, model, np.random.default_rng(seed),
                        progress or (lambda done, total: None))
 
 
+@alone
 def tolerance(
     magnet: Magnet, session: Session, blocks: BlockTable | None = None,
     reference: MultipoleReference | None = None, draws: int = 10_000,
@@ -367,12 +504,13 @@ def tolerance(
     >>> hf.tolerance(magnet, session, draws=100, limit_units=1e4).share
     1.0
     """
+    measured = None if blocks is None else prior_from_blocks(magnet, blocks).gaussian
     model = multipole_model(magnet, reference or MultipoleReference(), session)
-    prior = (assembled_prior(magnet, model.nominal) if blocks is None
-             else prior_from_blocks(magnet, blocks).gaussian)
+    prior = measured or assembled_prior(magnet, model.nominal)
     return predict_tolerance(model, magnet, prior, draws, np.random.default_rng(seed), limit_units)
 
 
+@alone
 def demagnetization(
     magnet: Magnet, session: Session, across: int = demagnetization_room.ACROSS
 ) -> DemagnetizationMap:
@@ -440,8 +578,8 @@ def simulate_measurement(
     ValueError
         If a text in ``hide`` does not describe an effect.
     StudyError
-        If the study does not state the noise of its readings, measures at a point inside a
-        material, or cannot have one of the effects.
+        If the magnet cannot be built, or the study does not state the noise of its readings,
+        measures at a point inside a material, or cannot have one of the effects.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
 
@@ -452,5 +590,6 @@ def simulate_measurement(
     >>> campaign.readings.sizes["point"]
     24
     """
+    build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
                              hide_random=hide_random, progress=progress)

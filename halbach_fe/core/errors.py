@@ -176,6 +176,9 @@ class CheckFailedError(HalbachError):
 OUT_OF_MEMORY = 13
 """Exit code if memory runs out; Python raises MemoryError, so no class above stands for it."""
 
+READER_LEFT = 141
+"""Exit code if the reader of standard output has ended, that of a program ended by SIGPIPE."""
+
 EXIT_CODES: dict[int, str] = {
     0: "success",
     1: "unexpected error (a bug: please report it)",
@@ -192,6 +195,7 @@ EXIT_CODES: dict[int, str] = {
     SchedulerError.exit_code: "the Dask scheduler or its workers failed",
     OUT_OF_MEMORY: "not enough memory",
     130: "interrupted (Ctrl-C)",
+    READER_LEFT: "nobody read the output to its end (broken pipe)",
 }
 
 

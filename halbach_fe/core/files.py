@@ -2,14 +2,68 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
-import tempfile
-from collections.abc import Iterator
+import shutil
+import stat
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from contextvars import ContextVar
+from functools import cached_property
+from pathlib import Path, PosixPath
 
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be
-from halbach_fe.core.temporary_files import remove_orphans, temporary_name
+from halbach_fe.core.temporary_files import remove_orphans, temporary_path
+
+LARGEST_STREAM_BYTES = 2**30
+"""Most that is read of a pipe or device, some of which never end (/dev/zero). The largest maps that
+were tried, of a million readings, have a tenth of it."""
+
+FULL_BYTES = 10_000_000
+"""A disk with less free space is full: programs that met its end have removed some of their files.
+"""
+
+_ON_WRITTEN: ContextVar[Callable[[Path], None] | None] = ContextVar("on_written", default=None)
+"""What `telling` has to call, if anything."""
+
+
+class InputFile(PosixPath):
+    """The path of a file that is read once, however often its content is asked for.
+
+    So what provenance hashes, and what an edited copy of a study starts from, is what was used,
+    even if the file changes meanwhile. A pipe, which can be read once only, is a file like others.
+
+    Examples
+    --------
+    >>> file = InputFile("dipole.toml")
+    >>> file.read_text("utf-8") == file.read_bytes().decode("utf-8")
+    True
+    """
+
+    @cached_property
+    def _content(self) -> bytes:
+        with self.open("rb") as file:
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return file.read()
+            content = file.read(LARGEST_STREAM_BYTES + 1)
+        if len(content) > LARGEST_STREAM_BYTES:
+            raise OSError(errno.EFBIG, f"A pipe or device of more than "
+                          f"{LARGEST_STREAM_BYTES / 2**30:g} GiB", str(self))
+        return content
+
+    def read_bytes(self) -> bytes:
+        """Return the content as it was when it was first asked for."""
+        return self._content
+
+    def read_text(self, encoding: str | None = None, errors: str | None = None) -> str:
+        """Return the content as text."""
+        return io.TextIOWrapper(io.BytesIO(self._content), encoding, errors).read()
+
+
+def as_path(path: str | Path) -> Path:
+    """Return a path of text as a path; an `InputFile` stays one, with what it has read."""
+    return path if isinstance(path, Path) else Path(path)
 
 
 def file_bytes(path: Path, where: str) -> bytes:
@@ -27,12 +81,49 @@ def file_bytes(path: Path, where: str) -> bytes:
                                        "Check the path.")) from None
     if not raw.strip():
         raise MeasurementError(must_be("content", where, "a table of readings", "an empty file"))
+    if (workbook := workbook_in(raw)) is not None:
+        raise MeasurementError(workbook_sentence(where, workbook))
     return raw
+
+
+def workbook_in(raw: bytes) -> str | None:
+    """Return the name of the program whose workbook a file is; None if it is none."""
+    if raw.startswith(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1") or (
+            raw.startswith(b"PK\x03\x04") and b"xl/" in raw):
+        return "Excel"
+    if raw.startswith(b"PK\x03\x04") and b"application/vnd.oasis.opendocument" in raw[:200]:
+        return "OpenDocument"
+    return None
+
+
+def workbook_sentence(where: str, program: str) -> str:
+    """Return the sentence for a workbook in place of a table of text."""
+    return must_be("content", where, "a table of text (CSV)", f"an {program} workbook",
+                   "Save the sheet as CSV.")
+
+
+@contextmanager
+def telling(on_written: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with the path of every file that `atomic` has written within the block.
+
+    Examples
+    --------
+    >>> with telling(lambda path: print(path.name)):
+    ...     write_text(Path("note.txt"), "text")
+    note.txt
+    """
+    token = _ON_WRITTEN.set(on_written)
+    try:
+        yield
+    finally:
+        _ON_WRITTEN.reset(token)
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` when the block succeeds.
+
+    A link at ``path`` is replaced, not followed. Who may read the file depends on the umask.
 
     Raises
     ------
@@ -42,20 +133,20 @@ def atomic(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_orphans(path.parent)
-        handle, name = tempfile.mkstemp(prefix=temporary_name(path.stem), suffix=path.suffix,
-                                        dir=path.parent)
-        os.close(handle)
+        temporary = temporary_path(path)
+        temporary.open("xb").close()
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror}.") from None
-    temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o644)
         temporary.replace(path)
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:
         temporary.unlink(missing_ok=True)
+    on_written = _ON_WRITTEN.get()
+    if on_written is not None:
+        on_written(path)
 
 
 def _write_bytes(content: bytes, path: Path) -> None:
@@ -72,6 +163,17 @@ def make_folder(folder: Path) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically; raise OutputError on failure."""
+    """Write a text file atomically; raise OutputError on failure.
+
+    Bytes that are no UTF-8, which names of files may contain, become ``?``.
+    """
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="replace")
+
+
+def is_full(folder: Path) -> bool:
+    """Tell whether the disk of a folder has no room left, as far as that can be known."""
+    try:
+        return shutil.disk_usage(folder).free < FULL_BYTES
+    except OSError:
+        return False

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import socket
+import uuid
 from pathlib import Path
 
 _NAME = re.compile(r"\..+~(?P<host>[^~]+)~(?P<process>\d+)~")
@@ -21,6 +22,15 @@ _NAME = re.compile(r"\..+~(?P<host>[^~]+)~(?P<process>\d+)~")
 def temporary_name(name: str) -> str:
     """Return the first part of a file's or folder's name while this process writes it."""
     return f".{name}~{_here()}~{os.getpid()}~"
+
+
+def temporary_path(path: Path) -> Path:
+    """Return a path in the same folder for a file or folder while this process writes it.
+
+    Nobody can guess it, and put a link there that leads elsewhere. Whoever creates it himself, and
+    does not use the module tempfile, gives it the permissions of the user's umask.
+    """
+    return path.with_name(f"{temporary_name(path.stem)}{uuid.uuid4().hex[:8]}{path.suffix}")
 
 
 def remove_orphans(folder: Path) -> None:

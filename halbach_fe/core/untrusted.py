@@ -41,6 +41,8 @@ endless cycle."""
 def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
     """Read the labelled data of an HDF5 file, or of one of its groups, into memory.
 
+    The file is read once, so that what is checked is what is used.
+
     Raises
     ------
     OSError
@@ -48,9 +50,11 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
     ValueError
         If the file is damaged, or refused for a reason that `open_hdf5` lists.
     """
-    with path.open("rb") as file, open_hdf5(file):
+    content = io.BytesIO(path.read_bytes())
+    with open_hdf5(content):
         pass
-    with _refusing(), xr.open_dataset(path, group=group, engine="h5netcdf",
+    content.seek(0)
+    with _refusing(), xr.open_dataset(content, group=group, engine="h5netcdf",
                                       phony_dims="sort") as opened:
         return opened.load()
 

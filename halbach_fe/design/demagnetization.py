@@ -205,9 +205,6 @@ def demagnetization_map(magnet: Magnet, session: Session,
     warm = at_temperature(magnet, material)
     blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]
-    if not magnetized:
-        raise StudyError(f"Input `array` of study {magnet.name} must leave a block magnetized; "
-                         "instead every magnetization_factor is 0.")
     cells = cut(blocks, magnetized, across)
     field = _field_strength(warm, blocks, cells, session)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])

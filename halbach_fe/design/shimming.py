@@ -21,7 +21,7 @@ and e is independent of the readings, which depend on p only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Literal
@@ -31,12 +31,12 @@ import scipy.linalg as linalg
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
-from halbach_fe.inference.block_prior import first_of_types, loose_blocks
+from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles, met
@@ -390,10 +390,12 @@ def shim(
     StudyError
         If the study has variations inside blocks.
     MeasurementError
-        If the stock does not fit the study.
+        If the stock does not fit the study, or its blocks are in the magnet.
     """
     check_shimming(result.study)
     magnet = result.magnet
+    if stock:
+        check_stock(magnet, stock, result.measured_blocks)
     mounts = mounts_of(magnet)
     spares = _measured_spares(magnet, mounts, stock) if stock else _nominal_spares(magnet, mounts)
     if not budget.get("replace"):
@@ -424,6 +426,37 @@ def check_shimming(study: Study) -> None:
             f"{study.prior.variation_sd:g}", "Remove prior.variation_sd and "
             "prior.variation_length_m: a moved block's own variation is not known in its new "
             "slot."))
+
+
+def check_stock(
+    magnet: Magnet, stock: BlockTable, mounted: Collection[str] | None = None
+) -> None:
+    """Refuse a stock whose blocks do not fit the magnet, or stand in it already.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    stock : BlockTable
+    mounted : collection of str, optional
+        Serial numbers of the blocks in the magnet, if they are known.
+
+    Raises
+    ------
+    MeasurementError
+        If a block has a place, or the serial number of a block in the magnet, or does not fit.
+    """
+    for serial, (ring, slot) in zip(stock.serial, stock.places, strict=True):
+        if ring:
+            raise MeasurementError(must_be(
+                f"ring and slot of block {serial}", stock.source,
+                "empty, as a block of the stock stands in no slot", f"ring {ring}, slot {slot}",
+                "Remove the blocks that are in the magnet, and state the type of the others."))
+        if serial in (mounted or ()):
+            raise MeasurementError(must_be(
+                "serial", stock.source, "of blocks that are not in the magnet",
+                f"{serial}, which the table of the magnet's blocks has too", "Remove it from one "
+                "of the tables."))
+    _measured_spares(magnet, mounts_of(magnet), stock)
 
 
 def taken_out(result: InferenceResult) -> tuple[Floats, Floats, Floats]:
@@ -535,6 +568,7 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
     `SpareBlocks` have independent uncertainties.
     """
     size = magnet.dimension
+    table = with_types(as_meant(magnet), table)
     mean, root = loose_blocks(magnet, table)
     number = first_of_types(as_meant(magnet)) | first_of_types(magnet)
     first = np.array([number[label] for label in table.type])

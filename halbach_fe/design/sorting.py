@@ -29,6 +29,7 @@ from halbach_fe.inference.block_prior import (
     loose_blocks,
     shape_axes,
     types_of,
+    with_types,
 )
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles
@@ -143,8 +144,8 @@ def sort_blocks(
     MeasurementError
         If the table does not fit the study, or has too few blocks of a type.
     """
+    table = sortable(magnet, table)
     responses = _slot_responses(magnet, table, model)
-    _check_block_counts(magnet, table)
     if len(set(table.type)) == len(table):
         warnings.warn(f"Every block of study {magnet.name} is of a different type and fits only "
                       "one slot: there is nothing to sort. State in prior.types which slots take "
@@ -207,8 +208,16 @@ def _columns(magnet: Magnet, model: MultipoleModel) -> Complexes:
         len(uniform), len(magnet.blocks), magnet.dimension)[:, present(magnet)]
 
 
-def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
-    """Raise a MeasurementError if the table has too few blocks of a type."""
+def sortable(magnet: Magnet, table: BlockTable) -> BlockTable:
+    """Return a table with the types of all blocks, if they can be sorted into the magnet.
+
+    Raises
+    ------
+    MeasurementError
+        If the table does not fit the study, or has too few blocks of a type.
+    """
+    table = with_types(as_meant(magnet), table)
+    loose_blocks(magnet, table)  # which refuses blocks of another magnet
     for label, members in types_of(magnet).items():
         needed = sum(bool(magnet.blocks[number].remanence) for number in members)
         measured = table.type.count(label)
@@ -217,6 +226,7 @@ def _check_block_counts(magnet: Magnet, table: BlockTable) -> None:
                 f"blocks of type {label}", table.source, f"enough for the {needed} slots of that "
                 "type", str(measured),
                 "Measure more blocks, or join types in the study's prior.types."))
+    return table
 
 
 def _table_order(responses: _SlotResponses) -> Ints:

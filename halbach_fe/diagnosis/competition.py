@@ -9,14 +9,14 @@ dropped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Evidence, Marginal
-from halbach_fe.diagnosis.flexible_causes import Family, Fitted, fit_family
+from halbach_fe.diagnosis.flexible_causes import Family, Fitted, fit_family, largest_factor
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,
@@ -96,6 +96,8 @@ class Competition:
     columns : ndarray, shape (rows, k)
         Whitened signatures of all candidates.
     residual : ndarray, shape (rows,)
+    evidence : Evidence
+        Of these columns for this residual.
     candidates : sequence of Candidate
     families : sequence of Family
     whiten : callable
@@ -103,20 +105,78 @@ class Competition:
     """
 
     def __init__(
-        self, marginal: Marginal, columns: Floats, residual: Floats,
+        self, marginal: Marginal, columns: Floats, residual: Floats, evidence: Evidence,
         candidates: Sequence[Candidate], families: Sequence[Family],
         whiten: Callable[[Floats], Floats],
     ) -> None:
-        self.candidates, self.families = candidates, families
+        self.candidates, self.families, self.evidence = candidates, families, evidence
         self.prior = prior_log_odds(candidates)
         self.prior_of_family = float(np.log(EFFECT_PRIOR_ODDS / max(len(families), 1)))
         whitened = [whiten(family.fields()) for family in families]
         ends = np.cumsum([0, *(part.shape[1] for part in whitened)]).tolist()
         self._parts = [np.arange(*ends[number:number + 2]) for number in range(len(families))]
-        self._columns, self._terms = columns, np.hstack(whitened)
-        self._kept = marginal.remove(columns)
-        self.evidence = marginal.evidence(columns, residual)
-        self._evidence_of_terms = marginal.evidence(self._terms, residual)
+        self._terms, self._columns = np.hstack(whitened), columns
+        self._absorbed_terms = marginal.absorbed(self._terms)
+        self._absorbed_columns = marginal.absorbed(columns)
+        absorbed = marginal.absorbed(residual[:, None])[:, 0]
+        self._score = self._terms.T @ residual - self._absorbed_terms.T @ absorbed
+        # information between two families, of a column with all terms, of a term with all columns
+        self._products: dict[tuple[int, int], Floats] = {}
+        self._by_column: dict[int, Floats] = {}
+        self._by_term: dict[int, Floats] = {}
+        self._extended: dict[tuple[int, ...], Explanation] = {}
+
+    def _of_terms(self, rows: Ints) -> Floats:
+        """Return the information between some terms of any shape."""
+        found = np.empty((len(rows), len(rows)))
+        family = np.searchsorted([part[-1] for part in self._parts], rows)
+        for one in np.unique(family).tolist():
+            for other in np.unique(family).tolist():
+                here, there = np.flatnonzero(family == one), np.flatnonzero(family == other)
+                found[np.ix_(here, there)] = self._product(one, other)[np.ix_(
+                    rows[here] - self._parts[one][0], rows[there] - self._parts[other][0])]
+        return found
+
+    def _product(self, one: int, other: int) -> Floats:
+        """Return the information between the terms of two families."""
+        if one > other:
+            return self._product(other, one).T
+        if (one, other) not in self._products:
+            a, b = self._parts[one], self._parts[other]
+            self._products[one, other] = (
+                self._terms[:, a].T @ self._terms[:, b]
+                - self._absorbed_terms[:, a].T @ self._absorbed_terms[:, b])
+        return self._products[one, other]
+
+    def _cross(self, rows: Ints, columns: Ints) -> Floats:
+        """Return the information between some terms of any shape and some effects' columns."""
+        found = np.empty((len(rows), len(columns)))
+        for number, column in enumerate(columns.tolist()):
+            if column not in self._by_column:
+                self._by_column[column] = (
+                    self._terms.T @ self._columns[:, column]
+                    - self._absorbed_terms.T @ self._absorbed_columns[:, column])
+            found[:, number] = self._by_column[column][rows]
+        return found
+
+    def _cross_of_all(self, rows: Ints) -> Floats:
+        """Return the information between some terms and the columns of all effects."""
+        missing = np.array([row for row in rows.tolist() if row not in self._by_term], int)
+        if len(missing):
+            found = (self._terms[:, missing].T @ self._columns
+                     - self._absorbed_terms[:, missing].T @ self._absorbed_columns)
+            self._by_term |= dict(zip(missing.tolist(), found, strict=True))
+        return np.array([self._by_term[row] for row in rows.tolist()])
+
+    def given(self, terms: Sequence[Term]) -> Evidence:
+        """Return the evidence of all effects with terms integrated out."""
+        if not terms:
+            return self.evidence
+        rows = np.concatenate([term.columns for term in terms])
+        scale = np.concatenate([term.deviations for term in terms])
+        precision = self._of_terms(rows) * scale * scale[:, None] + np.eye(len(rows))
+        return self.evidence.beside(precision, self._cross_of_all(rows) * scale[:, None],
+                                    self._score[rows] * scale)
 
     def _given(
         self, terms: Sequence[Term], columns: Sequence[int], family: Ints | None = None
@@ -124,110 +184,130 @@ class Competition:
         """Return the evidence of effects' columns, and of a family's terms after them, with terms
         integrated out.
         """
-        of_terms, family = self._evidence_of_terms, np.zeros(0, int) if family is None else family
+        family = np.zeros(0, int) if family is None else family
         index = np.asarray(columns, int)
         added = np.concatenate([family, *(term.columns for term in terms)])
         scale = np.concatenate([np.ones(len(family)), *(term.deviations for term in terms)])
-        cross = self._kept[:, index].T @ self._terms[:, added] * scale
-        own = of_terms.information[np.ix_(added, added)] * scale * scale[:, None]
-        evidence = replace(
-            self.evidence,
-            information=np.block([[self.evidence.information[np.ix_(index, index)], cross],
-                                  [cross.T, own]]),
-            score=np.concatenate([self.evidence.score[index], of_terms.score[added] * scale]),
-            prior=np.ones(len(index) + len(added)))
+        cross = (self._cross(added, index) * scale[:, None]).T
+        own = self._of_terms(added) * scale * scale[:, None]
+        evidence = Evidence.of(
+            np.block([[self.evidence.part(index), cross], [cross.T, own]]),
+            np.concatenate([self.evidence.score[index], self._score[added] * scale]),
+            self.evidence.chi2, self.evidence.readings)
         kept = len(index) + len(family)
         return evidence.given(range(kept, len(index) + len(added))).only(range(kept))
 
-    def given(self, terms: Sequence[Term]) -> Evidence:
-        """Return the evidence of all effects with terms integrated out."""
-        return self._given(terms, range(len(self.evidence.score))) if terms else self.evidence
+    def _alone(
+        self, effects: Sequence[int], terms: Sequence[Term]
+    ) -> tuple[Evidence, list[Candidate]]:
+        """Return the evidence of some effects only beside terms, and these effects as its
+        candidates.
+        """
+        columns, chosen = self._renumbered(effects)
+        return self._given(terms, columns), chosen
+
+    def _renumbered(self, effects: Sequence[int]) -> tuple[list[int], list[Candidate]]:
+        """Return the columns of some effects, and the effects with their numbers among these."""
+        chosen = [self.candidates[number] for number in effects]
+        columns = [column for candidate in chosen for column in candidate.columns]
+        return columns, [replace(candidate, columns=tuple(
+            columns.index(column) for column in candidate.columns)) for candidate in chosen]
 
     def explanation(self, effects: Sequence[int], terms: Sequence[Term]) -> Explanation:
         """Judge effects and terms together."""
-        chosen = [self.candidates[number] for number in effects]
         total = float(self.prior[list(effects)].sum()) + len(terms) * self.prior_of_family
         if terms:
-            chosen_terms = np.concatenate([term.columns for term in terms])
+            own = self._given((), (), np.concatenate([term.columns for term in terms]))
             scale = np.concatenate([term.deviations for term in terms])
-            of_terms = self._evidence_of_terms
-            own = replace(
-                of_terms, score=of_terms.score[chosen_terms] * scale,
-                information=of_terms.information[np.ix_(chosen_terms, chosen_terms)]
-                * scale * scale[:, None], prior=np.ones(len(scale)))
+            own = replace(own, score=own.score * scale,
+                          information=own.information * scale * scale[:, None])
             total += own.fit(range(len(scale))).log_evidence
             total -= sum(term.fitted.at_best - term.fitted.log_bayes_factor for term in terms)
-        evidence = self.given(terms)
+        evidence, chosen = self._alone(effects, terms)
         total += log_evidence(evidence, chosen)
         rest = with_candidates(evidence, chosen)
         return Explanation(tuple(effects), tuple(terms), total, rest.chi2 / rest.readings)
 
     def terms_beside(self, effects: Sequence[int], terms: Sequence[Term]) -> list[Term]:
         """Return all other families beside effects and terms, the likeliest first."""
-        chosen = [self.candidates[number] for number in effects]
-        columns = [column for candidate in chosen for column in candidate.columns]
-        renumbered = [replace(candidate, columns=tuple(
-            columns.index(column) for column in candidate.columns)) for candidate in chosen]
-        found: list[Term] = []
-        for family, part in zip(self.families, self._parts, strict=True):
-            if any(term.family is family for term in terms):
-                continue
-            both = with_candidates(self._given(terms, columns, part), renumbered)
-            fitted = fit_family(family, both.only(
-                range(len(columns), len(columns) + len(part))))
-            used = fitted.deviations > 0
-            found.append(Term(family, fitted, part[used], fitted.deviations[used]))
+        found = [self._term(number, evidence)
+                 for number, evidence in self._families_beside(effects, terms)]
         return sorted(found, key=lambda term: -term.fitted.log_bayes_factor)
+
+    def likeliest_term(self, effects: Sequence[int], terms: Sequence[Term]) -> Term | None:
+        """Return the likeliest other family beside effects and terms; None if the readings do not
+        demand any.
+
+        Families that cannot be likelier are not fitted.
+        """
+        least, best = DETECTION_LOG_ODDS - self.prior_of_family, None
+        bounded = [(largest_factor(self.families[number], evidence), number, evidence)
+                   for number, evidence in self._families_beside(effects, terms)]
+        for bound, number, evidence in sorted(bounded, key=lambda each: -each[0]):
+            if bound < least:
+                break
+            term = self._term(number, evidence)
+            if term.fitted.log_bayes_factor >= least:
+                least, best = term.fitted.log_bayes_factor, term
+        return best
+
+    def _families_beside(
+        self, effects: Sequence[int], terms: Sequence[Term]
+    ) -> Iterator[tuple[int, Evidence]]:
+        """Yield the number of every other family, and its evidence beside effects and terms."""
+        columns, renumbered = self._renumbered(effects)
+        for number, (family, part) in enumerate(zip(self.families, self._parts, strict=True)):
+            if not any(term.family is family for term in terms):
+                both = with_candidates(self._given(terms, columns, part), renumbered)
+                yield number, both.only(range(len(columns), len(columns) + len(part)))
+
+    def _term(self, number: int, evidence: Evidence) -> Term:
+        """Return a family at its likeliest form."""
+        family, part = self.families[number], self._parts[number]
+        fitted = fit_family(family, evidence)
+        used = fitted.deviations > 0
+        return Term(family, fitted, part[used], fitted.deviations[used])
 
     def extended(self, effects: Sequence[int]) -> Explanation:
         """Add terms while the readings demand them, and drop effects that these make needless."""
+        key = tuple(effects)
+        if key not in self._extended:
+            self._extended[key] = self._extend(key)
+        return self._extended[key]
+
+    def _extend(self, effects: Sequence[int]) -> Explanation:
         kept = list(effects)
         terms: list[Term] = []
         while len(terms) < MOST_TERMS:
-            term = self.terms_beside(kept, terms)[0]
-            if term.fitted.log_bayes_factor + self.prior_of_family < DETECTION_LOG_ODDS:
+            term = self.likeliest_term(kept, terms)
+            if term is None:
                 break
             terms.append(term)
             kept = self.needed(kept, terms)
         return self.explanation(kept, terms)
 
-    def tempered(self, effects: Sequence[int], terms: Sequence[Term]) -> Evidence:
-        """Return the evidence of the effects beside terms, by the scatter that all of them leave.
-
-        What terms of a limited fineness leave is no longer noise of the stated size.
-        """
-        return self._tempered(self.given(terms), effects)
-
-    def _tempered(self, evidence: Evidence, effects: Sequence[int]) -> Evidence:
-        left = with_candidates(evidence, [self.candidates[k] for k in effects])
-        factor = max(1.0, left.chi2 / left.readings)
-        return replace(evidence, information=evidence.information / factor,
-                       score=evidence.score / factor, chi2=evidence.chi2 / factor)
-
     def needed(self, effects: Sequence[int], terms: Sequence[Term]) -> list[int]:
         """Drop effects whose odds beside the others and the terms are too small."""
-        return self._needed(effects, self.given(terms))
-
-    def _needed(self, effects: Sequence[int], evidence: Evidence) -> list[int]:
-        kept = list(effects)
+        evidence, candidates = self._alone(effects, terms)
+        kept = list(range(len(effects)))
         while kept:
-            tempered = self._tempered(evidence, kept)
+            tempered = _tempered(evidence, [candidates[k] for k in kept])
             odds = [float(log_bayes_factors(with_candidates(
-                tempered, [self.candidates[k] for k in kept if k != number]),
-                [self.candidates[number]])[0]) + self.prior[number] for number in kept]
+                tempered, [candidates[k] for k in kept if k != number]),
+                [candidates[number]])[0]) + self.prior[effects[number]] for number in kept]
             worst = int(np.argmin(odds))
             if odds[worst] >= DETECTION_LOG_ODDS:
                 break
             del kept[worst]
-        return kept
+        return [effects[number] for number in kept]
 
     def with_more_effects(self, start: Explanation) -> Explanation:
         """Add effects beside the terms of an explanation, one at a time."""
-        kept = list(start.effects)
+        kept, evidence = list(start.effects), self.given(start.terms)
         while start.terms and len(kept) < MAX_EFFECTS:
-            odds = log_bayes_factors(with_candidates(
-                self.tempered(kept, start.terms), [self.candidates[k] for k in kept]),
-                self.candidates) + self.prior
+            chosen = [self.candidates[k] for k in kept]
+            odds = log_bayes_factors(with_candidates(_tempered(evidence, chosen), chosen),
+                                     self.candidates) + self.prior
             taken = {self.candidates[k].effect for k in kept if self.candidates[k].unique}
             odds[[number for number, candidate in enumerate(self.candidates)
                   if number in kept or candidate.effect in taken]] = -np.inf
@@ -250,7 +330,7 @@ class Competition:
             deviations = LARGE_SIZE * family.spectra[-2]
             terms.append(Term(family, Fitted(0.0, 0.0, (), False, deviations, deviations), part,
                               deviations))
-        return self._needed(effects, self.given(terms))
+        return self.needed(effects, terms)
 
     def best_explanations(
         self, catalogued: Sequence[int], scattered: bool = False
@@ -295,3 +375,12 @@ class Competition:
         if not kept:
             return without, without
         return best if len(kept) == len(best.effects) else self.extended(kept), without
+
+
+def _tempered(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """Return the evidence by the scatter that candidates leave beside terms of any shape.
+
+    What terms of a limited fineness leave is no longer noise of the stated size.
+    """
+    left = with_candidates(evidence, candidates)
+    return evidence.tempered(max(1.0, left.chi2 / left.readings))

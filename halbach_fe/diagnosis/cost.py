@@ -10,16 +10,18 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.diagnose import MAX_ROUNDS, blocks_of
+from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
-from halbach_fe.diagnosis.gross_errors import find_gross_errors
+from halbach_fe.diagnosis.map_errors import Data, blocks_of, correct_map_errors
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.instrument import probe_points
+from halbach_fe.measurement.campaign import check_maps
 from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
 from halbach_fe.study.model import Study
 
@@ -62,30 +64,32 @@ class DiagnosisEstimate:
 
 
 def estimate_diagnosis(
-    study: Study, data: xr.Dataset, blocks: BlockTable | None = None,
+    study: Study, data: Data, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
     jobs: int = 1,
 ) -> DiagnosisEstimate:
     """Estimate the cost of `halbach_fe.diagnosis.diagnose.diagnose`, with nothing solved.
 
-    Gross errors of the map are found, as in the diagnosis, because the magnet is solved at the
+    Gross errors of the maps are found, as in the diagnosis, because the magnet is solved at the
     corrected positions.
     """
-    corrected = study
-    for error in find_gross_errors(study, data, blocks):
-        corrected = error.apply(corrected)
+    check_maps(study, data)
+    _, corrected, starts = correct_map_errors(study, data, blocks, catalogue())
     blocks = blocks_of(blocks, study, corrected)
-    study, magnet = corrected, build_magnet(corrected)
+    study = apply_effects(corrected, starts[0]) if starts else corrected
+    magnet = build_magnet(study)
     observation = observation_of(magnet, data, blocks, validation_map)
-    points = probe_points(study.instrument, observation.map_points)[:1]
+    campaign = Campaign.of(study, data, validation_map)
+    first = campaign.maps[0]
+    points, own = campaign.points_of(study)[:1], first.study_of(study)
     signatures, fields, seconds = 0, 0, 0.0
     for effect in catalogue() if effects is None else effects:
-        places = effect.places(study)
+        places = campaign.places(effect, study)
         if not places:
             continue
         signatures += min(len(places), SHORTLIST) if effect.name == "blocks_swapped" else len(
             places)
-        asked = _asked(effect, study, points, places[0])
+        asked = _asked(effect, own, points, places[0])
         if asked:  # all places of an effect need fields of much the same cost
             fields += len(places) * len(asked)
             seconds += len(places) * sum(

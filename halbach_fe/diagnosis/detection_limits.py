@@ -14,24 +14,23 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, each_block
 from halbach_fe.diagnosis.effects.block_demagnetized import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.effects.block_displaced import BlockDisplacedEffect
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,
     WIDE_PRIOR_SD,
 )
-from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import DetectionLimits
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import marginal_of
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.study.model import Study
 
 BLOCKS_AT_ONCE = 100
 """Number of blocks whose signatures are kept at a time, to bound their memory."""
 
 
 def detection_limits(
-    update: InferenceResult, times: Floats, columns: Floats
+    update: InferenceResult, campaign: Campaign, columns: Floats
 ) -> DetectionLimits | None:
     """Return the smallest changes of single blocks that the training readings would have shown.
 
@@ -39,8 +38,7 @@ def detection_limits(
     ----------
     update : InferenceResult
         The inference with the identified effects in the model.
-    times : ndarray, shape (n,)
-        Time of each point of the map.
+    campaign : Campaign
     columns : ndarray, shape (rows, k)
         Whitened signatures of the identified effects per prior standard deviation, whose amplitudes
         are free.
@@ -53,9 +51,8 @@ def detection_limits(
     places = each_block(update.study)
     if not places:
         return None
-    whitened, _, marginal, _ = marginal_of(update)
-    points = probe_points(update.study.instrument, update.observation.map_points)
-    nominal = NominalFields(update.study, points, times, _not_solved)
+    whitened, _, marginal, _ = marginal_of(update, campaign)
+    scene = campaign.scene(update.study)  # changes of single blocks need their field in vacuum only
     threshold = DETECTION_LOG_ODDS - float(np.log(EFFECT_PRIOR_ODDS / len(places)))
 
     def limits(effect: Effect, count: int) -> Floats:
@@ -63,7 +60,7 @@ def detection_limits(
         sd, found = effect.parameters[0].sd, []
         for first in range(0, len(places), BLOCKS_AT_ONCE):
             signatures = [sd * whitened(update.observation.read(
-                effect.signature(nominal, place)[:count]))
+                scene.signature(Hypothesis(effect, place))[:count]))
                 for place in places[first:first + BLOCKS_AT_ONCE]]
             evidence = marginal.evidence(np.hstack([columns, *signatures]),
                                          np.zeros(len(columns))).given(range(columns.shape[1]))
@@ -103,7 +100,3 @@ def smallest_amplitude(information: Floats, threshold: float) -> float:
         found.append(float(np.sqrt(2 * cost / gain)))
     return min(found)
 
-
-def _not_solved(study: Study) -> Floats:
-    """Take the place of a solver: changes of single blocks need their field in vacuum only."""
-    raise AssertionError(f"study {study.name} was not to be solved")

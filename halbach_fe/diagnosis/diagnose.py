@@ -17,6 +17,9 @@ they explain far less.
 
 Random errors of the probe's positions are noise rather than an effect: their size is estimated in
 every round, and the comparison is repeated with that noise until it no longer changes.
+
+Several maps of one magnet, which the study lists, are diagnosed together: effects of the magnet
+must explain all of them, and those of an instrument belong to a map or to a probe.
 """
 
 from __future__ import annotations
@@ -35,17 +38,19 @@ from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.equal_positions import possible_positions
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
-from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
+from halbach_fe.diagnosis.map_errors import Data, blocks_of, correct_map_errors
 from halbach_fe.diagnosis.model_selection import probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.pace import Pace
 from halbach_fe.diagnosis.position_noise import (
+    PositionNoise,
     estimate_position_noise,
-    has_settled,
+    have_settled,
     with_position_noise,
 )
-from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect, Suspicion, UnknownCause
+from halbach_fe.diagnosis.result import Diagnosis, Floor, IdentifiedEffect, Suspicion, UnknownCause
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
     NominalSolver,
     Say,
@@ -68,8 +73,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_several_maps
-from halbach_fe.measurement.instrument import map_time
+from halbach_fe.measurement.campaign import check_maps
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
@@ -85,18 +89,19 @@ ON_AXIS_M = 1e-6
 
 
 def diagnose(
-    study: Study, data: xr.Dataset, session: Session, blocks: BlockTable | None = None,
+    study: Study, data: Data, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
     say: Say = lambda text: None, solver: NominalSolver | None = None,
-    floor_T: dict[str, float] | None = None, time_limit_s: float | None = None,
+    floor_T: Floor | None = None, time_limit_s: float | None = None,
 ) -> Diagnosis:
-    """Find which effects a study lacks to explain a map.
+    """Find which effects a study lacks to explain its maps.
 
     Parameters
     ----------
     study : Study
-    data : Dataset
-        The map, as `halbach_fe.measurement.field_map.read_map` returns it.
+    data : Dataset or dict of str to Dataset
+        The map, as `halbach_fe.measurement.field_map.read_map` returns it; or all maps that the
+        study lists, see `halbach_fe.measurement.campaign.read_maps`.
     session : Session
         Its folder receives a subfolder for each round.
     blocks : BlockTable, optional
@@ -109,8 +114,9 @@ def diagnose(
         Called with a line of text on each step, to report progress.
     solver : NominalSolver, optional
         Several diagnoses may share one, so that equal magnets are solved once.
-    floor_T : dict of str to float, optional
-        The model-free floor of the map by component, to be reported with the results.
+    floor_T : dict, optional
+        The model-free floor of the map by component, to be reported with the results; of maps that
+        the study lists, by map and component.
     time_limit_s : float, optional
         Time after which the search ends with what it has so far. The step under way is finished,
         and so is one with the effects that were found; that takes one more inference.
@@ -124,34 +130,35 @@ def diagnose(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
-    refuse_several_maps(study, "a diagnosis")
-    refuse_open_instruments(study, "a diagnosis, which finds errors of instruments itself")
+    check_maps(study, data)
     effects = catalogue() if effects is None else effects
     pace = Pace(say, session.progress, time_limit_s)
     session = replace(session, progress=pace.advance)
     pace.begin("looking for gross errors of the map")
-    gross_errors, corrected, starts = _correct_map_errors(study, data, blocks, effects)
+    gross_errors, corrected, starts = correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:
-        say(f"gross error: {error.convention.text}")
+        say(f"gross error: {error.text}")
+    campaign = Campaign.of(corrected, data, validation_map)
     blocks = blocks_of(blocks, study, corrected)
     signatures: Signatures = {}
     solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
-    times = np.concatenate([map_time(each) for each in (data, validation_map) if each is not None])
     first: tuple[InferenceResult, Search] | None = None
-    position_noise, converged, closing = None, True, False
+    position_noise: tuple[PositionNoise, ...] = ()
+    converged, closing = True, False
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
     flexible: list[Family] = []
 
+    def changed(identified: Sequence[IdentifiedEffect]) -> Study:
+        return with_position_noise(apply_effects(corrected, identified), position_noise)
+
     def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
-        changed = with_position_noise(apply_effects(corrected, identified), position_noise)
-        return infer(build_magnet(changed), data, _subsession(session, name), blocks,
+        return infer(build_magnet(changed(identified)), data, _subsession(session, name), blocks,
                      validation_map=validation_map)
 
     if len(starts) > 1:
         say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
-    start, positions = possible_positions(
-        starts, {effect.name: effect for effect in effects}, updated, times)
+    start, positions = possible_positions(starts, updated, campaign)
     identified = start
 
     for number in range(MAX_ROUNDS):
@@ -160,33 +167,37 @@ def diagnose(
         pace.begin(f"round {number + 1}, solving")
         update = updated(identified, f"round-{number + 1}")
         if number == 0:
-            outliers = outliers_of(update)
+            outliers = outliers_of(update, campaign)
         if number == 0 and outliers:
             say(f"outliers: {len(outliers)} readings are excluded")
             corrected = excluding(corrected, outliers)
             update = updated(identified, "without-outliers")
         pace.begin(f"round {number + 1}, effects")
+        if update.terms is not None:
+            signatures.clear()  # they were at the poses of the last round
         prior_mean = (first[0] if first else update).prior.mean
         search = score_hypotheses(
-            corrected, start, update, prior_mean, times, solver, effects, identified, signatures,
+            corrected, start, update, prior_mean, campaign, solver, effects, identified, signatures,
             pace.advance, partial(_is_over, pace, closing))
         first = first or (update, search)
         solver_error = None if identified else explain_by_solver_error(update)
         if solver_error:
             say("the solver's own error explains the misfit")
             break
-        found = identify_effects(corrected, search, update.observation.map_points)
+        found = identify_effects(corrected, search)
         flexible = flexible or families_of(search, update)
         judgement = judge(search, update, found, flexible)
         if number > 0 or judgement.is_clear or _has_converged(identified, found):
-            found = named_effects(corrected, search, judgement, found,
-                                  update.observation.map_points)
+            found = named_effects(corrected, search, judgement, found)
         estimate = position_noise if judgement.fits else estimate_position_noise(
-            update, search.marginal, np.hstack([search.columns, *judgement.whitened_terms()]),
-            search.training, position_noise)
-        if not closing and not has_settled(position_noise, estimate):
-            say(f"vibration: positions with a standard deviation of "
-                f"{1e3 * estimate.sd_m if estimate else 0:.2g} mm are added to the noise")
+            update, campaign, search.marginal,
+            np.hstack([search.columns, *judgement.whitened_terms()]), search.training,
+            position_noise)
+        if not closing and not have_settled(position_noise, estimate):
+            sizes = [f"{1e3 * noise.sd_m:.2g} mm{f' in map {noise.map}' if noise.map else ''}"
+                     for noise in estimate]
+            say("vibration: positions with a standard deviation of "
+                f"{' and '.join(sizes) or '0 mm'} are added to the noise")
             position_noise = estimate
             signatures.clear()  # they were whitened by the previous noise
             closing = pace.is_over
@@ -209,14 +220,14 @@ def diagnose(
     if not solver_error:
         unknown = describe_unknown(judgement, update, search, identified)
         suspected = suspicions(judgement, search.hypotheses) if unknown is None else ()
-    if unknown is not None and unknown.alone and not start and position_noise is None:
+    if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     in_model = [column for number in numbers for column in search.candidates[number].columns]
-    limits = detection_limits(update, times, search.columns[:, in_model])
+    limits = detection_limits(update, campaign, search.columns[:, in_model])
     return Diagnosis(
-        corrected_study=corrected, before=first[0], after=update, identified=identified,
-        unknown=unknown,
+        corrected_study=corrected, before=first[0], after=update,
+        study=changed(identified), identified=identified, unknown=unknown,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
@@ -232,41 +243,6 @@ def diagnose(
 def _is_over(pace: Pace, closing: bool) -> bool:
     """Tell whether no further signatures are computed: in the last round, or the time is up."""
     return closing or pace.is_over
-
-
-def blocks_of(blocks: BlockTable | None, study: Study, corrected: Study) -> BlockTable | None:
-    """Return the measured blocks, without their places if the corrected study has other rings."""
-    if blocks is None or corrected.array.blocks_by_ring == study.array.blocks_by_ring:
-        return blocks
-    unplaced = np.zeros_like(blocks.ring)
-    return replace(blocks, ring=unplaced, slot=unplaced)
-
-
-def _correct_map_errors(
-    study: Study, data: xr.Dataset, blocks: BlockTable | None, effects: Sequence[Effect]
-) -> tuple[tuple[GrossError, ...], Study, tuple[dict[str, tuple[float, ...]], ...]]:
-    """Find the gross errors of a map and correct the study for them.
-
-    Returns
-    -------
-    errors : tuple of GrossError
-    study : Study
-        The study whose instrument or magnet is corrected for these errors.
-    starts : tuple of dict
-        Amplitudes of effects from which the search starts, one dictionary for each position of the
-        map that may be equal to the others by symmetry. An error of the points' positions that is
-        also an effect of the catalogue (`wrong_radius`, `wrong_line`) is not corrected in the study
-        but returned here, so that the search refines its amplitude.
-    """
-    found = find_gross_errors(study, data, blocks)
-    names = {effect.name for effect in effects}
-    starts: tuple[dict[str, tuple[float, ...]], ...] = ()
-    if found and found[-1].starts and found[-1].starts[0].keys() <= names:
-        starts = tuple(each for each in found[-1].starts if each.keys() <= names)
-        found = found[:-1]
-    for error in found:
-        study = error.apply(study)
-    return found, study, starts
 
 
 def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:
@@ -289,24 +265,29 @@ def _same_amplitudes(old: IdentifiedEffect, new: IdentifiedEffect) -> bool:
 
 
 def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> list[ResidualGroup]:
-    """Return chi-squared of the training readings grouped by z window, azimuth, radius and
+    """Return chi-squared of the training readings grouped by map, z window, azimuth, radius and
     component.
 
-    Kinds of groups with one member only or with more than 40 are left out.
+    Kinds of groups with one member only or with more than 40 are left out. Positions are those that
+    the map states; of several maps, those in the magnet.
     """
     chosen = ~update.held_out
-    x, y, z = update.observation.positions[chosen].T
+    observation, several = update.observation, update.is_campaign
+    x, y, z = (observation.places if several else observation.positions)[chosen].T
     angle, radius = np.degrees(np.arctan2(y, x)) % 360, np.hypot(x, y)
     edges = np.linspace(z.min(), z.max() + 1e-9, 13)
     window = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, 11)
+    maps, labels = (np.array(each)[chosen].tolist()
+                    for each in (update.maps, observation.labels))
     members = {
+        "map": maps,
         "z": [f"{edges[k]:.3f} ... {edges[k + 1]:.3f} m" for k in window],
         "angle": [f"{30 * int(azimuth // 30)} ... {30 * int(azimuth // 30) + 30} deg"
                   if distance > ON_AXIS_M else "on the axis"
                   for azimuth, distance in zip(angle, radius, strict=True)],
         "radius": [f"{distance:.4f} m" for distance in radius],
-        "label": [label for label, keep in zip(update.observation.labels, chosen, strict=True)
-                  if keep]}
+        "label": [f"{label} of {name}" if several else label
+                  for name, label in zip(maps, labels, strict=True)]}
     used = {kind: names for kind, names in members.items() if 1 < len(set(names)) <= 40}
     return residual_groups(marginal, residual, used)
 

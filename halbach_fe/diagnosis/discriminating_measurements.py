@@ -26,23 +26,28 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.map_errors import Data
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.diagnosis.scene import Campaign, keys_of
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP
-from halbach_fe.measurement.instrument import map_time, probe_points
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
+from halbach_fe.study.maps import PROBE_KEYS
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -63,10 +68,9 @@ NMR_RELATIVE_SD = 2e-6
 NMR_MIN_FIELD_T = 0.04
 """Lowest field that the usual NMR probes measure."""
 
-MAPPER_KEYS = {"translation_m", "rotation_rad", "z_scale", "radius_scale", "radius_offset_m",
-               "eccentricity_m", "arm_sag_m"}
-"""Keys of the study's instrument that belong to the mapper and stay fixed when its probe is turned.
-All other keys belong to the probe."""
+SENSOR_KEYS = {*PROBE_KEYS, "offset_T", "drift_T"}
+"""Keys of the study's instrument that belong to the sensors and turn with the probe. All others
+belong to the mapper and stay fixed."""
 
 TEMPERATURE_EFFECTS = {"temperature", "temperature_gradient"}
 """Effects that vanish if the magnet's temperature is uniform and measured."""
@@ -93,6 +97,8 @@ class ProposedScan:
         Whether the magnet's temperature is uniform and measured.
     mapped : bool
         Whether the mapper and its probe take the readings; False for an NMR teslameter.
+    map : str or None
+        Name of the map, of those that the study lists, whose mapper and probe take them.
     """
 
     points: Floats
@@ -103,6 +109,7 @@ class ProposedScan:
     magnet_rotation: Floats
     temperature_known: bool = False
     mapped: bool = True
+    map: str | None = None
 
 
 @dataclass(frozen=True)
@@ -181,72 +188,103 @@ class ScanFields(NominalFields):
 
 
 def separations(
-    diagnosis: Diagnosis, data: xr.Dataset, session: Session,
-    effects: Sequence[Effect] | None = None,
+    diagnosis: Diagnosis, data: Data, session: Session, effects: Sequence[Effect] | None = None,
 ) -> list[Separation]:
     """Compute what every candidate measurement would gain for each pair of effect and rival.
+
+    Of several maps, the one whose instrument may be in error is measured again, or else the one
+    with the most readings. There are none if terms of instruments are open.
 
     Parameters
     ----------
     diagnosis : Diagnosis
-    data : Dataset
-        The map that was diagnosed.
+    data : Dataset or dict of str to Dataset
+        The maps that were diagnosed.
     session : Session
     effects : sequence of Effect, optional
         The effects among which the diagnosis chose; default the whole catalogue.
     """
     catalogued = {effect.name: effect for effect in effects or catalogue()}
+    study = diagnosis.before.study
+    campaign = Campaign.of(study, data)
     pairs = [(effect, rival) for effect in diagnosis.identified
-             for rival in _rivals(effect, diagnosis.before.study, catalogued)]
-    if not pairs:
+             for rival in _rivals(effect, study, catalogued, campaign)]
+    if not pairs or diagnosis.before.terms is not None:
         return []
-    candidates = candidate_measurements(diagnosis, data)
-    old, *all_new = _readings(diagnosis, [
-        present_scan(diagnosis, data), *(candidate.scan for candidate in candidates)], session)
-    marginal_now = Marginal.of(old.blocks)
-    before = [_distance(diagnosis, marginal_now, [old], *pair) for pair in pairs]
+    names: list[str | None] = [None] if isinstance(data, xr.Dataset) else list(data)
+    present = [present_scan(diagnosis, data, name) for name in names]
+    again = [_map_of(pair, diagnosis) for pair in pairs]
+    candidates = {name: candidate_measurements(diagnosis, data, name)
+                  for name in dict.fromkeys(again)}
+    scans = [(name, candidate) for name, own in candidates.items() for candidate in own]
+    readings = _readings(diagnosis, [*present, *(one.scan for _, one in scans)], session)
+    old, all_new = readings[:len(present)], readings[len(present):]
+    blocks = np.vstack([one.blocks for one in old])
+    marginal_now = Marginal.of(blocks)
+    before = [_distance(diagnosis, marginal_now, old, *pair) for pair in pairs]
     found: list[dict[str, float]] = [{} for _ in pairs]
-    for candidate, new in zip(candidates, all_new, strict=True):
-        marginal_after = Marginal.of(np.vstack([old.blocks, new.blocks]))
-        for pair, gains, already in zip(pairs, found, before, strict=True):
-            total = _distance(diagnosis, marginal_after, [old, new], *pair)
-            gains[candidate.name] = total - already
-    return [Separation(effect.hypothesis, rival, tuple(candidates), gains, next(
-        (candidate for candidate in candidates if gains[candidate.name] > SEPARATING_GAIN), None))
-        for (effect, rival), gains in zip(pairs, found, strict=True)]
+    for (name, candidate), new in zip(scans, all_new, strict=True):
+        marginal_after = Marginal.of(np.vstack([blocks, new.blocks]))
+        for pair, own, gains, already in zip(pairs, again, found, before, strict=True):
+            if own == name:
+                total = _distance(diagnosis, marginal_after, [*old, new], *pair)
+                gains[candidate.name] = total - already
+    return [Separation(effect.hypothesis, rival, tuple(candidates[own]), gains, next(
+        (candidate for candidate in candidates[own] if gains[candidate.name] > SEPARATING_GAIN),
+        None)) for (effect, rival), own, gains in zip(pairs, again, found, strict=True)]
 
 
-def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[CandidateMeasurement]:
-    """Return the measurements that can be made of a study's magnet, the cheapest first."""
+def _map_of(pair: tuple[IdentifiedEffect, Hypothesis], diagnosis: Diagnosis) -> str | None:
+    """Return the name of the map that is to be measured again; None if the study lists none."""
+    update = diagnosis.before
+    if not update.study.maps:
+        return None
+    for maps in (pair[0].hypothesis.place.maps, pair[1].place.maps):
+        if maps:
+            return maps[0]
+    listed = [one.name for one in update.study.maps]
+    return max(listed, key=update.maps.count)
+
+
+def candidate_measurements(
+    diagnosis: Diagnosis, data: Data, name: str | None = None
+) -> list[CandidateMeasurement]:
+    """Return the measurements that can be made of a study's magnet, the cheapest first.
+
+    They are made by the mapper and probe of map ``name``, or of the only one.
+    """
     study, observation = diagnosis.before.study, diagnosis.before.observation
-    present = present_scan(diagnosis, data)
-    sigma = _point_sigma(diagnosis)
+    present = present_scan(diagnosis, data, name)
+    same = "the same map" if name is None else f"map {name} again,"
+    own = np.array(diagnosis.before.maps) == name if name else slice(None)
+    places = observation.positions if name is None else observation.places[own]
+    sigma = _point_sigma(diagnosis, own)
     centre = NominalFields(study, np.zeros((1, 3)), np.zeros(1),
                            lambda other: np.zeros((1, 3))).field[0]
     size = float(np.linalg.norm(centre))
     found = [
         CandidateMeasurement(
-            "probe_rolled", "the same map with the probe turned by 180° about z",
-            replace(present, probe_rotation=np.diag([-1.0, -1.0, 1.0]))),
+            "probe_rolled", f"{same} with the probe turned by 180° about z",
+            replace(present, probe_rotation=present.probe_rotation @ np.diag([-1.0, -1.0, 1.0]))),
         CandidateMeasurement(
-            "probe_reversed", "the same map with the probe turned by 180° about x",
-            replace(present, probe_rotation=np.diag([1.0, -1.0, -1.0])))]
+            "probe_reversed", f"{same} with the probe turned by 180° about x",
+            replace(present, probe_rotation=present.probe_rotation @ np.diag([1.0, -1.0, -1.0])))]
     if size > NMR_MIN_FIELD_T:
         found.append(CandidateMeasurement(
             "nmr_point", "one NMR reading in the middle of the bore", ProposedScan(
                 np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
                 independent_noise(np.array([NMR_RELATIVE_SD * size])), np.eye(3), np.eye(3),
                 mapped=False)))
-    radii = np.unique(np.round(observation.radii, 6))
+    radii = np.unique(np.round(np.hypot(places[:, 0], places[:, 1]), 6))
     magnet = build_magnet(study)
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
-    heights = np.unique(np.round(observation.map_points[:, 2], 9))
+    heights = np.unique(np.round(places[:, 2], 9))
     heights = heights[np.linspace(0, len(heights) - 1, min(len(heights), 40)).astype(int)]
     found.append(CandidateMeasurement(
         "second_radius", f"circles of radius {1e3 * radius:.0f} mm",
-        _point_scan(np.vstack([_circle(radius, z) for z in heights]), sigma)))
+        _point_scan(np.vstack([_circle(radius, z) for z in heights]), sigma, name)))
     if study.dimension == 3:
         half, reach = magnet.array_half_length, magnet.array_outer_radius
         farthest = min(4 * reach, 0.4 * (boundary_half_length(magnet, "extruded") - half))
@@ -254,25 +292,29 @@ def candidate_measurements(diagnosis: Diagnosis, data: xr.Dataset) -> list[Candi
                   for step in np.linspace(0.2, 1, 5)]
         found.append(CandidateMeasurement(
             "far_field", f"points up to {1e3 * farthest:.0f} mm beyond the ends",
-            _point_scan(np.vstack([_circle(0.5 * reach, z, 4) for z in beyond]), sigma)))
+            _point_scan(np.vstack([_circle(0.5 * reach, z, 4) for z in beyond]), sigma, name)))
     return [
         *found,
         CandidateMeasurement(
-            "magnet_turned", "the same map with the magnet turned by 90° about its axis",
+            "magnet_turned", f"{same} with the magnet turned by 90° about its axis",
             replace(present, magnet_rotation=rotation_about_z(np.pi / 2))),
         CandidateMeasurement(
-            "known_temperature", "the same map at another temperature of the magnet, which is "
+            "known_temperature", f"{same} at another temperature of the magnet, which is "
             "uniform and measured on the magnet", replace(present, temperature_known=True))]
 
 
-def present_scan(diagnosis: Diagnosis, data: xr.Dataset) -> ProposedScan:
-    """Return the map that was diagnosed, thinned to about `MAX_READINGS` readings."""
+def present_scan(diagnosis: Diagnosis, data: Data, name: str | None = None) -> ProposedScan:
+    """Return a map that was diagnosed, by its name among several.
+
+    All maps together are thinned to about `MAX_READINGS` readings.
+    """
     update = diagnosis.before
-    observation = update.observation
-    own = np.array(update.parts) != HELD_OUT_MAP
+    observation, campaign = update.observation, Campaign.of(update.study, data)
+    used_for_update = np.array(update.parts) != HELD_OUT_MAP
+    own = used_for_update & ((np.array(update.maps) == name) | (name is None))
     _, owner = np.unique(observation.positions, axis=0, return_inverse=True)
     count = len(np.unique(owner[own]))
-    wanted = max(1, round(count * min(1.0, MAX_READINGS / own.sum())))
+    wanted = max(1, round(count * min(1.0, MAX_READINGS / used_for_update.sum())))
     # steps of the golden ratio, which do not alias with the angles of a circle
     chosen = (np.arange(wanted) * (np.sqrt(5) - 1) / 2 % 1 * count).astype(int)
     kept = own & ((wanted == count) | np.isin(owner.ravel(), np.unique(owner[own])[chosen]))
@@ -280,10 +322,13 @@ def present_scan(diagnosis: Diagnosis, data: xr.Dataset) -> ProposedScan:
     used = np.unique(analysis.indices // len(COMPONENTS))
     columns = (len(COMPONENTS) * used[:, None] + np.arange(len(COMPONENTS))).ravel()
     covariance = update.errors.subset(kept).covariance * (kept.sum() / own.sum())
+    one = campaign.maps[0] if name is None else next(
+        each for each in campaign.maps if each.name == name)
+    turned = rotation_matrix(one.study_of(update.study).instrument.rotation_rad)
     return ProposedScan(
-        probe_points(update.study.instrument, observation.map_points[used]), map_time(data)[used],
+        campaign.points_of(update.study)[used], campaign.times[used],
         sparse.csr_array(sparse.csc_array(analysis)[:, columns]),
-        NoiseCovariance(sparse.csr_array(covariance)), np.eye(3), np.eye(3))
+        NoiseCovariance(sparse.csr_array(covariance)), turned, np.eye(3), map=name)
 
 
 def distance(blocks: Marginal, signature: Floats, rivals: Floats) -> float:
@@ -377,6 +422,7 @@ class _Readings:
         effect, place, scan = hypothesis.effect, hypothesis.place, self.scan
         owner = owner_of(hypothesis, self.magnet.nominal.study)
         gone = scan.temperature_known and effect.name in TEMPERATURE_EFFECTS
+        gone |= bool(place.maps) and scan.map not in place.maps
         if gone or (not scan.mapped and owner in ("mapper", "sensors")):
             return np.zeros((len(effect.parameters), len(scan.points), 3))
         if owner == "magnet":
@@ -419,46 +465,47 @@ def owner_of(
 
     It follows from the keys of the study that the effect changes.
     """
-    effect = hypothesis.effect
-    amplitudes = [parameter.sd for parameter in effect.parameters]
-    changed = effect.apply(study, hypothesis.place, amplitudes)
-    if effect.kind == "field":
-        return "magnet" if changed.external == study.external else "surroundings"
-    keys = {name for name, value in changed.instrument
-            if value != getattr(study.instrument, name)}
-    return "mapper" if keys <= MAPPER_KEYS else "sensors"
+    effect, place = hypothesis.effect, hypothesis.place
+    own = study.of_map([one.name for one in study.maps].index(place.maps[0])
+                       ) if place.maps else study
+    if effect.kind == "instrument":
+        return "sensors" if keys_of(effect, place, own) & SENSOR_KEYS else "mapper"
+    changed = effect.apply(study, place, [parameter.sd for parameter in effect.parameters])
+    return "magnet" if changed.external == study.external else "surroundings"
 
 
 def _rivals(
-    identified: IdentifiedEffect, study: Study, catalogued: Mapping[str, Effect]
+    identified: IdentifiedEffect, study: Study, catalogued: Mapping[str, Effect],
+    campaign: Campaign,
 ) -> list[Hypothesis]:
     """Return the best effects that the readings cannot distinguish, each at its best place."""
     found: dict[str, Hypothesis] = {}
     for rival, _ in identified.selection.alternatives:
         if rival.effect not in (identified.selection.candidate.effect, *found):
             effect = catalogued[rival.effect]
-            for place in effect.places(study):  # a shortlist may hold places that this omits
+            # a shortlist may hold places that this omits
+            for place in campaign.places(effect, study):
                 if place.name == rival.place:
                     found[rival.effect] = Hypothesis(effect, place)
     return list(found.values())[:MAX_RIVALS]
 
 
-def _point_scan(points: Floats, sigma: float) -> ProposedScan:
+def _point_scan(points: Floats, sigma: float, name: str | None) -> ProposedScan:
     """Return a scan of all three components at points, with independent noise ``sigma`` in T."""
     count = 3 * len(points)
     return ProposedScan(
         points, np.linspace(0, 1, len(points)), sparse.csr_array(sparse.eye_array(count)),
-        independent_noise(np.full(count, sigma)), np.eye(3), np.eye(3))
+        independent_noise(np.full(count, sigma)), np.eye(3), np.eye(3), map=name)
 
 
-def _point_sigma(diagnosis: Diagnosis) -> float:
-    """Return the noise in T of one component at one point.
+def _point_sigma(diagnosis: Diagnosis, own: NDArray[np.bool_] | slice) -> float:
+    """Return the noise in T of one component at one point, among ``own`` readings.
 
     The noise of a study with Fourier coefficients is that of a coefficient, which averages over the
     points of a circle.
     """
     update = diagnosis.before
-    sigma = float(np.median(update.noise.sd))
+    sigma = float(np.median(update.noise.sd[own]))
     settings = update.study.observation
     if settings.quantity == "fourier_coefficients":
         return sigma * float(np.sqrt(settings.positions.angles / 2))

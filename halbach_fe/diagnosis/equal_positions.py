@@ -14,19 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     INDISTINGUISHABLE_LOG_EVIDENCE,
     Candidate,
     SelectedEffect,
 )
-from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect, PossiblePosition
+from halbach_fe.diagnosis.result import IdentifiedEffect, PossiblePosition
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import marginal_of
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import probe_points
-from halbach_fe.study.model import Study
 
 STEPS = 2
 """Number of steps that refine a position: it starts from a fit of nominal blocks, within 2 mm."""
@@ -44,20 +41,17 @@ class _Refined:
 
 
 def possible_positions(
-    starts: Sequence[Mapping[str, tuple[float, ...]]], catalogued: Mapping[str, Effect],
-    updated: Callable[[Start, str], InferenceResult], times: Floats,
+    starts: Sequence[Start], updated: Callable[[Start, str], InferenceResult], campaign: Campaign,
 ) -> tuple[Start, tuple[PossiblePosition, ...]]:
     """Return the most probable position, and all that the readings do not exclude.
 
     Parameters
     ----------
-    starts : sequence of dict
-        Amplitudes of effects by name, one dictionary for each position.
-    catalogued : dict of str to Effect
+    starts : sequence of Start
+        The positions.
     updated : callable
         Takes a position and a name, and returns the inference with that position.
-    times : ndarray, shape (n,)
-        Time of each point of the map.
+    campaign : Campaign
 
     Returns
     -------
@@ -66,44 +60,45 @@ def possible_positions(
     positions : tuple of PossiblePosition
         It and the others, the most probable first. The tuple is empty if there are no others.
     """
-    first = [_identified(start, catalogued) for start in starts]
-    if len(first) < 2:
-        return (first[0] if first else ()), ()
-    refined = sorted((_refined(start, f"position-{number}", updated, times)
-                      for number, start in enumerate(first, start=1)),
+    if len(starts) < 2:
+        return (starts[0] if starts else ()), ()
+    refined = sorted((_refined(start, f"position-{number}", updated, campaign)
+                      for number, start in enumerate(starts, start=1)),
                      key=lambda each: -each.log_evidence)
     best = refined[0]
     near = [each for each in refined
             if each.log_evidence >= best.log_evidence - INDISTINGUISHABLE_LOG_EVIDENCE]
     weights = np.exp([each.log_evidence - best.log_evidence for each in near])
     return best.start, tuple(
-        PossiblePosition({effect.hypothesis.effect.name: tuple(effect.values.tolist())
+        PossiblePosition({effect.name: tuple(effect.values.tolist())
                           for effect in each.start}, float(weight / weights.sum()))
         for each, weight in zip(near, weights, strict=True)) if len(near) > 1 else ()
 
 
-def _identified(start: Mapping[str, tuple[float, ...]], catalogued: Mapping[str, Effect]) -> Start:
-    """Return effects of given amplitudes as if they had been found."""
+def start_of(
+    amplitudes: Mapping[str, tuple[float, ...]], hypotheses: Mapping[str, Hypothesis]
+) -> Start:
+    """Return effects of given amplitudes, by name, as if they had been found."""
     return tuple(
-        IdentifiedEffect(Hypothesis(catalogued[name], Place()), np.array(values),
-                         np.zeros(len(values)),
-                         SelectedEffect(Candidate(name, "", ()), 0.0, 0.0, ()))
-        for name, values in start.items())
+        IdentifiedEffect(hypotheses[name], np.array(values), np.zeros(len(values)),
+                         SelectedEffect(Candidate(name, hypotheses[name].place.name, ()),
+                                        0.0, 0.0, ()))
+        for name, values in amplitudes.items())
 
 
 def _refined(
-    start: Start, name: str, updated: Callable[[Start, str], InferenceResult], times: Floats
+    start: Start, name: str, updated: Callable[[Start, str], InferenceResult],
+    campaign: Campaign,
 ) -> _Refined:
     """Return the position to which a few steps lead, and its log evidence."""
     for step in range(STEPS + 1):
         update = updated(start, name)
         if step == STEPS:
             break
-        whitened, _, marginal, training = marginal_of(update)
-        points = probe_points(update.study.instrument, update.observation.map_points)
-        nominal = NominalFields(update.study, points, times, _not_solved)
+        whitened, _, marginal, training = marginal_of(update, campaign)
+        scene = campaign.scene(update.study)  # displacements need the field in vacuum only
         columns = np.hstack([whitened(update.observation.read(
-            effect.hypothesis.effect.signature(nominal, Place()))) for effect in start])
+            scene.signature(effect.hypothesis))) for effect in start])
         sd = np.array([parameter.sd for effect in start for parameter in effect.parameters])
         change = sd * marginal.evidence(columns * sd, training).fit(range(len(sd))).mean
         ends = np.cumsum([len(effect.values) for effect in start])[:-1]
@@ -111,7 +106,3 @@ def _refined(
             start, np.split(change, ends), strict=True))
     return _Refined(start, update.log_evidence)
 
-
-def _not_solved(study: Study) -> Floats:
-    """Take the place of a solver: displacements need the field of blocks in vacuum only."""
-    raise AssertionError(f"study {study.name} was not to be solved")

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as linalg
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 
 ROWS_AT_ONCE = 8192
 """Number of rows that products over all readings take at a time, to bound their memory."""
@@ -47,10 +47,14 @@ class Fit:
 class Evidence:
     """The sufficient statistics of readings for a set of signatures, the blocks integrated out.
 
+    Conditioning on a few of thousands of columns changes the matrix A by a product of low rank.
+    Only its factor is kept, so that it costs as much as the columns and not as their square. The
+    matrix A is ``(information - absorbed' absorbed) / temperature``.
+
     Attributes
     ----------
     information : ndarray, shape (k, k)
-        The matrix A of the module's docstring.
+        The matrix A of the module's docstring before any columns were integrated out. Use `part`.
     score : ndarray, shape (k,)
         The vector b of the module's docstring.
     chi2 : float
@@ -61,6 +65,10 @@ class Evidence:
     prior : ndarray, shape (k,)
         Prior precisions of the amplitudes, in units of their usual prior standard deviation: 1
         unless widened.
+    absorbed : ndarray, shape (d, k)
+        Information that columns which were integrated out have taken, one row for each of them.
+    temperature : float
+        Variance of the noise over the stated one.
     """
 
     information: Floats
@@ -68,13 +76,27 @@ class Evidence:
     chi2: float
     readings: int
     prior: Floats
+    absorbed: Floats
+    temperature: float = 1.0
+
+    @classmethod
+    def of(cls, information: Floats, score: Floats, chi2: float, readings: int) -> Evidence:
+        """Return the evidence of columns of which none is integrated out."""
+        count = len(score)
+        return cls(information, score, chi2, readings, np.ones(count), np.zeros((0, count)))
+
+    def part(self, rows: Ints, columns: Ints | None = None) -> Floats:
+        """Return some rows and columns of A, by default the rows' own columns."""
+        columns = rows if columns is None else columns
+        return (self.information[np.ix_(rows, columns)]
+                - self.absorbed[:, rows].T @ self.absorbed[:, columns]) / self.temperature
 
     def fit(self, chosen: Sequence[int]) -> Fit:
         """Return the posterior of the amplitudes of a set of columns, whose prior mean is 0."""
         index = np.asarray(chosen, int)
         if not len(index):
             return Fit(0.0, np.zeros(0), np.zeros((0, 0)))
-        precision = self.information[np.ix_(index, index)] + np.diag(self.prior[index])
+        precision = self.part(index) + np.diag(self.prior[index])
         factor = linalg.cho_factor(precision, lower=True)
         mean = linalg.cho_solve(factor, self.score[index])
         size = float(np.log(np.diag(factor[0])).sum() - np.log(self.prior[index]).sum() / 2)
@@ -86,25 +108,44 @@ class Evidence:
         index = np.asarray(chosen, int)
         if not len(index):
             return self
-        precision = self.information[np.ix_(index, index)] + np.diag(self.prior[index])
-        cross = linalg.cho_solve(linalg.cho_factor(precision), self.information[index])
-        weights = cross.T @ self.score[index]
-        fit = self.fit(chosen)
-        return Evidence(
-            self.information - self.information[index].T @ cross, self.score - weights,
-            self.chi2 - float(self.score[index] @ fit.mean), self.readings, self.prior)
+        return self.beside(self.part(index) + np.diag(self.prior[index]),
+                           self.part(index, np.arange(len(self.score))), self.score[index])
+
+    def beside(self, precision: Floats, cross: Floats, score: Floats) -> Evidence:
+        """Return the evidence with the amplitudes of other columns integrated out.
+
+        Parameters
+        ----------
+        precision : ndarray, shape (d, d)
+            The matrix A of these columns, plus their prior precisions on its diagonal.
+        cross : ndarray, shape (d, k)
+            Their rows of the matrix A.
+        score : ndarray, shape (d,)
+            Their vector b.
+        """
+        root = linalg.cholesky(precision, lower=True)
+        taken, own = (linalg.solve_triangular(root, part, lower=True) for part in (cross, score))
+        return replace(
+            self, score=self.score - own @ taken, chi2=self.chi2 - float(own @ own),
+            absorbed=np.vstack([self.absorbed, np.sqrt(self.temperature) * taken]))
 
     def only(self, chosen: Sequence[int]) -> Evidence:
         """Return the evidence of a subset of the columns."""
         index = np.asarray(chosen, int)
-        return replace(self, information=self.information[np.ix_(index, index)],
-                       score=self.score[index], prior=self.prior[index])
+        return replace(self, information=self.part(index), score=self.score[index],
+                       prior=self.prior[index], absorbed=np.zeros((0, len(index))),
+                       temperature=1.0)
 
     def shifted(self, column: int) -> Evidence:
         """Return the evidence of the readings less one signature at amplitude 1."""
-        row = self.information[column]
+        row = self.part(np.array([column]), np.arange(len(self.score)))[0]
         return replace(self, score=self.score - row,
                        chi2=self.chi2 - 2 * self.score[column] + row[column])
+
+    def tempered(self, factor: float) -> Evidence:
+        """Return the evidence if the variance of the noise is larger by a factor."""
+        return replace(self, temperature=factor * self.temperature, score=self.score / factor,
+                       chi2=self.chi2 / factor)
 
     def widened(self, chosen: Sequence[int], width: float) -> Evidence:
         """Return the evidence with another prior standard deviation for a set of columns.
@@ -124,7 +165,9 @@ class Evidence:
         for size, members in sizes.items():
             index = np.array([groups[number] for number in members])
             prior = self.prior[index]
-            precision = self.information[index[:, :, None], index[:, None, :]] + (
+            taken = self.absorbed[:, index]  # (d, groups, size)
+            precision = (self.information[index[:, :, None], index[:, None, :]]
+                         - np.einsum("dgi,dgj->gij", taken, taken)) / self.temperature + (
                 prior[:, :, None] * np.eye(size))
             score = self.score[index]
             mean = np.linalg.solve(precision, score[:, :, None])[:, :, 0]
@@ -161,15 +204,21 @@ class Marginal:
         (n,).
         """
         columns = np.column_stack([signatures, residual])
+        half = self.absorbed(columns)
+        total = -half.T @ half
+        for part in _rows(len(columns)):
+            total += columns[part].T @ columns[part]
+        return Evidence.of(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), len(columns))
+
+    def absorbed(self, columns: Floats) -> Floats:
+        """Return what the blocks absorb of whitened columns (n, k), as (m, k).
+
+        For two columns a and b the product ``a' S^-1 b`` is ``a' b - absorbed(a)' absorbed(b)``.
+        """
         cross = np.zeros((self.whitened.shape[1], columns.shape[1]))
-        own = np.zeros((columns.shape[1], columns.shape[1]))
         for part in _rows(len(columns)):
             cross += self.whitened[part].T @ columns[part]
-            own += columns[part].T @ columns[part]
-        half = linalg.solve_triangular(self.factor[0], cross, lower=True)
-        total = own - half.T @ half
-        return Evidence(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), len(columns),
-                        np.ones(len(total) - 1))
+        return np.asarray(linalg.solve_triangular(self.factor[0], cross, lower=True))
 
     def remove(self, columns: Floats) -> Floats:
         """Return whitened S^-1 times whitened columns (n, k): the part that the blocks cannot

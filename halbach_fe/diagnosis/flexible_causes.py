@@ -15,12 +15,12 @@ catalogue with one amplitude is the better explanation where both explain the re
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
-from scipy import special
+from scipy import linalg, special
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Evidence
@@ -74,6 +74,10 @@ class Family:
     unit : float
         Error of the readings in T, of the gains, or of the positions in m, by a term of amplitude
         1; 0 for fields, whose size is that of `fields`.
+    map : str or None
+        Name of the map on whose instrument it acts, of several; None if it acts on all.
+    rows : slice
+        Of the points on which it acts, among those of all maps.
     """
 
     acts_on: ActsOn
@@ -85,6 +89,23 @@ class Family:
     waves: Floats = field(repr=False)
     span: float = 0.0
     unit: float = 0.0
+    map: str | None = None
+    rows: slice = field(default_factory=lambda: slice(None))
+
+    @property
+    def name(self) -> str:
+        """What it acts on, the coordinate, and the map among several."""
+        return f"{self.acts_on} {self.along}".strip() + (f" in map {self.map}" if self.map else "")
+
+    def of_map(self, name: str, rows: slice, count: int) -> Family:
+        """Return the same causes in one of several maps, which have ``count`` points together."""
+        def fields() -> Floats:
+            own = self.fields()
+            found = np.zeros((len(own), count, 3))
+            found[:, rows] = own
+            return found
+
+        return replace(self, fields=fields, map=name, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -138,10 +159,39 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
     return Fitted(float(special.logsumexp(factors) - np.log(len(factors))), *best)
 
 
-def families(
+def largest_factor(family: Family, evidence: Evidence) -> float:
+    """Return a bound that `Fitted.log_bayes_factor` cannot exceed, in little time.
+
+    It is the gain in log likelihood at the largest prior variance of each amplitude, without the
+    price of the amplitudes.
+    """
+    variance = (SIZES[-1] * family.spectra.max(axis=0))**2
+    precision = evidence.information + np.diag(1 / variance)
+    return float(evidence.score @ linalg.solve(precision, evidence.score, assume_a="pos")) / 2
+
+
+def field_family(
+    points: Floats, noise_T: float, seen: Callable[[Floats], Floats] = np.asarray
+) -> Family:
+    """Return the family of fields from outside the bore.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3), in m
+    noise_T : float
+        Noise of a reading.
+    seen : callable, optional
+        Returns what the maps show (k, n, 3) in T of fields (k, n, 3) in T.
+    """
+    terms = harmonic_fields(points)
+    return _of_smooth_terms("field", "", replace(terms, fields=seen(terms.fields)), noise_T, False,
+                            np.ptp(points[:, 2]))
+
+
+def instrument_families(
     points: Floats, time: Floats, nominal: Floats, gradient: Floats, noise_T: float
 ) -> list[Family]:
-    """Return all families for a map.
+    """Return all families of what an instrument may do in a map.
 
     Parameters
     ----------
@@ -149,16 +199,14 @@ def families(
     time : ndarray, shape (n,)
         From 0 to 1.
     nominal : ndarray, shape (n, 3), in T
-        Field of the model.
+        What the map shows of the model.
     gradient : ndarray, shape (n, 3, 3), in T/m
-        Its derivatives; the last axis is the direction.
+        Its derivatives; the last axis is the direction in the magnet.
     noise_T : float
         Noise of a reading.
     """
     angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
-    found = [_of_smooth_terms("field", "", harmonic_fields(points), noise_T, False,
-                              np.ptp(points[:, 2])),
-             _of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
+    found = [_of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
                               np.ptp(points[:, 2]))]
     coordinates = {"z": points[:, 2], "angle": angle, "radius": radius, "time": time,
                    "field": np.linalg.norm(nominal, axis=1)}

@@ -136,12 +136,15 @@ class GrossError:
         Other conventions that explain the map equally well.
     misfit_before, misfit_after : float
         Rms difference from the nominal magnet, relative to the map's rms.
+    map : str or None
+        Name of the map among those that the study lists; None if it lists none.
     """
 
     convention: MapConvention
     alternatives: tuple[MapConvention, ...]
     misfit_before: float
     misfit_after: float
+    map: str | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -159,9 +162,20 @@ class GrossError:
         found = [_start_of(each) for each in (self.convention, *self.alternatives)]
         return tuple(start for start in found if start) if found[0] else ()
 
+    @property
+    def text(self) -> str:
+        """Description of all errors in one phrase, with the name of the map among several."""
+        return self.convention.text if self.map is None else f"map {self.map}: " + (
+            self.convention.text)
+
     def apply(self, study: Study) -> Study:
         """Return the study that reads the map by the corrected convention."""
-        return self.convention.apply(study)
+        if self.map is None:
+            return self.convention.apply(study)
+        number = [one.name for one in study.maps].index(self.map)
+        own = self.convention.apply(study.of_map(number))
+        corrected = study.with_tables({self.map: {"instrument": own.instrument}})
+        return corrected.with_(array=own.array, external=own.external)
 
 
 @dataclass(frozen=True)
@@ -442,10 +456,7 @@ class _Search:
 
     def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
         """Return the smallest misfit with one block missing or upside down."""
-        turned = convention.magnet if convention.magnet in self.turned else None
-        nominal = self.nominal(replace(
-            convention, fields=IDENTITY_AXES, flux_density_unit=1.0,
-            magnet=None if turned else convention.magnet))
+        turned, nominal = self.nominal_of(convention)
         if nominal is None:
             return INFINITE_MISFIT
         turn = turned.turn_rad if turned and turned.turn_rad else 0.0
@@ -470,10 +481,7 @@ class _Search:
 
         None if points are inside material, or fewer than half of the observed values remain.
         """
-        turned = convention.magnet if convention.magnet in self.turned else None
-        nominal = self.nominal(replace(
-            convention, fields=IDENTITY_AXES, flux_density_unit=1.0,
-            magnet=None if turned else convention.magnet))
+        turned, nominal = self.nominal_of(convention)
         if nominal is None:
             return None
         field = nominal.field(turned.turn_rad if turned and turned.turn_rad else 0.0)
@@ -520,6 +528,18 @@ class _Search:
                                               strict=True):
             total += unit @ (MU_0 * block.recoil_tensor @ magnetization)
         return np.asarray(total @ sensor_matrix(study.instrument).T)
+
+    def nominal_of(
+        self, convention: MapConvention
+    ) -> tuple[ArrayVariant | None, _Nominal | None]:
+        """Return the magnet of a convention if it is a turned one, and the field before that turn.
+
+        The field is None where `nominal` has none.
+        """
+        turned = convention.magnet if convention.magnet in self.turned else None
+        return turned, self.nominal(replace(
+            convention, fields=IDENTITY_AXES, flux_density_unit=1.0,
+            magnet=None if turned else convention.magnet))
 
     def nominal(self, source: MapConvention) -> _Nominal | None:
         """Return the nominal field at the points of a convention.

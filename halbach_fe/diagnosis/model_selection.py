@@ -150,7 +150,8 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
     for candidate in candidates:
         if candidate.is_binary:
             column = candidate.columns[0]
-            total += float(evidence.score[column] - evidence.information[column, column] / 2)
+            own = evidence.part(np.array([column]))[0, 0]
+            total += float(evidence.score[column] - own / 2)
             evidence = evidence.shifted(column)
         total -= np.log(2) * bool(candidate.free)
     return total + with_wide_priors(evidence, candidates).fit(

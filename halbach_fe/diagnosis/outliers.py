@@ -21,9 +21,10 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
 from halbach_fe.stats.noise import NoiseCovariance
-from halbach_fe.study.inference import ExcludedReading
+from halbach_fe.study.inference import ExcludedReading, Inference
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Component
 
@@ -84,6 +85,8 @@ class Outlier:
     off_T, sd_T : float
         Difference from the prediction by all readings that are no outliers, and its standard
         deviation.
+    map : str or None
+        Name of the map among those that the study lists; None if it lists none.
     """
 
     row: int
@@ -91,10 +94,11 @@ class Outlier:
     at_m: tuple[float, ...]
     off_T: float
     sd_T: float
+    map: str | None = None
 
 
-def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
-    """Find the outliers among the readings of a map.
+def outliers_of(update: InferenceResult, campaign: Campaign) -> tuple[Outlier, ...]:
+    """Find the outliers among the readings of all maps, each among its neighbours in its map.
 
     There are none among Fourier coefficients, each of which is computed from many readings.
     """
@@ -102,31 +106,45 @@ def outliers_of(update: InferenceResult) -> tuple[Outlier, ...]:
     if (np.diff(observation.analysis.indptr) != 1).any():
         return ()
     own = np.array(update.parts) != HELD_OUT_MAP
-    root = with_fewer_columns(update.response.matrix[own] @ update.prior.root)
+    root = with_fewer_columns(update.prediction_prior.root(np.flatnonzero(own)))
     residual = (update.readings - update.prediction_prior.mean)[own]
     noise, training = update.errors.subset(own), ~update.held_out[own]
-    labels = [label for label, is_own in zip(observation.labels, own, strict=True) if is_own]
+    maps = np.array(update.maps)
+    labels = [f"{name} {label}" for name, label in zip(
+        maps[own].tolist(), np.array(observation.labels)[own].tolist(), strict=True)]
     flagged = find_outliers(root, residual, noise, training, labels, observation.positions[own],
                             float(np.abs(update.readings[own]).max()))
     if not flagged.any():
         return ()
     predicted = leave_one_out(root, residual, noise, training & ~flagged)
     point, component = np.divmod(observation.analysis.indices[own], len(COMPONENTS))
+    names, listed = maps[own], bool(update.study.maps)
+    first = {one.name: one.rows.start for one in campaign.maps}
     return tuple(
-        Outlier(int(point[k]) + 1, COMPONENTS[component[k]],
+        Outlier(int(point[k] - first[str(names[k])]) + 1, COMPONENTS[component[k]],
                 tuple(observation.positions[own][k].tolist()), float(predicted.difference[k]),
-                float(predicted.sd[k])) for k in np.flatnonzero(flagged))
+                float(predicted.sd[k]), str(names[k]) if listed else None)
+        for k in np.flatnonzero(flagged))
 
 
 def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
     """Return the study with outliers excluded."""
+    if not study.maps:
+        return study.with_(inference=_excluding(study.inference, outliers))
+    return study.with_tables({
+        one.name: {"inference": _excluding(study.of_map(number).inference, own)}
+        for number, one in enumerate(study.maps)
+        if (own := [outlier for outlier in outliers if outlier.map == one.name])})
+
+
+def _excluding(inference: Inference, outliers: Sequence[Outlier]) -> Inference:
+    """Return the settings of a map with outliers excluded."""
     rows: dict[int, list[Component]] = {}
     for outlier in outliers:
         rows.setdefault(outlier.row, []).append(outlier.component)
-    inference = study.inference.with_(excluded_readings=(
-        *study.inference.excluded_readings,
+    return inference.with_(excluded_readings=(
+        *inference.excluded_readings,
         *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items())))
-    return study.with_(inference=inference)
 
 
 @dataclass(frozen=True)

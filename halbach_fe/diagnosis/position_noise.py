@@ -9,21 +9,21 @@ factor everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy import special
+from scipy import linalg, special
 from scipy.optimize import minimize_scalar
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
+from halbach_fe.diagnosis.scene import Campaign, ScannedMap
 from halbach_fe.diagnosis.smooth_discrepancy import DECAY_RATES, harmonic_fields, sensor_errors
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.measurement.reading_noise import readings_per_displacement
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
@@ -69,44 +69,88 @@ class PositionNoise:
         such errors, or noise that is larger everywhere by the best factor.
     sd_m : float
         The likeliest standard deviation of a position along each axis.
+    map : str or None
+        Name of the map among those that the study lists; None if it lists none.
     """
 
     log_bayes_factor: float
     sd_m: float
+    map: str | None = None
 
 
 def estimate_position_noise(
-    update: InferenceResult, marginal: Marginal, columns: Floats, residual: Floats,
-    current: PositionNoise | None,
-) -> PositionNoise | None:
-    """Estimate the position noise from the training readings; None if there is no evidence of it.
+    update: InferenceResult, campaign: Campaign, marginal: Marginal, columns: Floats,
+    residual: Floats, current: Sequence[PositionNoise],
+) -> tuple[PositionNoise, ...]:
+    """Estimate the position noise of each map from its training readings.
 
     Parameters
     ----------
     update : InferenceResult
+    campaign : Campaign
     marginal : Marginal
         The training readings with the blocks integrated out.
     columns : ndarray, shape (n, k)
         Whitened signatures of effects, per standard deviation of their amplitudes.
     residual : ndarray, shape (n,)
         Whitened training readings less their prior prediction.
-    current : PositionNoise or None
+    current : sequence of PositionNoise
         The position noise that the study of ``update`` already has.
+
+    Returns
+    -------
+    tuple of PositionNoise
+        Of those maps that show it.
+    """
+    known = {noise.map: noise for noise in current}
+    listed, points = bool(update.study.maps), campaign.points_of(update.study)
+    of_map = np.array(update.maps)[~update.held_out]
+    found = []
+    for one in campaign.maps:
+        own = np.flatnonzero(of_map == one.name)
+        name = one.name if listed else None
+        if len(own):
+            noise = _of_map(update, one, points[one.rows], own,
+                            marginal if len(own) == len(residual) else Marginal.of(
+                                marginal.whitened[own]),
+                            columns[own], residual[own], known.get(name))
+            found += [] if noise is None else [replace(noise, map=name)]
+    return tuple(found)
+
+
+def _of_map(
+    update: InferenceResult, scanned: ScannedMap, points: Floats, own: Ints, marginal: Marginal,
+    columns: Floats, residual: Floats, current: PositionNoise | None,
+) -> PositionNoise | None:
+    """Estimate the position noise of a map; None if there is no evidence of it.
+
+    Parameters
+    ----------
+    update : InferenceResult
+    scanned : ScannedMap
+    points : ndarray, shape (n, 3), in m
+        The map's points in the magnet.
+    own : ndarray of int, shape (rows,)
+        Numbers of the map's readings among all training readings.
+    marginal, columns, residual, current
+        See `estimate_position_noise`, for these readings only.
     """
     count = len(residual)
-    if current is None and update.prior_conflict < 1 + MIN_CHI2_EXCESS * np.sqrt(2 / count):
+    chi2 = float(residual @ marginal.remove(residual[:, None])[:, 0]) / count
+    if current is None and chi2 < 1 + MIN_CHI2_EXCESS * np.sqrt(2 / count):
         return None
-    noise, observation = update.errors.subset(~update.held_out), update.observation
-    training = np.flatnonzero(~update.held_out)
+    training = np.flatnonzero(~update.held_out)[own]
+    noise = update.errors.subset(training)
+    analysis = sparse.csr_array(sparse.csc_array(update.observation.analysis[training])[
+        :, 3 * scanned.rows.start:3 * scanned.rows.stop])
     rows = np.arange(count)
     if count > MAX_READINGS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MAX_READINGS, replace=False))
-    per_metre = readings_per_displacement(update.magnet, observation, np.ones(3))
-    moved = noise.whitening @ per_metre[training]
+    magnet = update.magnet.with_study(scanned.study_of(update.study))
+    moved = noise.whitening @ readings_per_displacement(magnet, analysis, points, np.ones(3))
     scale, smooth = SMOOTH_SCALE * float(np.median(noise.sd)), []
-    points = probe_points(update.study.instrument, observation.map_points)
     for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):
-        readings = scale * observation.read(terms.fields)[:, training].T
+        readings = scale * (analysis @ terms.fields.reshape(len(terms.fields), -1).T)
         smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAY_RATES[0])))
     nuisance = np.hstack([marginal.whitened, EFFECT_SCALE * columns, *smooth])
     found = compare_noise_models(nuisance[rows], residual[rows], sparse.csr_array(moved[rows]),
@@ -115,21 +159,30 @@ def estimate_position_noise(
     return found if log_odds > DETECTION_LOG_ODDS else None
 
 
-def has_settled(old: PositionNoise | None, new: PositionNoise | None) -> bool:
-    """Tell whether the estimate has converged between two rounds."""
-    if old is None or new is None:
-        return old is new
-    return abs(new.sd_m / old.sd_m - 1) < CONVERGENCE_TOLERANCE
+def have_settled(old: Sequence[PositionNoise], new: Sequence[PositionNoise]) -> bool:
+    """Tell whether the estimates have converged between two rounds."""
+    before = {noise.map: noise.sd_m for noise in old}
+    return before.keys() == {noise.map for noise in new} and all(
+        abs(noise.sd_m / before[noise.map] - 1) < CONVERGENCE_TOLERANCE for noise in new)
 
 
-def with_position_noise(study: Study, position_noise: PositionNoise | None) -> Study:
-    """Return the study with position noise added to its noise."""
-    if position_noise is None:
-        return study
-    settings = study.noise or NoiseSettings(position_sd_m=(position_noise.sd_m,))
-    old = settings.position_sd_m if study.noise else None
-    more = tuple(float(np.hypot(sd, position_noise.sd_m)) for sd in old or (0.0,))
-    return study.with_(noise=settings.with_(position_sd_m=more))
+def with_position_noise(study: Study, found: Sequence[PositionNoise]) -> Study:
+    """Return the study with position noise added to the noise of its maps."""
+    for one in found:
+        if one.map is None:
+            study = study.with_(noise=_added(study.noise, one.sd_m))
+        else:
+            number = [each.name for each in study.maps].index(one.map)
+            study = study.with_tables({
+                one.map: {"noise": _added(study.of_map(number).noise, one.sd_m)}})
+    return study
+
+
+def _added(noise: NoiseSettings | None, sd_m: float) -> NoiseSettings:
+    """Return the noise of a map with more position noise."""
+    settings = noise or NoiseSettings(position_sd_m=(sd_m,))
+    old = settings.position_sd_m if noise else None
+    return settings.with_(position_sd_m=tuple(float(np.hypot(sd, sd_m)) for sd in old or (0.0,)))
 
 
 def compare_noise_models(
@@ -184,7 +237,13 @@ def _compressed(root: Floats) -> Floats:
     """Return a covariance factor (n, k) with fewer columns.
 
     Its covariance is the same except for components far below the noise. Many columns are nearly
-    linearly dependent.
+    linearly dependent: a Cholesky factorization with pivots ends where no reading has more of the
+    covariance left than is negligible. Eigenvectors of what it keeps are the fewest columns.
     """
-    values, vectors = np.linalg.eigh(root.T @ root)
-    return np.asarray(root @ vectors[:, values > NEGLIGIBLE_VARIANCE])
+    covariance = root @ root.T
+    factor, order, rank, _ = linalg.lapack.dpstrf(covariance, tol=NEGLIGIBLE_VARIANCE / len(root),
+                                                  lower=True, overwrite_a=True)
+    kept = np.empty((len(root), rank))
+    kept[order - 1] = np.tril(factor)[:, :rank]
+    values, vectors = np.linalg.eigh(kept.T @ kept)
+    return np.asarray(kept @ vectors[:, values > NEGLIGIBLE_VARIANCE])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,9 +10,10 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
+from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.gross_errors import GrossError
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
@@ -20,20 +22,8 @@ from halbach_fe.diagnosis.solver_error import SolverErrorExplanation
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study
 
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """An effect at a place.
-
-    Attributes
-    ----------
-    effect : Effect
-    place : Place
-        Block, ring, seam or point at which the effect acts; empty for effects of the whole magnet.
-    """
-
-    effect: Effect
-    place: Place
+Floor = Mapping[str, float] | Mapping[str, Mapping[str, float]]
+"""Model-free floor in T by component (``Bx``) of the only map, or by map and component."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +120,9 @@ class UnknownPart:
         Distance along the coordinate over which it typically changes its sign, in m, degrees, T or
         as a fraction of the map's time; None if it is constant.
     log_bayes_factor : float
+    map : str or None
+        Name of the map on whose instrument it acts, among those that the study lists; None for a
+        field, and for the only map.
     """
 
     acts_on: Literal["field", "readings", "gains", "positions"]
@@ -142,6 +135,7 @@ class UnknownPart:
     size: float
     half_wave: float | None
     log_bayes_factor: float
+    map: str | None = None
 
 
 @dataclass(frozen=True)
@@ -239,6 +233,9 @@ class Diagnosis(ShownInNotebook):
         with this study.
     before, after : InferenceResult
         The inference with the corrected study, and with the identified effects added to it.
+    study : Study
+        The study with everything that the diagnosis added. Terms of instruments that it leaves open
+        are still what it says.
     identified : tuple of IdentifiedEffect
     unknown : UnknownCause or None
         The discrepancy that the identified effects leave, if there is one.
@@ -261,8 +258,8 @@ class Diagnosis(ShownInNotebook):
         Errors of the map's units, axes or magnet.
     outliers : tuple of Outlier
         Single readings that are excluded.
-    position_noise : PositionNoise or None
-        Random errors of the probe's positions, if the readings show them.
+    position_noise : tuple of PositionNoise
+        Random errors of the probe's positions in those maps that show them.
     solver_error : SolverErrorExplanation or None
         The solver's own error, if it explains the misfit. The search for effects is then skipped.
     converged : bool
@@ -276,8 +273,9 @@ class Diagnosis(ShownInNotebook):
     uncompared : int or None
         Number of hypotheses that were not compared, if the time limit cut the search; None if it
         did not.
-    floor_T : dict of str to float, or None
-        The model-free floor of the map by component (``Bx``), if Maxwell's check of it is known.
+    floor_T : dict, or None
+        The model-free floor of the map by component (``Bx``), if Maxwell's check of it is known; of
+        maps that the study lists, by map and component.
 
     Examples
     --------
@@ -292,6 +290,7 @@ class Diagnosis(ShownInNotebook):
     corrected_study: Study
     before: InferenceResult
     after: InferenceResult
+    study: Study
     identified: tuple[IdentifiedEffect, ...]
     unknown: UnknownCause | None
     probabilities: dict[str, float]
@@ -304,19 +303,14 @@ class Diagnosis(ShownInNotebook):
     rounds: int
     gross_errors: tuple[GrossError, ...] = ()
     outliers: tuple[Outlier, ...] = ()
-    position_noise: PositionNoise | None = None
+    position_noise: tuple[PositionNoise, ...] = ()
     solver_error: SolverErrorExplanation | None = None
     converged: bool = True
     positions: tuple[PossiblePosition, ...] = ()
     limits: DetectionLimits | None = None
-    floor_T: dict[str, float] | None = None
+    floor_T: Floor | None = None
     uncompared: int | None = None
     suspected: tuple[Suspicion, ...] = ()
-
-    @property
-    def study(self) -> Study:
-        """The study with everything that the diagnosis added."""
-        return self.after.study
 
     @property
     def found_anything(self) -> bool:

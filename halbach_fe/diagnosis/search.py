@@ -12,6 +12,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     Candidate,
@@ -20,12 +21,12 @@ from halbach_fe.diagnosis.model_selection import (
     with_wide_priors,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.scene import Campaign, Scene
 from halbach_fe.diagnosis.screening import most_likely
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.measurement.instrument import probe_points
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
@@ -50,14 +51,14 @@ class NominalSolver:
     _signatures: dict[tuple[str, bytes], Signatures] = field(default_factory=dict, repr=False)
 
     def signatures(
-        self, study: Study, update: InferenceResult, prior_mean: Floats, times: Floats
+        self, study: Study, update: InferenceResult, prior_mean: Floats, campaign: Campaign
     ) -> Signatures:
         """Return the store of signatures for a study and its map.
 
-        They depend on everything but the readings: the places and times of the map, its noise, and
-        what is known of the blocks.
+        They depend on everything but the readings: the places and times of the maps, their noise,
+        and what is known of the blocks.
         """
-        parts = (update.observation.map_points, times, update.errors.sd, prior_mean,
+        parts = (campaign.stated_points, campaign.times, update.errors.sd, prior_mean,
                  update.held_out.astype(float))
         key = study.model_dump_json(), b"".join(np.ascontiguousarray(part).tobytes()
                                                 for part in parts)
@@ -103,7 +104,8 @@ class Search:
         The readings with blocks and solver error integrated out.
     training : ndarray, shape (rows,)
         Whitened residual of the training readings with the identified effects in the model.
-    nominal : NominalFields
+    campaign : Campaign
+    nominal : Scene
         Of the study from which the search started.
     uncompared : int
         Number of hypotheses for which there was no time.
@@ -116,21 +118,21 @@ class Search:
     residual: Floats
     marginal: Marginal
     training: Floats
-    nominal: NominalFields
+    campaign: Campaign
+    nominal: Scene
     uncompared: int = 0
 
 
 def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
     """Return the study with identified effects applied at their amplitudes."""
     for effect in identified:
-        hypothesis = effect.hypothesis
-        study = hypothesis.effect.apply(study, hypothesis.place, effect.values.tolist())
+        study = effect.hypothesis.apply(study, effect.values.tolist())
     return study
 
 
 def score_hypotheses(
     corrected: Study, start: Sequence[IdentifiedEffect], update: InferenceResult,
-    prior_mean: Floats, times: Floats, solver: NominalSolver, effects: Sequence[Effect],
+    prior_mean: Floats, campaign: Campaign, solver: NominalSolver, effects: Sequence[Effect],
     identified: Sequence[IdentifiedEffect], signatures: Signatures,
     progress: Progress = lambda done, total: None, is_over: Callable[[], bool] = lambda: False,
 ) -> Search:
@@ -150,8 +152,7 @@ def score_hypotheses(
         The inference with the identified effects in the model.
     prior_mean : ndarray, shape (parameters,), in A/m
         Prior mean of the magnetizations of the study without effects.
-    times : ndarray, shape (n,)
-        Time of each point of the map, from 0 at the first to 1 at the last.
+    campaign : Campaign
     solver : NominalSolver
     effects : sequence of Effect
     identified : sequence of IdentifiedEffect
@@ -164,28 +165,31 @@ def score_hypotheses(
     is_over : callable, optional
         Tells whether the time is up. Signatures that are not known by then are left out.
     """
-    whitened, response, marginal, training = marginal_of(update)
+    whitened, response, marginal, training = marginal_of(update, campaign)
     residual = training
-    study = apply_effects(corrected, start)
+    study = campaign.with_terms(apply_effects(corrected, start), update.terms)
 
-    def nominal_fields_of(other: Study) -> NominalFields:
-        points = probe_points(other.instrument, update.observation.map_points)
-        return NominalFields(other, points, times, lambda changed: solver.field(changed, points),
-                             solve_iron=lambda changed: solver.iron_change(changed, points),
-                             measured_magnetizations=update.by_block(prior_mean))
+    def scene_of(other: Study) -> Scene:
+        return campaign.scene(other, solver.field, solver.iron_change, update.by_block(prior_mean))
 
-    nominal, nominal_start = nominal_fields_of(update.study), nominal_fields_of(study)
-    known = solver.signatures(study, update, prior_mean, times)
+    nominal, nominal_start = scene_of(update.study), scene_of(study)
+    known = solver.signatures(study, update, prior_mean, campaign)
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
                 for effect in identified}
     kept = marginal.remove(response)
     uniform = slice(0, update.magnet.dimension * len(update.magnet.blocks))
     information = response[:, uniform].T @ kept[:, uniform]
     score = kept[:, uniform].T @ training
-    shortlisted = [Hypothesis(effect, place) for effect in effects if effect.places(study)
+
+    def shortlist(effect: Effect) -> Sequence[Place]:
+        if effect.kind == "instrument":
+            return campaign.places(effect, update.study)
+        return effect.shortlist(update.study, update.prior.mean[uniform], information, score)
+
+    shortlisted = [Hypothesis(effect, place) for effect in effects
+                    if campaign.places(effect, study)
                     for place in dict.fromkeys((
-                        *effect.shortlist(update.study, update.prior.mean[uniform], information,
-                                          score),
+                        *shortlist(effect),
                         *(place for name, place in (*signatures, *in_model)
                           if name == effect.name)))]
     candidates: list[Candidate] = []
@@ -206,22 +210,21 @@ def score_hypotheses(
             if signature is None:
                 if key not in known:
                     known[key] = whitened(update.observation.read(
-                        effect.signature(nominal_start, place)))
+                        nominal_start.signature(hypothesis)))
                 signature = signatures[key] = known[key]
         elif effect.applied_in_full:
-            others = apply_effects(
-                corrected, [other for other in identified if other is not present])
+            others = campaign.with_terms(apply_effects(
+                corrected, [other for other in identified if other is not present]), update.terms)
             amounts = np.pad(present.values,
                              (0, len(amplitude_scale(effect)) - len(present.values)))
             amounts[0] = 1.0
             signature = whitened(update.observation.read(_discrete_signature(
-                present.hypothesis, amounts, nominal_fields_of(others))))
+                present.hypothesis, amounts, scene_of(others))))
             residual = residual + signature @ amounts
         else:
             amounts = np.pad(present.values,
                              (0, len(amplitude_scale(effect)) - len(present.values)))
-            signature = whitened(update.observation.read(
-                effect.derivative(nominal, place, amounts.tolist())))
+            signature = whitened(update.observation.read(nominal.derivative(hypothesis, amounts)))
             residual = residual + signature @ amounts
         scored.append(hypothesis)
         columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
@@ -240,15 +243,16 @@ def score_hypotheses(
 
         def of(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
             return whitened(update.observation.read(
-                effect.derivative(nominal_start, place, amounts.tolist())))
+                nominal_start.derivative(Hypothesis(effect, place), amounts)))
 
         better = _improved_place(effect, [scored[number].place for number in numbers],
                                  [columns[number] for number in numbers], of, fixed, marginal,
                                  residual)
         if better is not None and (effect.name, better) not in signatures:
-            signature = whitened(update.observation.read(effect.signature(nominal_start, better)))
+            hypothesis = Hypothesis(effect, better)
+            signature = whitened(update.observation.read(nominal_start.signature(hypothesis)))
             signatures[effect.name, better] = signature
-            scored.append(Hypothesis(effect, better))
+            scored.append(hypothesis)
             columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique))
@@ -261,7 +265,7 @@ def score_hypotheses(
     stacked = np.hstack([np.zeros((len(residual), 0)), *(columns[number] for number in chosen)])
     return Search(tuple(scored[number] for number in chosen), tuple(compared),
                   marginal.evidence(stacked, residual), stacked, residual, marginal, training,
-                  nominal_start, uncompared)
+                  campaign, nominal_start, uncompared)
 
 
 def _improved_place(
@@ -316,9 +320,11 @@ def _improved_place(
 
 
 def marginal_of(
-    update: InferenceResult
+    update: InferenceResult, campaign: Campaign
 ) -> tuple[Callable[[Floats], Floats], Floats, Marginal, Floats]:
     """Return the training readings of an inference with blocks and solver error integrated out.
+
+    So are the terms of instruments that the study leaves open.
 
     Returns
     -------
@@ -339,25 +345,25 @@ def marginal_of(
 
     response = noise.whiten(update.response.matrix[rows])
     marginal = Marginal.of(with_fewer_columns(np.hstack([
-        response @ update.prior.root, whitened(_solver_error(update))])))
-    residual = whitened(update.readings - update.response.offset
-                        - update.response.matrix @ update.prior.mean)
+        noise.whiten(update.prediction_prior.root(rows)),
+        whitened(_solver_error(update, campaign))])))
+    residual = whitened(update.readings - update.prediction_prior.mean)
     return whitened, response, marginal, residual
 
 
-def _solver_error(update: InferenceResult) -> Floats:
+def _solver_error(update: InferenceResult, campaign: Campaign) -> Floats:
     """Return readings (k, n) in T of smooth fields as large as the solver's error.
 
     The solver's error is smooth, unlike noise. These fields are integrated out with the blocks, so
     that no effect is identified for a misfit that the solver's error can explain.
     """
     size = float(np.sqrt(np.mean(update.response.error**2)))
-    points = probe_points(update.study.instrument, update.observation.map_points)
+    points = campaign.points_of(update.study)
     fields = fields_of_rms(harmonic_fields(points), size) if size else np.zeros((1, *points.shape))
-    return update.observation.read(fields)
+    return update.observation.read(campaign.seen(update.study, fields))
 
 
-def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, nominal: NominalFields) -> Floats:
+def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:
     """Return the signatures (k, n, 3) in T of an effect that is applied in full.
 
     Such an effect is not linear in its first amplitude, which is 1 if it is present. The first
@@ -370,20 +376,24 @@ def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, nominal: Nomina
     hypothesis : Hypothesis
     amounts : ndarray, shape (k,)
         Amplitudes of the parameters and refinements.
-    nominal : NominalFields
+    scene : Scene
         Fields of the study without the effect.
     """
     effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
     if not effect.refinements:
-        return effect.signature(nominal, place)
-    refined = effect.refine(nominal, place, values)
-    changed = nominal.solve(effect.apply(nominal.study, place, values))
-    change = changed - nominal.finite_element_field
-    return np.concatenate([(change - np.tensordot(amounts[1:], refined, 1))[None], refined])
+        return scene.signature(hypothesis)
+
+    def of_map(nominal: NominalFields) -> Floats:
+        refined = effect.refine(nominal, place, values)
+        changed = nominal.solve(effect.apply(nominal.study, place, values))
+        change = changed - nominal.finite_element_field
+        return np.concatenate([(change - np.tensordot(amounts[1:], refined, 1))[None], refined])
+
+    return scene.seen(hypothesis, of_map)
 
 
 def identify_effects(
-    corrected: Study, search: Search, points: Floats
+    corrected: Study, search: Search
 ) -> tuple[IdentifiedEffect, ...]:
     """Select the missing effects and fit their amplitudes, without impossible ones.
 
@@ -396,30 +406,26 @@ def identify_effects(
     corrected : Study
         The study corrected for gross errors and outliers.
     search : Search
-    points : ndarray, shape (n, 3), in m
-        Points of the map.
     """
     excluded: set[int] = set()
     while True:
         found = amplitudes(
             search, select_effects(search.evidence, search.candidates, excluded=excluded))
-        impossible = next((number for number in range(len(found))
-                    if not possible(corrected, found[:number + 1], points)), None)
+        impossible = next((number for number in range(len(found)) if not possible(
+            corrected, found[:number + 1], search.campaign)), None)
         if impossible is None:
             return found
         excluded.add(search.candidates.index(found[impossible].selection.candidate))
 
 
-def possible(study: Study, identified: Sequence[IdentifiedEffect], points: Floats) -> bool:
-    """Tell whether a valid study can have effects of these amplitudes, with the map's points in
-    air.
-    """
+def possible(study: Study, identified: Sequence[IdentifiedEffect], campaign: Campaign) -> bool:
+    """Tell whether a valid study can have effects of these amplitudes, with all points in air."""
     if any(value < parameter.minimum for effect in identified
            for value, parameter in zip(effect.values, effect.parameters, strict=True)):
         return False
     try:
         changed = apply_effects(study, identified)
-        inside = build_magnet(changed).contains(probe_points(changed.instrument, points))
+        inside = build_magnet(changed).contains(campaign.points_of(changed))
     except HalbachError:
         return False
     return not inside.any()

@@ -42,10 +42,9 @@ def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation |
         return None
     training = ~update.held_out
     noise = update.noise.subset(training)
-    matrix = update.response.matrix[training]
-    marginal = Marginal.of(with_fewer_columns(noise.whiten(matrix @ update.prior.root)))
-    residual = noise.whiten(
-        update.readings[training] - update.response.offset[training] - matrix @ update.prior.mean)
+    marginal = Marginal.of(with_fewer_columns(noise.whiten(
+        update.prediction_prior.root(np.flatnonzero(training)))))
+    residual = noise.whiten((update.readings - update.prediction_prior.mean)[training])
     chi2 = float(residual @ marginal.remove(residual[:, None])[:, 0]) / len(residual)
     if chi2 <= update.conflict_limit:
         return None

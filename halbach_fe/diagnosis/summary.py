@@ -16,13 +16,14 @@ from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.model_selection import Candidate
+from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.diagnosis.result import (
     DetectionLimits,
     Diagnosis,
-    Hypothesis,
     IdentifiedEffect,
     PossiblePosition,
     Suspicion,
@@ -36,6 +37,7 @@ from halbach_fe.inference.result import (
     TRAINING,
     InferenceResult,
 )
+from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.model import Study
 
@@ -95,7 +97,8 @@ class RegionFit:
 
 
 def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[RegionFit]:
-    """Return the fit of all readings of each part, and of held-out readings by region.
+    """Return the fit of all readings of each part, and of held-out readings by region; of several
+    maps, also that of the training readings of each.
 
     ``loo_residuals`` (n,) are the standardized leave-one-out residuals of the training readings.
     """
@@ -103,6 +106,14 @@ def region_scores(update: InferenceResult, loo_residuals: Floats) -> list[Region
     training = parts == TRAINING
     found = [RegionFit(ALL_READINGS, TRAINING, int(training.sum()), update.prior_conflict,
                    _rms(update, training), float(np.mean(np.abs(loo_residuals) <= COVERAGE_Z)))]
+    for name in dict.fromkeys(update.maps) if update.is_campaign else ():
+        own = training & (np.array(update.maps) == name)
+        if own.any():
+            found.append(RegionFit(
+                name, TRAINING, int(own.sum()),
+                float(np.mean(update.whitened(update.prediction_prior, own) ** 2)),
+                _rms(update, own), float(np.mean(np.abs(loo_residuals[own[training]])
+                                                 <= COVERAGE_Z))))
     names = list(dict.fromkeys(update.regions))
     for part in (HELD_OUT, HELD_OUT_MAP):
         for region in [ALL_READINGS, *(names if len(names) > 1 else [])]:
@@ -140,15 +151,24 @@ def write_summary(
     write_text(folder / SUMMARY_FILE, text + "\n")
 
 
-def write_study(text: str, study: Study, diagnosis: Diagnosis, folder: Path) -> None:
+def write_study(
+    text: str, study: Study, diagnosis: Diagnosis, folder: Path, origin: Path | None = None
+) -> None:
     """Write study.diagnosed.toml, edited from the text of the study's file.
+
+    The paths of the maps that it lists start from ``origin``, the folder of that file, and are
+    changed to start from ``folder``.
 
     Raises
     ------
     StudyError
         If no valid study has the fitted amplitudes.
     """
-    write_edited(folder / STUDY_FILE, text, _steps(study, diagnosis))
+    steps = list(_steps(study, diagnosis))
+    if origin is not None and study.maps:
+        moved = [(with_paths_from(each, origin, folder), comment) for each, comment in steps]
+        steps = [steps[0], (moved[0][0], "path from this folder"), *moved[1:]]
+    write_edited(folder / STUDY_FILE, text, steps)
 
 
 def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
@@ -156,17 +176,15 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     yield study, "copied from another file, so that this one is complete"
     for error in diagnosis.gross_errors:
         study = error.apply(study)
-        yield study, f"gross error: {error.convention.text}"
+        yield study, f"gross error: {error.text}"
     study = diagnosis.corrected_study
     yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
     for effect in diagnosis.identified:
-        hypothesis = effect.hypothesis
-        study = hypothesis.effect.apply(study, hypothesis.place, effect.values.tolist())
+        study = effect.hypothesis.apply(study, effect.values.tolist())
         yield study, note(effect)
-    position_noise = diagnosis.position_noise
-    yield diagnosis.study, "" if position_noise is None else (
-        f"vibration: {1e3 * position_noise.sd_m:.2g} mm, log Bayes factor "
-        f"{position_noise.log_bayes_factor:.1f}")
+    yield diagnosis.study, "; ".join(
+        f"vibration: {_in_map(one.map)}{1e3 * one.sd_m:.2g} mm, log Bayes factor "
+        f"{one.log_bayes_factor:.1f}" for one in diagnosis.position_noise)
 
 
 def note(identified: IdentifiedEffect) -> str:
@@ -231,6 +249,11 @@ def place_in_words(place: Place) -> str:
     return " and ".join(filter(None, blocks)) or place.name
 
 
+def _in_map(name: str | None) -> str:
+    """Return the name of a map before what is said of it; nothing for the only one."""
+    return "" if name is None else f"map {name}: "
+
+
 def block_in_words(ring: int, slot: int, label: str = "") -> str:
     """Describe a block by its own label, or else by ring and slot; 0 stands for all of them."""
     if label and label != f"r{ring:02d}s{slot:02d}":
@@ -275,18 +298,19 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
         found.append(OtherFinding(
             " and ".join(error.names), error.convention.text, "gross error",
             f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
-            f"Gross error: {error.convention.text}.",
+            f"Gross error: {error.text}.", EMPTY_CELL if error.map is None else f"map {error.map}",
             instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
     if diagnosis.outliers:
-        rows = sorted({outlier.row for outlier in diagnosis.outliers})
-        text = f"row{'s' if len(rows) > 1 else ''} " + ", ".join(
-            map(str, rows[:MAX_LISTED_ROWS])) + ", ..." * (len(rows) > MAX_LISTED_ROWS)
+        text = "; ".join(
+            _rows_in_words([one.row for one in diagnosis.outliers if one.map == name])
+            + (" of the map" if name is None else f" of map {name}")
+            for name in dict.fromkeys(one.map for one in diagnosis.outliers))
         count = len(diagnosis.outliers)
         found.append(OtherFinding(
             "outliers", "single readings that are outliers", "readings",
             f"{count} of {count + len(diagnosis.before.parts)}",
             f"{count} {'readings are outliers' if count > 1 else 'reading is an outlier'} and "
-            f"excluded ({text} of the map).", place=text))
+            f"excluded ({text}).", place=text.removesuffix(" of the map")))
     if diagnosis.solver_error:
         cause = diagnosis.solver_error
         found.append(OtherFinding(
@@ -296,14 +320,21 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             "The solver's own error explains the misfit: chi² per reading is "
             f"{cause.chi2_noise:.3g} for the noise alone and {cause.chi2_errors:.3g} with that "
             "error. Refine `mesh` or move `open_boundary` outwards, and diagnose the map again."))
-    if diagnosis.position_noise:
-        size = f"{1e3 * diagnosis.position_noise.sd_m:.2g} mm"
+    for noise in diagnosis.position_noise:
+        size, where = f"{1e3 * noise.sd_m:.2g} mm", f"map {noise.map}" if noise.map else ""
         found.append(OtherFinding(
             "vibration", "random errors of the probe's positions", "noise",
             f"{size} along each axis",
-            f"The probe's positions have random errors of {size} along each axis.",
-            factor=f"{diagnosis.position_noise.log_bayes_factor:.1f}"))
+            f"The probe's positions{f' in {where}' if where else ''} have random errors of {size} "
+            "along each axis.", where or EMPTY_CELL, f"{noise.log_bayes_factor:.1f}"))
     return found
+
+
+def _rows_in_words(rows: Sequence[int]) -> str:
+    """Name rows of a map."""
+    different = sorted(set(rows))
+    return f"row{'s' if len(different) > 1 else ''} " + ", ".join(
+        map(str, different[:MAX_LISTED_ROWS])) + ", ..." * (len(different) > MAX_LISTED_ROWS)
 
 
 def position_in_words(position: PossiblePosition) -> str:
@@ -311,7 +342,9 @@ def position_in_words(position: PossiblePosition) -> str:
     parts = []
     for name, values in position.amplitudes.items():
         lengths = ", ".join(f"{1e3 * value:.1f}" for value in values).replace("-", "−")
-        parts.append(f"({lengths}) mm" if len(values) > 1 else f"{lengths} mm {OUTWARDS[name]}")
+        effect, _, where = name.partition(" ")
+        size = f"({lengths}) mm" if len(values) > 1 else f"{lengths} mm {OUTWARDS[effect]}"
+        parts.append(f"{size} ({where})" if where else size)
     return f"{' and '.join(parts)} ({100 * position.probability:.0f} %)"
 
 
@@ -349,7 +382,7 @@ def diagnosis_summary(
         "effects": [_entry(effect) for effect in diagnosis.identified],
         "limits": _limits_entry(diagnosis.limits) if diagnosis.limits else None,
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
-        "vibration": asdict(diagnosis.position_noise) if diagnosis.position_noise else None,
+        "vibration": _vibration_entry(diagnosis.position_noise),
         "suspected": [_suspicion(one) for one in diagnosis.suspected],
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
@@ -372,15 +405,23 @@ def _gross(found: GrossError) -> dict[str, object]:
     def entry(convention: MapConvention) -> dict[str, object]:
         return {"errors": list(convention.names), "text": convention.text}
 
-    return {**entry(found.convention), "misfit_before": found.misfit_before,
+    return {**entry(found.convention), "map": found.map, "misfit_before": found.misfit_before,
             "misfit_after": found.misfit_after,
             "alternatives": [entry(convention) for convention in found.alternatives]}
+
+
+def _vibration_entry(found: Sequence[PositionNoise]) -> object:
+    """Return the JSON entry of position noise: of the only map, or by the names of the maps."""
+    entries = {one.map: {"log_bayes_factor": one.log_bayes_factor, "sd_m": one.sd_m}
+               for one in found}
+    return entries.get(None, entries or None)
 
 
 def _suspicion(one: Suspicion) -> dict[str, object]:
     """Return the JSON entry of a suspicion."""
     return {"effects": dict(zip(one.effects, one.shares, strict=True)),
-            "place": one.hypothesis.place.name, "probability": one.probability,
+            "place": one.hypothesis.place.name, "maps": list(one.hypothesis.place.maps),
+            "probability": one.probability,
             "log_bayes_factor": one.log_bayes_factor}
 
 
@@ -422,7 +463,7 @@ def _entry(identified: IdentifiedEffect) -> dict[str, object]:
     values, deviations = identified.reported
     return {
         "effect": effect.name, "title": effect.title, "kind": effect.kind,
-        "place": identified.place.name,
+        "place": identified.place.name, "maps": list(identified.hypothesis.place.maps),
         "parameters": [
             {"name": parameter.name, "unit": parameter.unit, "value": value, "sd": sd}
             for parameter, value, sd in zip(identified.parameters, values.tolist(),

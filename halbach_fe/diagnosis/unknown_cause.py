@@ -17,20 +17,15 @@ from scipy.sparse.csgraph import connected_components
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.competition import MANY, Competition, Explanation, Term
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.flexible_causes import Family, families
+from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     INDISTINGUISHABLE_LOG_EVIDENCE,
     log_bayes_factors,
     selected_effect,
     with_candidates,
 )
-from halbach_fe.diagnosis.result import (
-    Hypothesis,
-    IdentifiedEffect,
-    Suspicion,
-    UnknownCause,
-    UnknownPart,
-)
+from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion, UnknownCause, UnknownPart
 from halbach_fe.diagnosis.search import Search, amplitudes, possible
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study
@@ -107,10 +102,23 @@ class Judgement:
 
 
 def families_of(search: Search, update: InferenceResult) -> list[Family]:
-    """Return the causes of any shape that compete with the effects of a search."""
-    nominal = search.nominal
-    return families(nominal.points, nominal.time, nominal.field,
-                    nominal.gradient, float(np.median(update.errors.sd)))
+    """Return the causes of any shape that compete with the effects of a search.
+
+    A field acts on all maps; what an instrument does, on one of them.
+    """
+    scene, noise = search.nominal, update.errors.sd
+    found = [field_family(scene.points, float(np.median(noise)),
+                          lambda fields: search.campaign.seen(update.study, fields))]
+    listed = search.campaign.is_listed  # if not, another map has the same instrument
+    for own in [[one] for one in scene.maps if not one.is_validation] if listed else [scene.maps]:
+        rows = slice(own[0].rows.start, own[-1].rows.stop)
+        families = instrument_families(
+            scene.points[rows], np.concatenate([one.time for one in own]), scene.field[rows],
+            scene.gradient[rows],
+            float(np.median(noise[np.isin(update.maps, [one.name for one in own])])))
+        found += [family.of_map(own[0].name, rows, len(scene.points)) for family in families
+                  ] if listed else families
+    return found
 
 
 def judge(
@@ -121,16 +129,17 @@ def judge(
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.subset(rows), update.observation
     marginal, columns, residual = search.marginal, search.columns, search.residual
-    some = np.arange(len(rows))
+    evidence, some = search.evidence, np.arange(len(rows))
     if len(rows) > MAX_READINGS:
         some = np.sort(np.random.default_rng(0).choice(some, MAX_READINGS, replace=False))
         marginal = Marginal.of(marginal.whitened[some])
+        evidence = marginal.evidence(columns[some], residual[some])
 
     def whiten(fields: Floats) -> Floats:
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
-    competition = Competition(marginal, columns[some], residual[some], search.candidates, flexible,
-                              lambda fields: whiten(fields)[some])
+    competition = Competition(marginal, columns[some], residual[some], evidence,
+                              search.candidates, flexible, lambda fields: whiten(fields)[some])
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = [effect.hypothesis.place.at_m for effect in identified
                if effect.hypothesis.effect.name == "ferromagnetic_object"]
@@ -151,7 +160,7 @@ def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
 
 def named_effects(
     corrected: Study, search: Search, judgement: Judgement,
-    identified: Sequence[IdentifiedEffect], points: Floats,
+    identified: Sequence[IdentifiedEffect],
 ) -> tuple[IdentifiedEffect, ...]:
     """Return the effects of the best explanation, with their amplitudes beside its terms."""
     best, competition = judgement.best, judgement.competition
@@ -161,7 +170,7 @@ def named_effects(
     selected = [selected_effect(evidence, search.candidates, best.effects, number,
                                 competition.prior, ()) for number in best.effects]
     found = amplitudes(replace(search, evidence=evidence), selected)
-    while found and not possible(corrected, found, points):
+    while found and not possible(corrected, found, search.campaign):
         found = found[:-1]
     return found
 
@@ -214,16 +223,17 @@ def describe_unknown(
 def _part(term: Term, field: Floats, rivals: Sequence[Term]) -> UnknownPart:
     """Describe one term, whose posterior mean is ``field`` (n, 3) in T."""
     family, mean = term.family, term.fitted.mean
+    field = field[family.rows]
     power = mean**2
     waves = float(np.sqrt(power @ family.waves**2 / max(power.sum(), 1e-300)))
     size = family.unit * float(np.sqrt(power.sum()))
     return UnknownPart(
         family.acts_on, family.along,
-        tuple(f"{one.family.acts_on} {one.family.along}".strip() for one in rivals),
+        tuple(one.family.name for one in rivals),
         tuple(COMPONENTS[axis] for axis in term.fitted.axes), term.fitted.smooth,
         float(np.sqrt(np.mean(np.sum(field**2, axis=1)))),
         float(np.linalg.norm(field, axis=1).max()), size,
-        family.span / waves if waves > 0 else None, term.fitted.log_bayes_factor)
+        family.span / waves if waves > 0 else None, term.fitted.log_bayes_factor, family.map)
 
 
 def suspicions(judgement: Judgement, hypotheses: Sequence[Hypothesis]) -> tuple[Suspicion, ...]:

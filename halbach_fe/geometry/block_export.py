@@ -47,7 +47,7 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
     Raises
     ------
     StudyError
-        If no block is left, or an exception tilts a block of a cross-section.
+        If an exception tilts a block of a cross-section.
 
     Examples
     --------
@@ -68,9 +68,6 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
             row = _ring_row(block)
             row["material"] = array.of_ring(block.ring).material if array.ring else array.material
         rows.append(row | _material(block))
-    if not rows:
-        raise StudyError("Input `array` of study must have a block that is not missing, to be "
-                         "exported; instead all are missing.")
     columns = {column: [row.get(column) for row in rows] for column in COLUMNS}
     return {column: values for column, values in columns.items()
             if any(value is not None for value in values)}

@@ -193,6 +193,19 @@ class MagnetBlock:
         return inside
 
 
+def moved_block(block: MagnetBlock, turn_rad: float, z_m: float, factor: float) -> MagnetBlock:
+    """Return a block turned about the magnet's z axis, then moved along it.
+
+    Its remanence is multiplied by ``factor``.
+    """
+    turn = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+    return replace(
+        block, origin_m=vector(turn @ block.position + [0.0, 0.0, z_m]),
+        orientation_rad=vector(Rotation.from_matrix(turn @ block.axes).as_rotvec()),
+        displacement_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0),
+        easy_axis=vector(turn @ np.array(block.easy_axis)), remanence=factor * block.remanence)
+
+
 def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
     """Return the matrix (3, 3) of a rotation vector in rad."""
     if not any(vector):  # most blocks of most magnets, which may have thousands

@@ -13,21 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
-from halbach_fe.geometry.blocks import MagnetBlock, bore_radius
+from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
-from halbach_fe.geometry.overlaps import block_in_iron, overlapping_blocks
+from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
-from halbach_fe.study.magnet import External
+from halbach_fe.study.magnet import External, Neighbour
 from halbach_fe.study.materials import Curve
-from halbach_fe.study.model import Study, curve_of, iron_of, is_nonlinear
+from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
-
-SHAPE_KEYS = ("dimension", "array", "iron_ring", "iron")
-"""Keys of a study that the shapes of blocks and iron depend on."""
 
 CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
 """Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
@@ -246,9 +243,9 @@ class Magnet(ShownInNotebook):
         return max(self.array_half_length, self.iron_half_length)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m lie inside a block or the iron ring."""
+        """Tell which points (n, 3) in m lie inside a block, a neighbour's block or the iron."""
         inside = np.zeros(len(points), bool)
-        for block in self.blocks:
+        for block in self.blocks + neighbour_blocks(self.blocks, self.external.neighbours):
             inside |= block.contains(points)
         for body in self.iron:
             inside |= body.contains(points)
@@ -260,8 +257,12 @@ class Magnet(ShownInNotebook):
 
     def with_study(self, study: Study) -> Magnet:
         """Return the magnet of another study; blocks are built again only if they may differ."""
-        same = all(getattr(study, key) == getattr(self.study, key) for key in SHAPE_KEYS)
+        same = all(getattr(study, key) == getattr(self.study, key) for key in MAGNET_KEYS)
         return Magnet(study, self.blocks) if same else build_magnet(study)
+
+
+WEAKEST_T = 1e-6
+"""Smallest remanence in T of a magnet's strongest block; results are relative to it."""
 
 
 def build_magnet(study: Study) -> Magnet:
@@ -288,10 +289,55 @@ def build_magnet(study: Study) -> Magnet:
     'r01s01'
     """
     magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
+    strongest = max(abs(block.remanence) for block in magnet.blocks)
+    if strongest < WEAKEST_T:
+        raise StudyError(must_be(
+            "`array`", f"study {study.name}", "a magnet with at least one magnetized block",
+            f"{len(magnet.blocks)} blocks that are missing" if not strongest
+            else f"{len(magnet.blocks)} blocks of at most {strongest:g} T",
+            "Correct remanence_T, or magnetization_factor of the exceptions."))
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
+    if study.external.neighbours:
+        _check_neighbours(study.dimension, study.array, study.iron_ring, study.iron,
+                          study.external.neighbours)
     return magnet
+
+
+def neighbour_blocks(
+    blocks: tuple[MagnetBlock, ...], neighbours: tuple[Neighbour, ...]
+) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of neighbouring magnets, which are those of the magnet, moved."""
+    return tuple(moved_block(block, float(np.radians(one.turn_deg)), one.z_m, one.factor)
+                 for one in neighbours for block in blocks)
+
+
+@lru_cache(maxsize=128)
+def _check_neighbours(
+    dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None,
+    neighbours: tuple[Neighbour, ...],
+) -> None:
+    """Refuse neighbouring magnets in the place of the magnet or of one another.
+
+    Raises
+    ------
+    StudyError
+    """
+    own = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
+    reach = max(abs(end) for block in own for end in (block.z_min, block.z_max))
+    solids = iron_solids(dimension, iron_ring, iron, reach)
+    taken = own
+    for one in neighbours:
+        blocks = neighbour_blocks(own, (one,))
+        found = block_in_others(blocks, taken, SQUEEZED) or (
+            block_in_iron(blocks, solids, SQUEEZED) if solids else None)
+        if found is not None:
+            raise StudyError(must_be(
+                "`external.neighbours`", "study", "other magnets, beside this one",
+                f"one at z_m = {one.z_m:g} whose block {own[found[0]].name} is where blocks or "
+                "iron are already", "Move it along z by more than the length of the magnet."))
+        taken += blocks
 
 
 @lru_cache(maxsize=128)  # a diagnosis builds the same magnets hundreds of times

@@ -68,6 +68,15 @@ def overlapping_blocks(
     return _first_overlap(_of_blocks(blocks), None, tolerance) if blocks else None
 
 
+def block_in_others(
+    blocks: Sequence[MagnetBlock], others: Sequence[MagnetBlock], tolerance: float = TOLERANCE
+) -> tuple[int, int, float] | None:
+    """Return the first of some blocks that overlaps one of others, as `block_in_iron` does."""
+    if not (blocks and others):
+        return None
+    return _first_overlap(_of_blocks(blocks), _of_blocks(others), tolerance)
+
+
 def block_in_iron(
     blocks: Sequence[MagnetBlock], iron: Sequence[IronSolid], tolerance: float = TOLERANCE
 ) -> tuple[int, int, float] | None:

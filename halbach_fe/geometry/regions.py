@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from halbach_fe.core.errors import MeshError
+from halbach_fe.core.files import write_text
 
 AIR_TAG = 1
 IRON_TAG = 2
@@ -60,8 +61,8 @@ class Regions(BaseModel):
         return names | {block.tag: f"block {block.name}" for block in self.blocks}
 
     def write(self, path: Path) -> None:
-        """Write the region file as JSON."""
-        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        """Write the region file as JSON; raise OutputError on failure."""
+        write_text(path, self.model_dump_json(indent=1) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> Regions:

@@ -154,6 +154,7 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     """
     blocks, size = magnet.blocks, magnet.dimension
     members_of = types_of(magnet)
+    table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_complete(magnet, table, used)
     index = _block_of_rows(magnet, table)
@@ -225,6 +226,7 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     """
     magnet = as_meant(magnet)
     blocks, size = magnet.blocks, magnet.dimension
+    table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_alike(magnet, shape_axes, "Make them types of their own.")
     index = _block_of_rows(magnet, table)
@@ -291,6 +293,16 @@ def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
     for number in order:
         found.setdefault(labels[number], []).append(number)
     return {label: tuple(members) for label, members in found.items()}
+
+
+def with_types(magnet: Magnet, table: BlockTable) -> BlockTable:
+    """Return a table with the types that follow from the places of its blocks."""
+    if all(table.type):
+        return table
+    label_of = {(magnet.blocks[number].ring, magnet.blocks[number].slot): label
+                for label, members in types_of(magnet).items() for number in members}
+    return replace(table, type=tuple(own or label_of.get(place, "") for own, place in zip(
+        table.type, table.places, strict=True)))
 
 
 def first_of_types(magnet: Magnet) -> dict[str, int]:
@@ -382,11 +394,12 @@ def _check_types(magnet: Magnet, table: BlockTable) -> None:
     places = {(block.ring, block.slot) for block in magnet.blocks if block.remanence}
     first, types = first_of_types(magnet), types_of(magnet)
     for serial, label, (ring, slot) in zip(table.serial, table.type, table.places, strict=True):
-        if label not in first:
+        if label and label not in first:
             raise MeasurementError(must_be(
                 f"type of block {serial}", table.source,
                 f"one of the study's: {', '.join(first)}", f"'{label}'",
-                "Name the slots of each type in the study's prior.types."))
+                "Name the slots of each type in the study's prior.types, or leave the type out "
+                "where ring and slot are given."))
         if ring and (ring, slot) not in places:
             raise MeasurementError(must_be(
                 f"place of block {serial}", table.source,

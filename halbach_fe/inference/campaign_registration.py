@@ -8,19 +8,22 @@ nominal magnet looks the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.pose_result import OpenKey, ProbePrior, Registration
+from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import Map
+from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.maps import PROBE_KEYS
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-
-KNOWN = ProbePrior(crosstalk=1e-9, gain=1e-9, offset_T=1e-12, sensor_m=1e-12)
-"""Prior of a probe that an earlier map has found."""
 
 
 def register_maps(
@@ -34,7 +37,8 @@ def register_maps(
     magnet : Magnet
     maps : sequence of Map
         In the order in which they are registered: best the one first that says most about the
-        blocks. Maps of one probe have the probe that the first of them finds.
+        blocks. Maps of one probe have the probe that the first of them finds, and those on one
+        stage are turned alike.
     session : Session
     open_keys : sequence of OpenKey, optional
         Numbers of the study that are fitted with the first map.
@@ -49,20 +53,25 @@ def register_maps(
     """
     found: dict[str, list[Registration]] = {}
     blocks: Gaussian | None = None
-    probes: dict[str, Instrument] = {}
+    probes: dict[str, Registration] = {}
+    stages: dict[str, Map] = {}
     for one in maps:
         study = one.study
         for key, (value, _) in (found[maps[0].name][0].open_keys.items() if found else ()):
             study = OpenKey(key, 1.0).apply(study, value)
         known = probes.get(one.probe)
         if known is not None:
-            study = study.with_(instrument=_with_probe(study.instrument, known))
+            study = study.with_(instrument=_with_probe(study.instrument, known.instrument))
         say(f"map {one.name}")
+        first = stages.setdefault(one.pose, one)
+        pose = None if first is one else PosePrior(
+            stage=_stage_pose(one, first, found[first.name][0]))
         found[one.name] = register(
             magnet.with_study(study), one.data, session.within(one.name),
-            None if known is None else KNOWN, () if found else open_keys, say, blocks)
+            None if known is None else replace(known.probe, offset_T=ProbePrior.offset_T),
+            () if found else open_keys, say, blocks, pose)
         blocks = found[one.name][0].blocks
-        probes.setdefault(one.probe, found[one.name][0].instrument)
+        probes.setdefault(one.probe, found[one.name][0])
     return found
 
 
@@ -71,15 +80,60 @@ def registered_study(
 ) -> Study:
     """Return the study of a campaign with the most probable pose of each map."""
     probes: dict[str, Instrument] = {}
+    stages: dict[str, tuple[Map, Instrument]] = {}
     listed = []
     for each, one in zip(study.maps, maps, strict=True):
         instrument = found[one.name][0].instrument
         instrument = _with_probe(instrument, probes.setdefault(one.probe, instrument))
+        first, of_first = stages.setdefault(one.pose, (one, instrument))
+        if first is not one:
+            instrument = _moved_along(one, instrument, first, of_first)
         listed.append(each.with_(instrument=instrument))
     study = study.with_(maps=tuple(listed))
     for key, (value, _) in found[maps[0].name][0].open_keys.items():
         study = OpenKey(key, 1.0).apply(study, value)
     return study
+
+
+def _stage_pose(one: Map, first: Map, found: Registration) -> StagePose:
+    """Return where a map lies by the first one on its stage."""
+    turn, apart = _relative(one, first)
+    stage = turn_of(found.instrument)
+    arm = stage.apply(turn.apply(one.middle_m) + apart - first.middle_m)
+    # turns about an axis move what is off that axis
+    moved = np.sqrt([arm[[1, 2]]**2 @ found.rotation_sd_rad[[2, 1]]**2,
+                     arm[[2, 0]]**2 @ found.rotation_sd_rad[[0, 2]]**2,
+                     arm[[0, 1]]**2 @ found.rotation_sd_rad[[1, 0]]**2])
+    return StagePose(
+        stage * turn, stage.apply(turn.apply(one.middle_m) + apart)
+        + found.instrument.translation_m, stage.as_matrix(), np.array(one.shift_sd_m),
+        np.hypot(found.translation_sd_m, moved), found.rotation_sd_rad)
+
+
+def _moved_along(
+    one: Map, instrument: Instrument, first: Map, of_first: Instrument
+) -> Instrument:
+    """Return an instrument at the place on a stage that is nearest to where it was found.
+
+    From its place relative to the first map, which the study states, it moves only along those axes
+    of the stage that are open.
+    """
+    turn, apart = _relative(one, first)
+    stage = turn_of(of_first)
+    place = turn_of(instrument).apply(one.middle_m) + instrument.translation_m
+    shift = (stage.inv().apply(place - of_first.translation_m)
+             - turn.apply(one.middle_m) - apart)
+    shift[np.array(one.shift_sd_m) == 0] = 0.0
+    x, y, z = (stage.apply(apart + shift) + of_first.translation_m).tolist()
+    alpha, beta, gamma = (stage * turn).as_rotvec().tolist()
+    return instrument.with_(translation_m=(x, y, z), rotation_rad=(alpha, beta, gamma))
+
+
+def _relative(one: Map, first: Map) -> tuple[Rotation, Floats]:
+    """Return the turn, and the place (3,) in m, of a map against the first one on its stage."""
+    own, other = one.study.instrument, first.study.instrument
+    back = turn_of(other).inv()
+    return back * turn_of(own), back.apply(np.subtract(own.translation_m, other.translation_m))
 
 
 def _with_probe(instrument: Instrument, probe: Instrument) -> Instrument:

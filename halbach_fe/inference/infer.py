@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError
-from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
@@ -20,29 +20,31 @@ from halbach_fe.inference.instrument_fit import (
     OpenTerms,
     joined,
     of_the_first,
+    readings_of_field,
 )
 from halbach_fe.inference.overlap import overlaps
-from halbach_fe.inference.readings import read_campaign
-from halbach_fe.inference.result import InferenceResult, InstrumentTerms, Prediction
+from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
+from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import study_prior, with_variations
+from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
-from halbach_fe.solver.formulation_choice import choose_route, solve_nominal
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.formulation_choice import choose_route, field_function, solve_nominal
+from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows, predict
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
 LINEAR_ENOUGH = 0.3
 """Error that the linearization of the iron may cause in a reading, relative to its error bar; a
 larger error causes a warning."""
 
-ROUNDS, AT_REST = 5, 0.3
+ROUNDS, AT_REST = 8, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its
 standard deviations up to which they are at rest."""
 
@@ -51,6 +53,7 @@ LEFT_OUT = 0.02
 may cause; a larger change causes a warning."""
 
 
+@alone
 def infer(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
     blocks: BlockTable | None = None, prior: Gaussian | None = None,
@@ -110,23 +113,29 @@ def infer(
     maps = maps_of(magnet.study, data, validation_map)
     open_terms = OpenTerms.of(maps)
     total = np.zeros(len(open_terms))
-    solved: tuple[Response, Linearization | None] | None = None
+    noises: Noises = {}
+    solved: _Solved | None = None
+    at = _Estimate.of(magnet, session) if len(open_terms) else None
     for _ in range(ROUNDS):
-        readings = read_campaign(magnet, maps)
+        readings = read_campaign(magnet, maps, noises)
+        if solved is None:
+            check_validation_map(readings, magnet.study)
         training = readings.training
-        here = open_terms.linearized(magnet, maps, readings, session.within(
-            "instrument")) if len(open_terms) else None
-        if solved is None or here is None or solved[1] is None or not here.is_near(
-                solved[1], float(readings.noise.sd.min())):
-            solved = _response(magnet, readings.observation, session), here
-        model = solved[0]
+        here = None if at is None else open_terms.linearized(at.field, maps, readings)
+        if (solved is None or here is None or solved.here is None
+                or not here.is_near(solved.here, readings)):
+            solved = _Solved(
+                _response(magnet, readings.observation, session), maps, here,
+                np.zeros(0) if at is None else readings_of_field(at.nominal, maps, readings))
+            model = solved.response
+        elif at is not None:
+            model = solved.moved(at, maps, readings)
         varying = len(model.parameters) - len(magnet.parameter_names)
         magnet_prior = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
                                  else study_prior(magnet, varying))
         matrix: Rows = model.matrix
         whole_prior = magnet_prior
-        if here is not None and solved[1] is not None:
-            model = replace(model, offset=model.offset + here.nominal - solved[1].nominal)
+        if here is not None:
             matrix = Beside(model.matrix, here.columns)
             whole_prior = joined(magnet_prior, -total, open_terms.sd)
         residual = readings.values - model.offset
@@ -135,12 +144,14 @@ def infer(
             matrix, residual[training], errors.subset(training), whole_prior,
             np.flatnonzero(training))
         whole = update.distribution
-        change = whole.mean[len(model.parameters):]
+        values, change = np.split(whole.mean, [len(model.parameters)])
         sd = whole.sd_of(np.hstack([np.zeros((len(change), len(model.parameters))),
                                     open_terms.counted]))
         total, at_rest = total + change, bool(
             (np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
-        maps = open_terms.applied(maps, change) if len(open_terms) else maps
+        if at is not None:
+            maps = open_terms.applied(maps, change)
+            at = replace(at, deviations=values - model.nominal)
         if at_rest:
             break
     else:
@@ -160,7 +171,7 @@ def infer(
         _check_linearization(magnet, readings.observation, session, model, posterior.mean,
                              errors.sd)
     return InferenceResult(
-        magnet=magnet.with_study(_with_instruments(magnet.study, maps)),
+        magnet=magnet.with_study(with_instruments(magnet.study, maps)),
         observation=readings.observation, readings=readings.values, noise=readings.noise,
         parts=readings.parts, regions=readings.regions, maps=readings.maps, response=model,
         prior=magnet_prior, posterior=posterior,
@@ -169,12 +180,71 @@ def infer(
         prior_conflict=update.prior_conflict, parameters_learnt=update.parameters_learnt,
         log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
-        measured_blocks=of_blocks.count if of_blocks and not prior else None,
+        measured_blocks=blocks.serial if blocks and not prior else None,
         left_out=update.discarded_information,
         terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
-                              at_rest)
+                              at_rest, _poses(open_terms, maps, whole))
         if len(open_terms) else None,
         overlaps=overlaps(matrix, residual, errors, whole_prior, readings))
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """The magnet as it is estimated: ``nominal`` is B of the nominal one, see `field`."""
+
+    nominal: Callable[[Floats], Floats]
+    of_deviations: Deviations
+    deviations: Floats
+
+    @classmethod
+    def of(cls, magnet: Magnet, session: Session) -> _Estimate:
+        """Return the nominal magnet."""
+        deviations = Deviations.of(magnet)
+        return cls(field_function(magnet, session.within("instrument")), deviations,
+                   np.zeros(deviations.count))
+
+    def field(self, points: Floats) -> Floats:
+        """Return B (n, 3) in T at points (n, 3) in m."""
+        return self.nominal(points) + self.of_deviations.field(self.deviations, points)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """The response of maps whose instruments had certain terms.
+
+    ``nominal`` (readings,) in T is what they read of the nominal magnet; it is empty if all terms
+    are known.
+    """
+
+    response: Response
+    maps: Sequence[Map]
+    here: Linearization | None
+    nominal: Floats
+
+    def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
+        """Return the response after small changes of the terms.
+
+        Its matrix is the same. Its offset contains what the changes do to the readings of the
+        magnet as it is estimated.
+        """
+        own = partial(estimate.of_deviations.field, estimate.deviations)
+        change = (readings_of_field(estimate.field, maps, readings) - self.nominal
+                  - readings_of_field(own, self.maps, readings))
+        return replace(self.response, offset=self.response.offset + change)
+
+
+def _poses(open_terms: OpenTerms, maps: Sequence[Map], posterior: Gaussian) -> tuple[MapPose, ...]:
+    """Return where the maps lie whose poses are among the open terms."""
+    found = []
+    for one, rows in zip(maps, open_terms.of_poses(maps), strict=True):
+        known = np.zeros((len(rows), len(posterior.mean) - len(open_terms)))
+        sd = posterior.sd_of(np.hstack([known, rows])).tolist()
+        instrument = one.study.instrument
+        x, y, z = (turn_of(instrument).apply(one.middle_m)
+                   + instrument.translation_m).tolist()
+        if rows.any():
+            found.append(MapPose(one.name, (x, y, z), tuple(sd[:3]), tuple(sd[3:])))
+    return tuple(found)
 
 
 def _response(magnet: Magnet, observation: Observation, session: Session) -> Response:
@@ -185,8 +255,8 @@ def _response(magnet: Magnet, observation: Observation, session: Session) -> Res
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
 
 
-def _with_instruments(study: Study, maps: Sequence[Map]) -> Study:
-    """Return a study with the instruments that were found."""
+def with_instruments(study: Study, maps: Sequence[Map]) -> Study:
+    """Return a study with the instruments of some maps, its own."""
     own = [one for one in maps if not one.is_validation]
     if not study.maps:
         return study.with_(instrument=own[0].study.instrument)
@@ -231,7 +301,7 @@ def _check_linearization(
     """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
     own = replace(session, folder=session.folder / "posterior")
     if choose_route(magnet, observation.points) == "moments":
-        updated = Magnet(magnet.study, _with_magnetizations(magnet, mean))
+        updated = Magnet(magnet.study, with_magnetizations(magnet, mean))
         true = observation.apply(solve_nominal(updated, observation.points, own))
     else:
         true = newton_readings(magnet, observation, own, mean[None])[0]
@@ -241,17 +311,3 @@ def _check_linearization(
             "The iron is linearized about the nominal magnet, which changes a reading of the "
             f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the "
             "non-linear posterior.", HalbachWarning, stacklevel=2)
-
-
-def _with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:
-    """Return the blocks of a magnet with magnetizations (parameters,) in A/m.
-
-    The axes of an anisotropic permeability turn with them, by fractions of a degree.
-    """
-    blocks, size = [], magnet.dimension
-    for block, magnetization in zip(magnet.blocks, values.reshape(-1, size), strict=True):
-        remanence = MU_0 * block.recoil_tensor[:, :size] @ magnetization
-        strength = float(np.linalg.norm(remanence))
-        blocks.append(block if not strength else replace(
-            block, remanence=strength, easy_axis=vector(remanence / strength)))
-    return tuple(blocks)

@@ -1,12 +1,13 @@
 """Terms of the instruments as parameters of the update, beside the magnetizations.
 
-The readings are linear in small changes of the terms, by the gradient of the nominal magnet's
-field. The update is therefore repeated about the terms that it found, until they are at rest.
+The readings are linear in small changes of the terms, by the gradient of the field of the magnet
+as it is estimated. The update is therefore repeated about what it found, until the terms are at
+rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,19 +15,21 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.readings import Readings
-from halbach_fe.measurement.campaign import Map
+from halbach_fe.measurement.campaign import Map, with_pivots
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     map_time,
     sensor_matrix,
     sensor_positions,
+    turn_of,
 )
 from halbach_fe.measurement.instrument_terms import (
     APART,
+    DRIFTS,
     NAMES,
+    OFFSETS,
     POSE,
     SENSORS,
     by_terms,
@@ -35,15 +38,14 @@ from halbach_fe.measurement.instrument_terms import (
     seen,
     with_terms,
 )
-from halbach_fe.solver.formulation_choice import field_function
-from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows
-from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.types import COMPONENTS
 
-DEVIATION = 0.05
-"""Deviations of the blocks relative to their magnetization. A response matrix is kept as long as a
-shift of the sensors changes the field of such deviations by less than the noise."""
+NEGLECTED = 0.01
+"""Part of the field that is not known at shifted sensors without a new response matrix: what
+permeable blocks and iron answer to deviations of the blocks, and what the next update changes. The
+matrix is kept as long as a shift changes this part by less than the noise."""
 
 
 @dataclass(frozen=True)
@@ -53,33 +55,41 @@ class OpenTerms:
     Attributes
     ----------
     names : tuple of str
-        Of each term, after the name of its map or probe: ``fringe.translation_x_m``.
+        Of each term, after the name of its map, stage or probe: ``fringe.translation_x_m``.
     sd : ndarray, shape (terms,)
         Prior standard deviations.
-    places : tuple of ndarray of int, shape (30,)
-        For each map the number among all open terms of each term of its instrument; -1 for those
-        that are known. Maps of one probe share numbers.
+    effects : tuple of ndarray, shape (30, terms)
+        For each map, how the open terms change the terms of its instrument (see `NAMES`). Maps of
+        one probe or stage share open terms.
+    shifts : tuple of ndarray, shape (3, terms)
+        For each map, how the open terms shift it along the axes of its stage.
     """
 
     names: tuple[str, ...]
     sd: Floats
-    places: tuple[NDArray[np.int64], ...]
+    effects: tuple[Floats, ...]
+    shifts: tuple[Floats, ...]
 
     @classmethod
     def of(cls, maps: Sequence[Map]) -> OpenTerms:
         """Return the open terms of all maps."""
-        names: dict[str, float] = {}
-        places = []
+        known: dict[str, float] = {}
+        of_terms, of_shifts = [], []
         for one in maps:
-            place = np.full(len(NAMES), -1)
-            for number, sd in enumerate(prior_sd(one.study.instrument_sd)):
-                owner = one.pose if number < POSE.stop else one.probe
-                name = f"{owner}.{NAMES[number]}"
-                if sd > 0:
-                    names.setdefault(name, float(sd))
-                    place[number] = list(names).index(name)
-            places.append(place)
-        return cls(tuple(names), np.array(list(names.values())), tuple(places))
+            owners = np.array([one.probe] * len(NAMES), object)
+            owners[POSE], owners[OFFSETS], owners[DRIFTS] = one.pose, one.offsets, one.offsets
+            terms = [f"{owner}.{name}" for owner, name in zip(owners, NAMES, strict=True)]
+            shifts = [f"{one.name}.stage_shift_{axis}_m" for axis in COMPONENTS]
+            sd = np.append(prior_sd(one.study.instrument_sd), one.shift_sd_m)
+            for name, value in zip(terms + shifts, sd.tolist(), strict=True):
+                if value > 0:
+                    known.setdefault(name, value)
+            of_terms.append(terms)
+            of_shifts.append(shifts)
+        names = np.array(list(known))
+        return cls(tuple(known), np.array(list(known.values())), *(
+            tuple((np.array(rows)[:, None] == names).astype(float) for rows in every)
+            for every in (of_terms, of_shifts)))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -88,11 +98,26 @@ class OpenTerms:
     def counted(self) -> Floats:
         """Matrix (terms, terms) to the terms as they count: sensors relative to their mean."""
         found = np.eye(len(self))
-        for place in self.places:
-            sensors = place[SENSORS]
-            if (sensors >= 0).all():
+        for effect in self.effects:
+            sensors = np.flatnonzero(effect[SENSORS].any(axis=0))
+            if len(sensors):
                 found[np.ix_(sensors, sensors)] = np.kron(APART, np.eye(3))
         return found
+
+    def of_poses(self, maps: Sequence[Map]) -> Floats:
+        """Return how the terms shift the middles of the maps and turn them (maps, 6, terms)."""
+        found = []
+        for number, one in enumerate(maps):
+            shift, turn = np.split(self._effect(number, one)[POSE], 2)
+            arm = turn_of(one.study.instrument).apply(one.middle_m - one.pivot_m)
+            found.append(np.concatenate([shift + np.cross(turn.T, arm).T, turn]))
+        return np.array(found)
+
+    def _effect(self, number: int, one: Map) -> Floats:
+        """Return how the terms change those of a map's instrument (30, terms), shifts included."""
+        effect = self.effects[number].copy()
+        effect[:3] += turn_of(one.study.instrument).as_matrix() @ self.shifts[number]
+        return effect
 
     def applied(self, maps: Sequence[Map], changes: Floats) -> list[Map]:
         """Return the maps after changes (terms,) of the instruments.
@@ -102,40 +127,58 @@ class OpenTerms:
         StudyError
             If the terms become larger than an instrument may have.
         """
-        return [replace(one, study=one.study.with_(instrument=self._changed(one, place, changes)))
-                for one, place in zip(maps, self.places, strict=True)]
-
-    def _changed(self, one: Map, place: NDArray[np.int64], changes: Floats) -> Instrument:
-        own = np.where(place >= 0, changes[place], 0.0)
-        return with_terms(one.study.instrument, one.middle_m, own)
+        found = []
+        for one, effect, shift in zip(maps, self.effects, self.shifts, strict=True):
+            instrument = with_terms(one.study.instrument, one.pivot_m, effect @ changes)
+            own = turn_of(instrument).apply(shift @ changes)
+            x, y, z = (own + instrument.translation_m).tolist()
+            found.append(replace(one, study=one.study.with_(
+                instrument=instrument.with_(translation_m=(x, y, z)))))
+        return with_pivots(found)
 
     def linearized(
-        self, magnet: Magnet, maps: Sequence[Map], readings: Readings, session: Session
+        self, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
     ) -> Linearization:
-        """Return how the readings of the nominal magnet depend on the open terms."""
-        field = field_function(magnet, session)
-        nominal, columns, sensors, steepness = [], [], [], []
-        for one, place in zip(maps, self.places, strict=True):
+        """Return how the readings depend on the open terms.
+
+        ``field`` takes points (n, 3) in m and returns B (n, 3) in T of the magnet as it is
+        estimated.
+        """
+        columns, sensors, steepness = [], [], []
+        for number, one in enumerate(maps):
             instrument = one.study.instrument
             data = in_si_and_magnet_axes(instrument, one.data)
             points = points_of(data)
             at_sensors, gradient = field_at_sensors(field, sensor_positions(instrument, points))
-            found = by_terms(instrument, points, one.middle_m, map_time(data), at_sensors, gradient)
-            own = np.zeros((3 * len(points), len(self)))
-            own[:, place[place >= 0]] = found.reshape(len(own), -1)[:, place >= 0]
-            columns.append(own)
-            nominal.append(seen(sensor_matrix(instrument), at_sensors))
+            found = by_terms(instrument, points, one.pivot_m, map_time(data), at_sensors, gradient)
+            columns.append(found.reshape(3 * len(points), -1) @ self._effect(number, one))
             sensors.append(sensor_positions(instrument, points).reshape(-1, 3))
             steepness.append(np.linalg.norm(gradient.reshape(-1, 9), axis=1))
-        read = readings.observation.read
         return Linearization(
-            np.concatenate(sensors), np.concatenate(steepness), read(np.concatenate(nominal)),
-            read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T)
+            np.concatenate(sensors), np.concatenate(steepness),
+            readings.observation.read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T)
+
+
+def readings_of_field(
+    field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
+) -> Floats:
+    """Return the readings (n,) in T of a field, without offset and drift.
+
+    ``field`` takes points (n, 3) in m and returns B (n, 3) in T.
+    """
+    found = []
+    for one in maps:
+        instrument = one.study.instrument
+        points = points_of(in_si_and_magnet_axes(instrument, one.data))
+        sensors = sensor_positions(instrument, points)
+        found.append(seen(sensor_matrix(instrument),
+                          field(sensors.reshape(-1, 3)).reshape(sensors.shape)))
+    return readings.observation.read(np.concatenate(found))
 
 
 @dataclass(frozen=True)
 class Linearization:
-    """Readings of the nominal magnet about some terms of the instruments.
+    """How the readings of a magnet depend on terms of the instruments, about some values of them.
 
     Attributes
     ----------
@@ -143,21 +186,21 @@ class Linearization:
         Places of all sensors.
     steepness : ndarray, shape (n,), in T/m
         Norm of the gradient there.
-    nominal : ndarray, shape (readings,), in T
-        Readings of the nominal magnet, without offset and drift.
     columns : ndarray, shape (readings, terms)
         Derivatives by the terms.
     """
 
     sensors: Floats
     steepness: Floats
-    nominal: Floats
     columns: Floats
 
-    def is_near(self, other: Linearization, sigma_T: float) -> bool:
-        """Tell whether the same response matrix serves both for a noise of ``sigma_T``."""
+    def is_near(self, other: Linearization, readings: Readings) -> bool:
+        """Tell whether the same response matrix serves both, for the noise of the readings."""
         moved = np.linalg.norm(self.sensors - other.sensors, axis=1)
-        return float((moved * self.steepness).max()) * DEVIATION < sigma_T
+        change, entries = NEGLECTED * moved * self.steepness, readings.observation.analysis
+        if (np.diff(entries.indptr) == 1).all():  # each reading is one component at one point
+            return bool((change[entries.indices] < readings.noise.sd).all())
+        return float(change.max()) < float(readings.noise.sd.min())
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ where it stopped.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,8 +26,9 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest
-from halbach_fe.core.errors import OutputError, SamplingError, StudyError
+from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.hdf5 import read_hdf5, with_checksum
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
@@ -328,37 +331,40 @@ def _store(
          "accepted": ("chain", np.array([r.accepted for r in runs]))},
         attrs={"key": key, "solves": solves, "generators": json.dumps(
             [r.generator.bit_generator.state for r in runs])})
-    try:
-        with atomic(path) as temporary:
-            posterior.to_netcdf(temporary, group="posterior", engine="h5netcdf")
-            state.to_netcdf(temporary, group="state", engine="h5netcdf", mode="a")
-    except OSError as error:
-        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
+    content = io.BytesIO()  # in memory: the HDF5 library crashes if the disk fills up under it
+    with_checksum(posterior).to_netcdf(content, group="posterior", engine="h5netcdf")
+    with_checksum(state).to_netcdf(content, group="state", engine="h5netcdf", mode="a")
+    with atomic(path) as temporary:
+        temporary.write_bytes(content.getvalue())
 
 
 def _resume(path: Path, key: str, runs: list[_Run]) -> int:
     """Continue the stored chains of an interrupted run; return the number of its solves.
 
     The stored chains are ignored, and 0 is returned, if they belong to other inputs or the file is
-    missing or damaged.
+    missing or damaged, which causes a warning.
     """
     count = len(runs)
     try:
-        state = untrusted.read_dataset(path, "state")
+        state = read_hdf5(path, "state")
         if state.attrs["key"] != key:
             return 0
         solves = int(state.attrs["solves"])
         last = untrusted.finite_array(state["last"], (count, len(runs[0].last)))
         accepted = untrusted.finite_array(state["accepted"], (count,))
-        stored = untrusted.read_dataset(path, "posterior")["magnetization"]
+        stored = read_hdf5(path, "posterior")["magnetization"]
         samples = untrusted.finite_array(stored, (count, stored.shape[1], len(runs[0].last)))
         generators = [np.random.default_rng() for _ in runs]
         states = json.loads(state.attrs["generators"])
         for generator, generator_state in zip(generators, states, strict=True):
             generator.bit_generator.state = generator_state
+    except FileNotFoundError:
+        return 0
     except MemoryError:
         raise
-    except Exception:  # a file that is damaged in any way is treated as missing
+    except Exception as error:  # a file that is damaged in any way is treated as missing
+        warnings.warn(f"The stored chains {path} cannot be used ({error}); sampling starts anew.",
+                      HalbachWarning, stacklevel=2)
         return 0
     for number, run in enumerate(runs):
         run.last, run.samples, run.accepted = last[number], samples[number], float(accepted[number])

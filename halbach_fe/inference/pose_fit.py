@@ -42,6 +42,8 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.measurement.instrument_terms import (
     DIFFERENCE_M,
+    POSE,
+    SMALL,
     STEADY,
     by_terms,
     field_at_sensors,
@@ -66,16 +68,9 @@ AT_REST, NO_BETTER = 0.02, 1e-3
 """A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
 if a step decreases chi-squared by a smaller part than the second."""
 
-DEVIATION = 0.05
-"""Deviations of the blocks relative to their magnetization. Their columns are kept as long as a
-shift of the readings changes the field of such deviations by less than the noise."""
-
 SEEN = 0.1
 """Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
 of a reading."""
-
-SMALL = 1e-5
-"""Step of finite differences by open keys of the instrument."""
 
 LONGEST_SD = 1.0
 """Longest step of an open key, in prior standard deviations."""
@@ -88,13 +83,18 @@ BLURS = (1.0, 0.1, 0.01)
 """Noise that is added on a line while the fit is on its way, in units of what the nominal blocks
 leave at first."""
 
+DEVIATION = 0.05
+"""Deviations of the blocks relative to their magnetization. Fields per block are kept as long as a
+shift of the sensors changes the field of such deviations by less than the noise."""
+
 NEAR = 0.1
-"""Part of that shift up to which columns are kept on a line, where single blocks are near."""
+"""Part of the shift that `DEVIATION` allows up to which columns are kept on a line, where single
+blocks are near."""
 
 HALVINGS = 5
 """Largest number of halvings of a step that does not improve the fit."""
 
-PROBE = 21
+PROBE = STEADY.stop - POSE.stop
 """Number of parameters of the probe: crosstalk, gains, offsets, and places of the sensors."""
 
 OFFSETS = slice(9, 12)
@@ -122,6 +122,8 @@ class PoseFit:
         Of all parameters of the blocks.
     pose_sd : ndarray, shape (6,)
         Prior standard deviations of the pose in m and rad.
+    on_known_stage : bool
+        Whether these are about the pose from which a fit starts.
     derivatives : dict
         Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
     solved : dict
@@ -140,6 +142,7 @@ class PoseFit:
     base: Instrument
     open: tuple[OpenKey, ...]
     pose_sd: Floats
+    on_known_stage: bool
     variations: Variations | None
     prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
@@ -182,7 +185,8 @@ class PoseFit:
             blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
-                   session, probe, base, open_keys, pose.sd(magnet), variations, blocks)
+                   session, probe, base, open_keys, pose.sd(magnet), pose.stage is not None,
+                   variations, blocks)
 
     @property
     def smallest_sigma(self) -> float:
@@ -225,8 +229,14 @@ class PoseFit:
         """Return all parameters (p,) less their prior means, in prior standard deviations.
 
         The prior mean of the place across is the axis, that of the place along it is the one of
-        the pose ``start``; of the turns it is the nearest rotation by right angles.
+        the pose ``start``; of the turns it is the nearest rotation by right angles. On a known
+        stage all of them are those of ``start``.
         """
+        if self.on_known_stage:
+            turned = (Rotation.from_rotvec(pose[3:])
+                      * Rotation.from_rotvec(start[3:]).inv()).as_rotvec()
+            return np.concatenate([np.append(pose[:3] - start[:3], turned) / self.pose_sd,
+                                   values / self.prior_sd()])
         turns = [Rotation.from_matrix(matrix) for matrix in right_angles()]
         nearest = min(turns, key=lambda turn: (
             Rotation.from_rotvec(start[3:]) * turn.inv()).magnitude())
@@ -294,7 +304,8 @@ class PoseFit:
             _mean_square(updated / state.sigma, self.held_out),
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest, self._blocks(columns.directions, mean, covariance))
+            log_evidence, at_rest, _probe_sd(sd[6:6 + PROBE]),
+            self._blocks(columns.directions, mean, covariance))
 
     def _blocks(self, directions: Floats, mean: Floats, covariance: Floats) -> Gaussian:
         """Return the updated blocks from mean (k,) and covariance (k, k) of their combinations."""
@@ -534,6 +545,13 @@ class _State:
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
             np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
                 factor, np.eye(len(inner)))[:count, :count]
+
+
+def _probe_sd(sd: Floats) -> ProbePrior:
+    """Return standard deviations (21,) of a probe's terms as those of their kinds."""
+    crosstalk, gain, offset, sensor = (float(np.sqrt(np.mean(part**2))) for part in np.split(
+        sd, [6, OFFSETS.start, OFFSETS.stop]))
+    return ProbePrior(crosstalk, gain, offset, sensor)
 
 
 def each_value(fit: PoseFit, values: Floats) -> list[float]:

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
@@ -47,6 +48,47 @@ class ProbePrior:
     sensor_m: float = 1e-4
 
 
+SEARCHED_M = 1e-3
+"""Standard deviation of a shift along a stage from which the shift is found from nothing."""
+
+
+@dataclass(frozen=True)
+class StagePose:
+    """Where a map lies by another map on the same stage, but for shifts along the stage's axes.
+
+    Attributes
+    ----------
+    turn : Rotation
+        From the map's axes to those of the magnet.
+    middle_m : ndarray, shape (3,)
+        Where its middle lies without a shift.
+    axes : ndarray, shape (3, 3)
+        Axes of the stage in the magnet, in columns.
+    shift_sd_m : ndarray, shape (3,)
+        Prior standard deviations of the shifts along them.
+    middle_sd_m, turn_sd_rad : ndarray, shape (3,)
+        What the other map leaves open, along and about the magnet's axes.
+    """
+
+    turn: Rotation
+    middle_m: Floats
+    axes: Floats
+    shift_sd_m: Floats
+    middle_sd_m: Floats
+    turn_sd_rad: Floats
+
+    def sd(self, magnet: Magnet) -> Floats:
+        """Return the standard deviations (6,) of shifts in m and turns in rad."""
+        shift = np.where(self.shift_sd_m < SEARCHED_M, self.shift_sd_m, magnet.half_length)
+        return np.append(np.sqrt(self.middle_sd_m**2 + self.axes**2 @ shift**2), self.turn_sd_rad)
+
+    def nearest(self, pose: Floats) -> Floats:
+        """Return the pose (6,) on the stage that is nearest to another one."""
+        shift = self.axes.T @ (pose[:3] - self.middle_m)
+        shift[self.shift_sd_m < SEARCHED_M] = 0.0
+        return np.append(self.middle_m + self.axes @ shift, self.turn.as_rotvec())
+
+
 @dataclass(frozen=True)
 class PosePrior:
     """Prior standard deviations of the pose, which matter where the map does not determine it.
@@ -58,16 +100,21 @@ class PosePrior:
         of the blocks.
     turn_rad : float
         Of the turns about the magnet's axes from the nearest rotation by right angles.
+    stage : StagePose, optional
+        What another map on the same stage says, which replaces the above.
     """
 
     across_m: float | None = None
     turn_rad: float = 0.1
+    stage: StagePose | None = None
 
     def sd(self, magnet: Magnet) -> Floats:
         """Return the standard deviations (6,) of shifts in m and turns in rad.
 
         That along the axis is the magnet's half length, about where the search has found the map.
         """
+        if self.stage is not None:
+            return self.stage.sd(magnet)
         across = self.across_m if self.across_m is not None else magnet.array_outer_radius
         return np.array([across, across, magnet.half_length, *[self.turn_rad] * 3])
 
@@ -145,6 +192,8 @@ class Registration:
         Log probability of the readings, up to a constant that all poses share.
     at_rest : bool
         Whether the fit came to rest.
+    probe : ProbePrior
+        Standard deviations of the probe, rms over its terms of each kind.
     blocks : Gaussian
         Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
         They serve to register another map of the same magnet: what permeable blocks answer to a
@@ -165,6 +214,7 @@ class Registration:
     held_out_nominal_rms_T: Floats
     log_evidence: float
     at_rest: bool
+    probe: ProbePrior
     blocks: Gaussian = dataclasses.field(repr=False)
 
     @property

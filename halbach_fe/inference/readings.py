@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -9,7 +10,7 @@ from functools import reduce
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import Map
@@ -24,6 +25,19 @@ from halbach_fe.measurement.observation import (
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.model import Study
+
+ROUNDED = 12
+"""Decimals, in m and T, to which readings are compared: two ways of adding up the same readings
+differ in the last bits."""
+
+
+MOVED_M = 1e-4
+"""Largest move of a reading for which its noise stays the same. The noise of uncertain positions
+is that of the field's gradient, which changes by 1 % over this way if it changes over 10 mm."""
+
+Noises = dict[str, tuple[Floats, NoiseCovariance]]
+"""Points (n, 3) in m and noise of the readings of a map, by its name."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +66,16 @@ class Readings:
         return np.array(self.parts) == TRAINING
 
 
-def read_campaign(magnet: Magnet, maps: Sequence[Map]) -> Readings:
+def read_campaign(magnet: Magnet, maps: Sequence[Map], known: Noises | None = None) -> Readings:
     """Return the readings of all maps, by the instrument of each.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    maps : sequence of Map
+    known : dict, optional
+        Noise of the same maps with little other poses, which is not computed again; what is
+        computed is added.
 
     Raises
     ------
@@ -63,17 +85,55 @@ def read_campaign(magnet: Magnet, maps: Sequence[Map]) -> Readings:
         If a map does not fit the study.
     """
     several = sum(not one.is_validation for one in maps) > 1
-    found = reduce(_stacked, (_read(magnet, one, several) for one in maps))
-    heights = found.observation.points[:, 2]
-    if magnet.dimension == 2 and np.ptp(heights) > 0:
+    noises = {} if known is None else known
+    found = [_read(magnet, one, several, noises) for one in maps]
+    if magnet.dimension == 2:
+        heights = np.concatenate([each.observation.points[:, 2] for each in found])
+        _check_plane(heights, "map")
+    return reduce(_stacked, found)
+
+
+def _check_plane(heights: Floats, where: str) -> None:
+    """Raise a MeasurementError if the points of a 2D study are at several heights."""
+    if np.ptp(heights) > 0:
         raise MeasurementError(must_be(
-            "points", "map", "in one plane for a 2D study",
+            "points", where, "in one plane for a 2D study",
             f"z from {heights.min():g} to {heights.max():g} m",
             "Use a 3D study, or one circle of the map."))
-    return found
 
 
-def _read(magnet: Magnet, one: Map, several: bool) -> Readings:
+def check_validation_map(readings: Readings, study: Study) -> None:
+    """Refuse a held-out map of readings that update the model: it is no test of it.
+
+    Raises
+    ------
+    MeasurementError
+        If all of its readings are in the map that updates the model.
+
+    Warns
+    -----
+    HalbachWarning
+        If some are.
+    """
+    observation = readings.observation
+    places = np.column_stack([observation.positions, readings.values]).round(ROUNDED)
+    rows = list(zip(observation.labels, map(tuple, places.tolist()), strict=True))
+    training = {row for row, part in zip(rows, readings.parts, strict=True) if part == TRAINING}
+    own = [row for row, part in zip(rows, readings.parts, strict=True) if part == HELD_OUT_MAP]
+    others = {row for row, part in zip(rows, readings.parts, strict=True) if part != HELD_OUT_MAP}
+    shared = sum(row in training for row in own)
+    if own and others.issuperset(own):
+        raise MeasurementError(must_be(
+            "--held-out", f"study {study.name}", "a map of other readings than those that update "
+            "the model", "the same readings", "Hold back readings before the "
+            "update (`inference.held_out`), or leave --held-out out."))
+    if shared:
+        warnings.warn(
+            f"{shared} of {len(own)} readings of the held-out map update the model too: their "
+            "predictions are no test.", HalbachWarning, stacklevel=2)
+
+
+def _read(magnet: Magnet, one: Map, several: bool, noises: Noises) -> Readings:
     """Return the readings of a map; ``several`` puts its name into error messages and regions."""
     study, where = one.study, one.name if one.is_validation or not several else f"map {one.name}"
     magnet = magnet.with_study(study)
@@ -81,7 +141,13 @@ def _read(magnet: Magnet, one: Map, several: bool) -> Readings:
     measured = ~np.isnan(data["B_T"].values)
     if not one.is_validation:
         measured &= ~excluded_components(study, data.sizes["point"])
+    if not np.any(data["B_T"].values[measured]):
+        raise MeasurementError(must_be(
+            "flux densities", where, "those of a magnet", "zero at all points",
+            "Was the probe connected? Correct the map."))
     observation = observe(study, points_of(data), measured, where)
+    if magnet.dimension == 2:
+        _check_plane(observation.points[:, 2], where)
     inside = magnet.contains(observation.points)
     if inside.any():
         first = int(np.argmax(inside))
@@ -106,7 +172,10 @@ def _read(magnet: Magnet, one: Map, several: bool) -> Readings:
         single = len(set(regions)) == 1
         regions = tuple(one.name if single else f"{one.name}: {region}" for region in regions)
     values = observation.read(np.nan_to_num(remove_nonlinear_part(study.instrument, data)))
-    return Readings(observation, values, reading_noise(magnet, observation, data), parts, regions,
+    points = noises[one.name][0] if one.name in noises else np.inf
+    if np.abs(observation.points - points).max() > MOVED_M:
+        noises[one.name] = observation.points, reading_noise(magnet, observation, data)
+    return Readings(observation, values, noises[one.name][1], parts, regions,
                     (one.name,) * len(observation))
 
 

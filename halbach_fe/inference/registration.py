@@ -25,12 +25,16 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
-from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
+from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS
+
+SAME_TURN = 0.1
+"""Angle in rad up to which a map is turned like another on its stage: more than the error of the
+search, and far less than between poses that a symmetric magnet makes equal."""
 
 
 def register(
@@ -74,7 +78,8 @@ def register(
     Raises
     ------
     MeasurementError
-        If no pose puts the map's points in air, or no pose explains half of its field.
+        If no pose puts the map's points in air, no pose explains half of its field, or none is
+        turned as it is known to be.
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
     """
@@ -87,6 +92,8 @@ def register(
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0])
     starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
     starts = starts[:most]
+    if prior.stage is not None and starts:
+        starts = _on_stage(starts, prior.stage)
     if not starts:
         raise MeasurementError(must_be(
             "map", "registration", "one that fits into the bore, or beside the magnet",
@@ -108,6 +115,20 @@ def register(
         found += [each for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]
     return sorted(found, key=lambda each: -each.log_evidence)
+
+
+def _on_stage(starts: Sequence[Floats], stage: StagePose) -> list[Floats]:
+    """Return the poses (6,) on a stage near those that are turned like another map on it."""
+    apart = [float((Rotation.from_rotvec(each[3:]) * stage.turn.inv()).magnitude())
+             for each in starts]
+    found = [stage.nearest(each) for each, angle in zip(starts, apart, strict=True)
+             if angle < SAME_TURN]
+    if not found:
+        raise MeasurementError(must_be(
+            "map", "registration", "turned like the one before it on the same stage",
+            f"turned by {np.degrees(min(apart)):.2g}° against it",
+            "Leave `stage` out, or check the axes of both files."))
+    return found
 
 
 def _same(one: Registration, other: Registration) -> bool:

@@ -48,6 +48,15 @@ TOO_NEAR = 0.1
 three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
 
 
+TOO_FAR = 25.0
+"""chi-squared per held-out reading beyond which noise or model are wrong: five standard deviations
+even if all predictions err alike, as they do where one combination of parameters is uncertain."""
+
+FEWEST_LEFT = 20
+"""Readings beyond the parameters learnt from which their noise is judged. chi-squared of 20 is
+below a tenth of its mean with a probability of 1e-9."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """The distribution of the readings that a model predicts, without their noise.
@@ -69,17 +78,39 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class MapPose:
+    """Where a map lies in the magnet, as the update found it.
+
+    Attributes
+    ----------
+    name : str
+        Of the map.
+    middle_m, middle_sd_m : tuple of float
+        Middle of its points in the magnet's axes, and the standard deviations.
+    turn_sd_rad : tuple of float
+        Standard deviations of its turn about each axis of the magnet.
+    """
+
+    name: str
+    middle_m: tuple[float, float, float]
+    middle_sd_m: tuple[float, float, float]
+    turn_sd_rad: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class InstrumentTerms:
     """Terms of the instruments that were estimated together with the magnetizations.
 
     Attributes
     ----------
     names : tuple of str
-        Such as ``fringe.translation_x_m``, after the name of a map or a probe.
+        Such as ``fringe.translation_x_m``, after the name of a map, a stage or a probe.
     change, sd, prior_sd : ndarray, shape (terms,)
         Change from what the study says, and standard deviations after and before.
     at_rest : bool
         Whether the last update changed no term by more than a part of its standard deviation.
+    poses : tuple of MapPose
+        Where the maps lie whose poses are among the terms.
     """
 
     names: tuple[str, ...]
@@ -87,6 +118,7 @@ class InstrumentTerms:
     sd: Floats
     prior_sd: Floats
     at_rest: bool
+    poses: tuple[MapPose, ...]
 
 
 @dataclass(frozen=True)
@@ -208,8 +240,9 @@ class InferenceResult(ShownInNotebook):
     kind : {"closed form", "linearized", "samples"}
         How the posterior was computed: in closed form, by linearization of the iron, or by Markov
         chains.
-    measured_blocks : int or None
-        Number of measured blocks from which the prior follows; None if it is the study's prior.
+    measured_blocks : tuple of str or None
+        Serial numbers of the measured blocks from which the prior follows; None if it is the
+        study's prior.
     left_out : float
         Upper bound of the relative change of a posterior variance by discarded information, see
         `halbach_fe.stats.linear_gaussian.LinearPosterior`.
@@ -245,7 +278,7 @@ class InferenceResult(ShownInNotebook):
     parameters_learnt: float
     log_evidence: float
     kind: Literal["closed form", "linearized", "samples"]
-    measured_blocks: int | None = None
+    measured_blocks: tuple[str, ...] | None = None
     left_out: float = 0.0
     terms: InstrumentTerms | None = None
     overlaps: tuple[Overlap, ...] = ()
@@ -342,19 +375,59 @@ class InferenceResult(ShownInNotebook):
     @property
     def disagreement(self) -> str:
         """Sentences if prior, model and maps cannot all be right, else an empty string."""
-        found = [self._conflict, *(each.disagreement for each in self.overlaps)]
+        found = [self._conflict or self.too_near, self._held_out_conflict,
+                 *(each.disagreement for each in self.overlaps)]
         return " ".join(sentence for sentence in found if sentence)
+
+    @cached_property
+    def noise_ratio(self) -> float:
+        """Variance that the update leaves of the training readings, over that of their noise.
+
+        It is 1 on average if the noise is right, whatever the prior: of n readings an update
+        explains as much as belongs to the parameters that it learns. The solver's error does not
+        count as noise here. NaN if fewer than `FEWEST_LEFT` readings are left.
+        """
+        training = ~self.held_out
+        count = float(training.sum()) - self.parameters_learnt
+        if count < FEWEST_LEFT:
+            return np.nan
+        left = self.noise.subset(training).whiten(
+            (self.readings - self.prediction_posterior.mean)[training])
+        return float(left @ left) / count
+
+    @property
+    def too_near(self) -> str:
+        """A sentence if noise or prior are stated too large, else an empty string."""
+        chi2 = self.prior_conflict
+        if chi2 < TOO_NEAR:
+            return (f"The readings are {_times_nearer(chi2)} times nearer to the "
+                    "model than their noise and the prior allow (chi² per reading is "
+                    f"{chi2:.2g}, where 1 is expected): the study's sigma_T, position_sd_m or prior"
+                    " is too large, so that error bars are too wide. Run `halbach-fe check` for the"
+                    " noise of the map.")
+        if self.noise_ratio < TOO_NEAR:
+            return (f"The updated model is {_times_nearer(self.noise_ratio)} times nearer to the "
+                    "readings than their noise allows: the study's sigma_T or position_sd_m is too "
+                    "large, so that error bars are too wide. Run `halbach-fe check` for the noise "
+                    "of the map.")
+        return ""
+
+    @property
+    def _held_out_conflict(self) -> str:
+        """A sentence if held-out readings are far from their predictions, else nothing."""
+        if not self.held_out.any():
+            return ""
+        chi2 = float(np.mean(self.standardized(self.prediction_posterior)[self.held_out]**2))
+        if chi2 <= TOO_FAR:
+            return ""
+        return (f"Held-out readings are {np.sqrt(chi2):.3g} times farther from their predictions "
+                "than these and the noise allow: sigma_T is too small, or an effect is missing "
+                "from the model, so that its error bars are too small.")
 
     @property
     def _conflict(self) -> str:
         """A sentence if prior, model and readings cannot all be right, else an empty string."""
         chi2 = self.prior_conflict
-        if chi2 < TOO_NEAR:
-            return (f"The readings are {1 / np.sqrt(max(chi2, 1e-300)):.3g} times nearer to the "
-                    "model than their noise and the prior allow (chi² per reading is "
-                    f"{chi2:.2g}, where 1 is expected): the study's sigma_T, position_sd_m or prior"
-                    " is too large, so that error bars are too wide. Run `halbach-fe check` for the"
-                    " noise of the map.")
         if chi2 <= self.conflict_limit:
             return ""
         free = self.prior.sd > 0  # a missing block has no parameters to change
@@ -448,3 +521,8 @@ class InferenceResult(ShownInNotebook):
                 f"chi2_{name}": float(
                     np.mean(self.whitened(prediction, chosen) ** 2)) if unseen else None}
         return RegionScore(region=region, part=part, readings=int(chosen.sum()), **figures)
+
+
+def _times_nearer(chi2: float) -> str:
+    """Return how many times residuals are smaller than expected, as text."""
+    return f"{1 / np.sqrt(max(chi2, 1e-300)):.3g}"

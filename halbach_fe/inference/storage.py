@@ -13,13 +13,14 @@ import xarray as xr
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.files import write_text
-from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.tables import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
+from halbach_fe.study.model import Study, magnet_description
 
 WRITTEN_COVARIANCE = 2000
 """Largest number of parameters for which the full covariance (then 32 MB) is written too."""
@@ -35,7 +36,7 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
         if len(update.response.parameters) <= WRITTEN_COVARIANCE:
             magnetization[f"{name}_covariance"] = (
                 ("parameter", "parameter_2"), distribution.covariance, {"units": "A2/m2"})
-    write_hdf5(magnetization, folder / "posterior.h5")
+    write_hdf5(with_checksum(magnetization), folder / "posterior.h5")
     readings = update.predictions
     write_text(folder / "prediction.csv", csv_text(
         {str(name): readings[name].values for name in PREDICTION_COLUMNS}))
@@ -50,27 +51,49 @@ def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
     ------
     MeasurementError
         If the file cannot be read as a posterior.h5, or belongs to another magnet.
+    OutputError
+        If its content is not what was written.
     """
-    nominal = magnet.nominal_magnetization
     distributions: dict[str, Gaussian] = {}
     try:
-        data = untrusted.read_dataset(path)
+        data = read_hdf5(path)
         own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
+        study = Study.model_validate_json(data.attrs["study"])
         for name in ("prior", "posterior"):
             distributions[name] = Gaussian(
                 untrusted.finite_array(data[f"{name}_mean"], own.shape),
                 _read_root(data, name, distributions.get("prior"), len(own)))
-    except (OSError, KeyError, ValueError, TypeError):
+    except ChangedContentError as error:
+        raise OutputError(must_be(
+            "--posterior", str(path), "as halbach-fe infer wrote it", f"a changed file: {error}",
+            "Run halbach-fe infer again.")) from None
+    except (OSError, KeyError, ValueError, TypeError, RecursionError):
         raise MeasurementError(must_be(
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
             "a file that cannot be read as such")) from None
+    nominal = magnet.nominal_magnetization
     if magnet.study.prior.variation_sd:  # amplitudes of variations are 0 in the nominal magnet
         nominal = np.concatenate([nominal, np.zeros(max(0, len(own) - len(nominal)))])
-    if own.shape != nominal.shape or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6):
+    key = _different_key(magnet_description(magnet.study), magnet_description(study))
+    if key is None and (own.shape != nominal.shape
+                        or not np.allclose(own, nominal, rtol=1e-9, atol=1e-6)):
+        key = "array"  # the data of a grade or of a table have changed
+    if key is not None:
         raise MeasurementError(must_be(
             "--posterior", str(path), f"that of the magnet of study {magnet.name}",
-            "that of another nominal magnet", "Use the study of that inference."))
+            f"that of another magnet, with another `{key}`", "Use the study of that inference."))
     return distributions
+
+
+def _different_key(expected: Any, found: Any) -> str | None:
+    """Return the first dotted key whose values differ between two trees of plain data, or None."""
+    if isinstance(expected, dict) and isinstance(found, dict):
+        for name in expected | found:
+            inner = _different_key(expected.get(name), found.get(name))
+            if inner is not None:
+                return f"{name}.{inner}".rstrip(".")
+        return None
+    return None if expected == found else ""
 
 
 def _stored_root(name: str, distribution: Gaussian, prior: Gaussian) -> dict[str, Any]:
@@ -131,7 +154,7 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "held_out": int(update.held_out.sum()),
         "parameters": len(update.response.parameters),
         "posterior": update.kind,
-        "measured_blocks": update.measured_blocks,
+        "measured_blocks": None if update.measured_blocks is None else len(update.measured_blocks),
         "superposition_error": update.response.superposition_error,
         "largest_solver_error_T": float(update.response.error.max()),
         "largest_solver_error_over_noise": float((update.response.error / update.noise.sd).max()),
@@ -150,6 +173,9 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
             for name, change, sd, prior_sd in zip(
                 update.terms.names, update.terms.change, update.terms.sd, update.terms.prior_sd,
                 strict=True)},
+        "poses": None if update.terms is None else {
+            pose.name: {key: value for key, value in asdict(pose).items() if key != "name"}
+            for pose in update.terms.poses},
         "instrument_at_rest": None if update.terms is None else update.terms.at_rest,
         "overlaps": [asdict(each) | {"disagreement": each.disagreement}
                      for each in update.overlaps],

@@ -17,18 +17,23 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.core.files import atomic, file_bytes
+from halbach_fe.core.files import as_path, atomic, file_bytes
 from halbach_fe.measurement.tables import check_columns, csv_table, finite, write_csv
 
 MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
-REQUIRED_COLUMNS = ("serial", "type", *MOMENT_COLUMNS, "sigma_A_m2")
-COLUMNS = (*REQUIRED_COLUMNS[:2], "ring", "slot", *REQUIRED_COLUMNS[2:], "volume_m3",
-           "temperature_C")
+REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")
+COLUMNS = ("serial", "type", "ring", "slot", *REQUIRED_COLUMNS[1:], "volume_m3", "temperature_C")
 
 MAX_PLACE = 100_000
 """Largest number of a ring or slot."""
+SMALLEST_SIGMA = 1e-9
+"""Smallest standard deviation of a moment, relative to the moment: no coil is as exact, and the
+square of a far smaller one is zero."""
 MAX_MOMENT = 1e12
 """Largest moment in A m^2. Larger values are unphysical, and their squares may overflow."""
+COLDEST_C, HOTTEST_C = -200.0, 200.0
+"""Range of temperatures at which moments are measured: from liquid nitrogen to far above any
+laboratory, but below room temperature in kelvin."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,8 @@ class BlockTable:
     Attributes
     ----------
     serial, type : tuple of str
-        Serial number, unique in the table, and type of each block.
+        Serial number, unique in the table, and type of each block; the type may be empty if the
+        place is known, since it follows from the place.
     ring, slot : ndarray of int, shape (n,)
         Place in the magnet, counted from 1; both 0 if the place is not known.
     moment : ndarray, shape (n, 3), in A m^2
@@ -89,7 +95,8 @@ def read_blocks(path: str | Path) -> BlockTable:
     """Read and validate a table of measured blocks.
 
     The header names the columns of `COLUMNS` in any order. The columns ring, slot, volume_m3 and
-    temperature_C may be missing or have empty cells. Lines ``# key: value`` are attributes.
+    temperature_C may be missing or have empty cells, type too if ring and slot are given. Lines
+    ``# key: value`` are attributes.
 
     Parameters
     ----------
@@ -112,7 +119,7 @@ def read_blocks(path: str | Path) -> BlockTable:
     >>> len(hf.read_blocks("blocks.csv"))
     16
     """
-    path = Path(path)
+    path = as_path(path)
     where = f"block table {path}"
     attributes, header, rows = csv_table(file_bytes(path, where), where)
     check_columns(header, COLUMNS, where)
@@ -127,16 +134,15 @@ def read_blocks(path: str | Path) -> BlockTable:
             empty if empty is not None and not row.get(name)
             else finite(row[name], f"{name} in line {number}", where) for number, row in lines])
 
-    def texts(name: str) -> tuple[str, ...]:
-        for number, row in lines:
-            if not row[name] or row[name].startswith("#"):  # `write_blocks` would make it a comment
-                raise MeasurementError(must_be(f"{name} in line {number}", where,
-                                               "given, and not begin with #",
-                                               f"'{row[name]}'" if row[name] else "an empty cell"))
-        return tuple(row[name] for _, row in lines)
-
+    for number, row in lines:
+        serial = row["serial"]
+        if not serial or serial.startswith("#"):  # `write_blocks` would make it a comment
+            raise MeasurementError(must_be(f"serial in line {number}", where,
+                                           "given, and not begin with #",
+                                           f"'{serial}'" if serial else "an empty cell"))
     return BlockTable(
-        texts("serial"), texts("type"), _whole(numbers("ring", 0.0), "ring", lines, where),
+        tuple(row["serial"] for _, row in lines), tuple(row.get("type", "") for _, row in lines),
+        _whole(numbers("ring", 0.0), "ring", lines, where),
         _whole(numbers("slot", 0.0), "slot", lines, where),
         np.column_stack([numbers(name) for name in MOMENT_COLUMNS]), numbers("sigma_A_m2"),
         numbers("volume_m3", np.nan), numbers("temperature_C", np.nan), attributes, where)
@@ -197,8 +203,17 @@ def _check(table: BlockTable) -> None:
         if table.volume[number] <= 0:  # False for NaN, an unknown volume
             refuse(number, "volume_m3", "positive", f"{table.volume[number]:g}",
                    "Leave it empty if it is not known.")
-        if np.isinf(table.volume[number]) or np.isinf(table.temperature[number]):
-            refuse(number, "volume and temperature", "finite numbers", "an infinite value")
+        if np.isinf(table.volume[number]):
+            refuse(number, "volume_m3", "a finite number", "an infinite value")
+        if not np.isnan(table.temperature[number]) and not (
+                COLDEST_C <= table.temperature[number] <= HOTTEST_C):
+            refuse(number, "temperature_C", f"from {COLDEST_C:g} to {HOTTEST_C:g} °C",
+                   f"{table.temperature[number]:g}", "Is it in kelvin?")
+        if table.sigma[number] < SMALLEST_SIGMA * size[number]:
+            refuse(number, "sigma_A_m2", f"at least {SMALLEST_SIGMA:g} of the moment of "
+                   f"{size[number]:g} A m^2", f"{table.sigma[number]:g}")
+        if not (table.type[number] or table.ring[number]):
+            refuse(number, "type", "given, or its ring and slot", "neither")
         if (table.ring[number] > 0) != (table.slot[number] > 0):
             refuse(number, "place", "ring and slot together", "only one of the two",
                    "Leave both empty if the place is not known.")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import points_of, read_map
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
 from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.model import Study
@@ -33,12 +33,18 @@ class Map:
     study : Study
         The study of this map alone.
     middle_m : ndarray, shape (3,)
-        Middle of its points in the coordinates that the map states, which the uncertain pose
-        shifts and turns about.
+        Middle of its points in the coordinates that the map states.
+    pivot_m : ndarray, shape (3,)
+        The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
+        middle, or that of the first map on the same stage.
     probe : str
         Name of its probe. Maps of one probe share its terms.
     pose : str
-        Name of the map whose pose it shares, mostly its own.
+        Name of the stage or of the map whose pose it shares, mostly its own.
+    offsets : str
+        Name of the map whose offsets and drift it has, mostly its own.
+    shift_sd_m : tuple of float
+        Prior standard deviations of an own shift along the axes of the stage.
     is_validation : bool
         Whether it is predicted but does not update the model.
     """
@@ -47,8 +53,11 @@ class Map:
     data: xr.Dataset
     study: Study
     middle_m: Floats
+    pivot_m: Floats
     probe: str
     pose: str
+    offsets: str
+    shift_sd_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     is_validation: bool = False
 
 
@@ -84,17 +93,21 @@ def read_maps(study: Study, folder: str | Path = ".") -> dict[str, xr.Dataset]:
     >>> list(hf.read_maps(study))
     ['body']
     """
+    return different_maps(study, {one.name: Path(folder) / one.file for one in study.maps})
+
+
+def different_maps(study: Study, files: Mapping[str, Path]) -> dict[str, xr.Dataset]:
+    """Read the files of a study's maps, by name, as `read_maps` does."""
     found: dict[str, xr.Dataset] = {}
-    for one in study.maps:
-        data = read_map(Path(folder) / one.file)
+    for own, file in files.items():
+        data = read_map(file)
         for name, other in found.items():
-            if np.array_equal(points_of(data), points_of(other)) and np.array_equal(
-                    data["B_T"].values, other["B_T"].values, equal_nan=True):
+            if _same_readings(data, other):
                 raise MeasurementError(must_be(
-                    f"`maps` '{one.name}' and '{name}'", f"study {study.name}",
+                    f"`maps` '{own}' and '{name}'", f"study {study.name}",
                     "different maps, as the same readings must not count twice",
                     "files with the same readings", "Remove one of them."))
-        found[one.name] = data
+        found[own] = data
     return found
 
 
@@ -117,34 +130,57 @@ def maps_of(
     StudyError
         If the study lists maps but a single one is given, or the other way round.
     """
+    check_maps(study, data)
+    if isinstance(data, xr.Dataset):
+        middle = _middle(study, data)
+        found = [Map(ONLY_MAP, data, study, middle, middle, ONLY_MAP, ONLY_MAP, ONLY_MAP)]
+    else:
+        found = []
+        for number, one in enumerate(study.maps):
+            own = study.of_map(number)
+            middle = _middle(own, data[one.name])
+            found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
+                             one.stage or one.name, one.name, one.stage_shift_sd_m))
+    if validation_map is not None:
+        own = study_for_validation_map(study.with_(maps=()), validation_map)
+        first = found[0]
+        shared = not study.maps  # with the only map; among several it has an instrument of its own
+        middle = _middle(own, validation_map)
+        found.append(Map(
+            VALIDATION_MAP, validation_map, own, middle, middle, *(
+                (first.probe, first.pose, first.offsets) if shared else (VALIDATION_MAP,) * 3),
+            is_validation=True))
+    return with_pivots(found)
+
+
+def check_maps(study: Study, data: xr.Dataset | Mapping[str, xr.Dataset]) -> None:
+    """Raise a StudyError if the maps that are given are not those that a study lists."""
     if isinstance(data, xr.Dataset):
         if study.maps:
             raise StudyError(must_be(
                 "`maps`", f"study {study.name}", "left out, or the only maps of the campaign",
                 "a list, and another map beside it",
                 "Read the listed maps (in Python by read_maps), or remove the list."))
-        found = [Map(ONLY_MAP, data, study, _middle(study, data), ONLY_MAP, ONLY_MAP)]
-    else:
-        if list(data) != [one.name for one in study.maps] or not data:
-            raise StudyError(must_be(
-                "`maps`", f"study {study.name}", "those that are given, by name",
-                f"{', '.join(one.name for one in study.maps) or 'none'} for "
-                f"{', '.join(data) or 'none'}", "Read them by read_maps."))
-        found = []
-        for number, one in enumerate(study.maps):
-            own = study.of_map(number)
-            found.append(Map(one.name, data[one.name], own, _middle(own, data[one.name]),
-                             one.probe or one.name, one.name))
-    if validation_map is not None:
-        own = study_for_validation_map(study.with_(maps=()), validation_map)
-        first = found[0]
-        shared = not study.maps  # with the only map; among several it has an instrument of its own
-        found.append(Map(
-            VALIDATION_MAP, validation_map, own,
-            first.middle_m if shared else _middle(own, validation_map),
-            first.probe if shared else VALIDATION_MAP, first.pose if shared else VALIDATION_MAP,
-            is_validation=True))
-    return found
+    elif list(data) != [one.name for one in study.maps] or not data:
+        raise StudyError(must_be(
+            "`maps`", f"study {study.name}", "those that are given, by name",
+            f"{', '.join(one.name for one in study.maps) or 'none'} for "
+            f"{', '.join(data) or 'none'}", "Read them by read_maps."))
+
+
+def with_pivots(maps: Sequence[Map]) -> list[Map]:
+    """Return maps that turn about the middle of the first one of their stage."""
+    first = {one.pose: one for one in reversed(maps)}
+    return [one if first[one.pose] is one else
+            replace(one, pivot_m=_seen_from(one.study, first[one.pose])) for one in maps]
+
+
+def _same_readings(one: xr.Dataset, other: xr.Dataset) -> bool:
+    """Tell whether two maps have the same B at the same points, in whatever order."""
+    rows = [np.column_stack([points_of(data), np.nan_to_num(data["B_T"].values, nan=np.inf)])
+            for data in (one, other)]
+    first, second = (each[np.lexsort(each.T)] for each in rows)
+    return np.array_equal(first, second)
 
 
 def with_paths_from(study: Study, before: Path, after: Path) -> Study:
@@ -169,6 +205,14 @@ def refuse_open_instruments(study: Study, verb: str) -> None:
         raise StudyError(must_be(
             "`instrument_sd`", f"study {study.name}", f"left out, for {verb}", "a table",
             "State the instrument that halbach-fe infer found (study.updated.toml) without it."))
+
+
+def _seen_from(study: Study, first: Map) -> Floats:
+    """Return the middle (3,) in m of the first map on a stage, in the coordinates of another."""
+    one, other = first.study.instrument, study.instrument
+    place = turn_of(one).apply(first.middle_m) + one.translation_m
+    return np.asarray(turn_of(other).inv().apply(
+        place - other.translation_m))
 
 
 def _middle(study: Study, data: xr.Dataset) -> Floats:

@@ -13,6 +13,8 @@ scans and attributes.
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be
-from halbach_fe.core.files import _write_bytes, atomic, file_bytes
+from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.measurement.tables import (
     _check_printable,
@@ -33,12 +35,15 @@ from halbach_fe.measurement.tables import (
     finite,
     write_csv,
 )
-from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
 SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
 OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
+FOREIGN = ("A table with other columns, other separators or no header is converted by `halbach-fe "
+           "import-map`, whose options say what its columns are; `infer` takes them too.")
+"""Advice for a map that is not in halbach-fe's own columns."""
 MAX_FIELD_T = 10.0
 """Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
 probably in mT or G."""
@@ -59,6 +64,16 @@ def field_map(
     if sigma is not None:
         data["sigma_T"] = (("point", "component"), np.array(sigma, float), {"units": "T"})
     return data
+
+
+def readings_sha256(data: xr.Dataset) -> str:
+    """Return the SHA-256 of the points and readings of a map, in whatever format it is stored.
+
+    Two maps have the same value if they have the same numbers in the same order.
+    """
+    values = np.column_stack([points_of(data), np.asarray(data["B_T"].values, dtype=float)])
+    values[np.isnan(values)] = np.nan  # NaN and zero have several binary forms
+    return hashlib.sha256(np.ascontiguousarray(values + 0.0).astype("<f8").tobytes()).hexdigest()
 
 
 def points_of(data: xr.Dataset) -> Floats:
@@ -116,12 +131,12 @@ def read_map(path: str | Path) -> xr.Dataset:
     >>> hf.read_map("map.csv")["B_T"].dims
     ('point', 'component')
     """
-    path = Path(path)
+    path = as_path(path)
     raw = file_bytes(path, f"map {path}")
     if path.suffix in (".h5", ".hdf5", ".nc"):
         data = _read_hdf5(path)
     else:
-        data = _read_vtu(path) if path.suffix == ".vtu" else _read_csv(raw, path)
+        data = _read_vtu(raw, path) if path.suffix == ".vtu" else _read_csv(raw, path)
     check_readings(data, path)
     data.encoding["source"] = str(path)
     return data
@@ -177,10 +192,13 @@ def _read_hdf5(path: Path) -> xr.Dataset:
     return data
 
 
-def _read_vtu(path: Path) -> xr.Dataset:
+def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
-        mesh = untrusted.read_mesh(path)
+        with tempfile.NamedTemporaryFile(suffix=".vtu") as copy:  # meshio opens files by their name
+            copy.write(raw)
+            copy.flush()
+            mesh = untrusted.read_mesh(Path(copy.name))
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
         if "time_s" in mesh.point_data:
             data["time_s"] = ("point", mesh.point_data["time_s"])
@@ -192,7 +210,11 @@ def _read_vtu(path: Path) -> xr.Dataset:
 
 def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
-    attributes, header, rows = csv_table(raw, where)
+    attributes, header, rows = csv_table(raw, where, FOREIGN)
+    if not {*POSITION_COLUMNS, *FIELD_COLUMNS}.intersection(header):
+        raise MeasurementError(must_be(
+            "header", where, f"complete with {', '.join(POSITION_COLUMNS)}, and at least one of "
+            f"{', '.join(FIELD_COLUMNS)}", ",".join(header), FOREIGN))
     _check_header(header, where)
     table: dict[str, list[float]] = {name: [] for name in header}
     scans: list[str] = []
@@ -262,7 +284,7 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
 
 
 def check_magnitudes(data: xr.Dataset) -> None:
-    """Raise MeasurementError if a map's values are too large to be in m and T.
+    """Raise MeasurementError if a map's values are too large to be in m and T, or sigmas absurd.
 
     The study, not the map, states the units of the file; see `in_si_and_magnet_axes` in
     `halbach_fe.measurement.instrument`.
@@ -280,6 +302,13 @@ def check_magnitudes(data: xr.Dataset) -> None:
             "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             "study."))
+    if "sigma_T" in data:
+        sigma = data["sigma_T"].values[~np.isnan(data["B_T"].values)]
+        for extreme in (sigma.max(), sigma.min()):
+            if not MIN_SIGMA_T <= extreme <= MAX_SIGMA_T:
+                raise MeasurementError(must_be(
+                    "sigma", where, f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T", f"{extreme:g}",
+                    "Correct it, or instrument.flux_density_unit_T of the study."))
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
@@ -143,6 +144,11 @@ def eccentricity_shift(points: Floats) -> Floats:
     """
     away = radial_direction(points) * (np.hypot(points[:, 0], points[:, 1]) > 0)[:, None]
     return np.stack([away[:, [0]] * away, away[:, [1]] * away])
+
+
+def turn_of(instrument: Instrument) -> Rotation:
+    """Return the turn from the axes that a map states to those of the magnet."""
+    return Rotation.from_rotvec(instrument.rotation_rad)
 
 
 def sensor_matrix(instrument: Instrument) -> Floats:

@@ -14,27 +14,41 @@ magnet is as good as that of the magnet).
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import permutations, product
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import linalg
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, fit_readings
+from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields
+from halbach_fe.measurement.probe_in_field import (
+    FEW_ITERATIONS,
+    GAINS,
+    LAG,
+    NEXT_ITERATIONS,
+    OFFSETS,
+    TURNS,
+    ProbeFit,
+    ProbeModel,
+    fit_probe,
+    noise_of,
+)
 from halbach_fe.measurement.scan_lines import (
     HELD_OUT_EVERY,
     held_out_lines,
     point_spacing,
     scan_lines,
 )
+from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, spikes
 from halbach_fe.study.types import COMPONENTS
+
+SMALLEST_FIELD_T = 1e-12
+"""Largest field of a map that is no measurement: SQUIDs resolve it, no probe of a magnet does."""
 
 FEWEST_POINTS = 30
 """Smallest number of complete readings that are checked."""
@@ -50,6 +64,13 @@ GAPS = (1.5, 2.5, 4.0)
 bore of 46 mm that was mapped to 18 mm in steps of 5 mm, 1.5 left 0.6 mT of held-out lines and 1.0
 left 1.9 mT."""
 
+PREDICTS = 1.02
+"""Factor by which the error of lines that are left out must grow without a change of the instrument
+for it to be kept. Without any drift it changed by -2 % to +1.3 % in four maps of 315 points."""
+
+CHANGING = (GAINS, OFFSETS, TURNS)
+"""Parameters that change during the scan."""
+
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
@@ -58,41 +79,9 @@ WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
 
-ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
-"""Largest number of steps of the fit of field and instrument, while orientations are tried, and
-from a fit of nearly the same readings."""
-
-SPIKE = 12.0
-"""A reading is a spike if its residual is larger than this multiple of the standard deviation of
-the residuals around it and of all, both from their medians."""
-
-ROUNDING = 1e-13
-"""Added to the information of the amplitudes, relative to its mean, so that maps without noise have
-positive definite matrices too."""
-
-HALVINGS = 8
-"""Number of times that a step is halved until it improves the fit."""
-
-AT_REST = 1.0
-"""Decrease of chi-squared below which the fit is at rest, of thousands of readings."""
-
-NEIGHBOURS = 26
-"""Number of neighbours of a reading, as many as a point of a grid has."""
-
-ROUGH = 1.8
-"""Multiple of the largest residual around a row that is far off a function through its neighbours.
-A single spike is 2 to 4 times as far off its own as off theirs."""
-
-ROUGH_ROUNDS = 10
-"""Number of times that spikes are looked for among the rows that are left."""
-
 PLAUSIBLE = 4.0
 """Prior standard deviations beyond which no instrument is. Such a fit explains what is no error of
 an instrument."""
-
-STEEPER = 100.0
-"""Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
-of positions is told from that of readings."""
 
 DETERMINED = 0.5
 """A parameter is determined if its standard deviation is below this part of its prior one."""
@@ -259,20 +248,25 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     True
     """
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
-    broken = _broken_rows(points, field)
+    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+    broken = broken_rows(points, field)
     usable = np.isfinite(field).all(axis=1)
     for rows in broken.values():
         usable[np.array(rows, int) - 1] = False
     if usable.sum() < FEWEST_POINTS:
         raise MeasurementError(must_be(
-            "map", "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
+            where, "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
             "components, neither all zero nor repeated", f"{int(usable.sum())}",
             "A line of one component obeys Maxwell's equations whatever it is."))
     if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
         raise MeasurementError(must_be(
-            "map", "Maxwell's check", "of points in a plane or a volume", "points on a line",
+            where, "Maxwell's check", "of points in a plane or a volume", "points on a line",
             "Along a line any field has div B = 0 and curl B = 0."))
-    rough = _rough_rows(points, field, usable)
+    if np.abs(field[usable]).max() < SMALLEST_FIELD_T:
+        raise MeasurementError(must_be(
+            where, "Maxwell's check", f"of a field of at least {SMALLEST_FIELD_T:g} T somewhere",
+            f"{np.abs(field[usable]).max():.3g} T", "Is it in tesla?"))
+    rough = rough_rows(points, field, usable)
     usable &= ~rough
     lines = scan_lines(points)
     chosen = usable & _some_lines(lines, usable)
@@ -289,27 +283,28 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     gap, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing)
     charges = Charges.around(places, gap)
     turned = field @ matrix.T
-    model = _Model(charges, points, turned, time, directions)
-    train = _fitted(model, train_rows, first_fit)
+    model = ProbeModel(charges, points, turned, time, directions)
+    train = fit_probe(model, train_rows, first_fit)
     # the prior width of the field, now that the instrument no longer counts as noise
     fit = model.fit(train, train_rows)
     say("asking each change of the instrument to predict scan lines")
     model, train = _confirmed(model, train_rows, _held_out(lines, train_rows), fit, train)
-    train = _fitted(model, train_rows, fit, train)
+    train = fit_probe(model, train_rows, fit, train)
     say("fitting all scan lines")
-    whole = _fitted(model, chosen, fit, train)
-    spikes = _spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
+    whole = fit_probe(model, chosen, fit, train)
+    far_off = spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
                      usable)
-    if rough.any() or spikes.any():
-        broken["spike"] = (1 + np.flatnonzero(rough | spikes)).tolist()
-    if spikes.any():
-        usable, chosen = usable & ~spikes, chosen & ~spikes
+    if rough.any() or far_off.any():
+        broken["spike"] = (1 + np.flatnonzero(rough | far_off)).tolist()
+    if far_off.any():
+        usable, chosen = usable & ~far_off, chosen & ~far_off
         held_out = _held_out(lines, chosen)
-        train = _fitted(model, chosen & ~held_out, fit, train)
-        whole = _fitted(model, chosen, fit, train)
+        train = fit_probe(model, chosen & ~held_out, fit, train)
+        whole = fit_probe(model, chosen, fit, train)
     floor = turned[held_out] - model.readings(train, held_out)
     residual = turned - model.readings(whole)
-    noise, displaced = _noise(charges.gradient(points[chosen], whole.amplitudes), residual[chosen])
+    noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes),
+                                residual[chosen])
     (as_given,) = fit_fields(charges, places, [readings])
     given = readings - charges.fields(places) @ as_given.amplitudes
     return MapCheck(
@@ -328,37 +323,6 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
 def _rms(residual: Floats) -> Floats:
     """Return the rms (3,) of residuals (n, 3)."""
     return np.asarray(np.sqrt(np.mean(residual**2, axis=0)))
-
-
-def _rough_rows(
-    points: Floats, field: Floats, usable: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Return the rows that are far off a quadratic function through their neighbours.
-
-    A row that is far off spoils the functions of its neighbours, but less than its own. A field
-    that is steeper than a quadratic function spoils those of neighbours alike.
-    """
-    found = np.zeros(len(points), bool)
-    for _ in range(ROUGH_ROUNDS):
-        rows = np.flatnonzero(usable & ~found)
-        near = _neighbours(points[rows])
-        residual = np.full_like(field, np.nan)
-        for part in np.array_split(np.arange(len(rows)), max(1, len(rows) // 1000)):
-            away = points[rows[near[part]]] - points[rows[part], None]
-            away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
-            x, y, z = np.moveaxis(away, 2, 0)
-            terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x],
-                             axis=2)
-            weights = np.linalg.pinv(terms, rcond=1e-6)[:, 0]  # of the value at the row itself
-            residual[rows[part]] = field[rows[part]] - np.einsum(
-                "nk,nkc->nc", weights, field[rows[near[part]]])
-        size = np.linalg.norm(residual[rows], axis=1)
-        worst = _spikes(points, residual, usable & ~found, 1.0)
-        worst[rows] &= size > ROUGH * size[near].max(axis=1)
-        if not worst.any():
-            break
-        found |= worst
-    return found
 
 
 def _time(data: xr.Dataset, count: int) -> Floats:
@@ -384,16 +348,6 @@ def _some_lines(lines: Ints, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     while every > 1 and every % HELD_OUT_EVERY == 0:
         every += 1
     return np.asarray(lines % every == 0)
-
-
-def _broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
-    """Return the rows that are zero, or repeat the row before them at another position."""
-    zero = (field == 0).all(axis=1)
-    repeated = np.zeros(len(field), bool)
-    repeated[1:] = (field[1:] == field[:-1]).all(axis=1) & (
-        points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
-    return {name: (1 + np.flatnonzero(rows)).tolist()
-            for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
 
 
 def _directions(points: Floats, lines: Ints) -> Floats:
@@ -440,9 +394,9 @@ def _orientation(
         return matrices[left[0]], ()
     every, against = np.ones(len(some), bool), {}
     for number in left.tolist():
-        model = _Model(charges, points[some], field[some] @ matrices[number].T, time[some],
+        model = ProbeModel(charges, points[some], field[some] @ matrices[number].T, time[some],
                        directions[some])
-        fitted = _fitted(model, every, fits[number], iterations=FEW_ITERATIONS)
+        fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
         against[number] = float(3 * len(some) * np.log(fitted.sigma)
                                 + fitted.instrument @ fitted.instrument / 2)
     alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
@@ -458,214 +412,28 @@ def _gap(
     The instrument is fitted with the charges that are farthest away, which are fewest.
     """
     every = np.ones(len(points), bool)
-    models = {gap: _Model(Charges.around(points, gap * spacing), points, field, time, directions)
-              for gap in GAPS}
+    models = {gap: ProbeModel(Charges.around(points, gap * spacing), points, field, time,
+                              directions) for gap in GAPS}
     (perfect,) = fit_fields(models[GAPS[-1]].charges, points, [field])
-    instrument = _fitted(models[GAPS[-1]], every, perfect)
+    instrument = fit_probe(models[GAPS[-1]], every, perfect)
     fitted = {gap: model.fit(instrument, every) for gap, model in models.items()}
     gap = max(fitted, key=lambda each: fitted[each].log_evidence)
     return gap * spacing, fitted[gap]
 
 
-# --- field and instrument -----------------------------------------------------------------------
-
-WAVES = 4
-"""Number of Legendre polynomials of the time by which the probe turns and its gain drifts."""
-
-SENSORS, MIXING = slice(0, 9), slice(9, 18)
-TURNS = slice(18, 18 + 3 * WAVES)
-OFFSETS = slice(TURNS.stop, TURNS.stop + 3)
-GAINS = slice(OFFSETS.stop, OFFSETS.stop + WAVES)
-LAG = GAINS.stop
-"""Places of the parameters: coordinates of the sensors, elements of the matrix between the axes of
-probe and stage, turns, changes of offsets, changes of the gain, and the lag."""
-
-PREDICTS = 1.02
-"""Factor by which the error of lines that are left out must grow without a change of the instrument
-for it to be kept. Without any drift it changed by -2 % to +1.3 % in four maps of 315 points."""
-
-CHANGING = (GAINS, OFFSETS, TURNS)
-"""Parameters that change during the scan."""
-
-PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 9, *(0.01,) * (3 * WAVES), *(2e-3,) * 3, *(0.01,) * WAVES,
-            1e-3)
-"""Prior standard deviations: in m, 1, rad, of the largest field, 1, and m."""
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """A field together with an instrument.
-
-    Attributes
-    ----------
-    amplitudes : ndarray, shape (k,)
-    instrument : ndarray, shape (p,)
-        In units of `PRIOR_SD`.
-    covariance : ndarray, shape (p, p)
-    sigma : float, in T
-    used : float
-        Number of parameters that the readings determine.
-    prior_sd : ndarray, shape (p,)
-        Prior standard deviations in SI.
-    lag : bool
-        Whether the stage moved in more than one direction along the lines.
-    """
-
-    amplitudes: Floats
-    instrument: Floats
-    covariance: Floats
-    sigma: float
-    used: float
-    prior_sd: Floats
-    lag: bool
-
-    @property
-    def sensors_m(self) -> Floats:
-        """Places (3, 3) of the sensors relative to their mean."""
-        places = (self.instrument * self.prior_sd)[SENSORS].reshape(3, 3)
-        return np.asarray(places - places.mean(axis=0))
-
-    @property
-    def mixing(self) -> Floats:
-        """Matrix (3, 3) that is added to 1: reading c is row c times B.
-
-        Its trace is 0, because a common gain is no error that a map can show.
-        """
-        matrix = (self.instrument * self.prior_sd)[MIXING].reshape(3, 3)
-        return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
-
-
-class _Model:
-    """Readings of a three-axis probe in a harmonic field."""
-
-    def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
-                 directions: Floats) -> None:
-        self.charges, self.points, self.field = charges, points, field
-        self.time, self.directions = time, directions
-        self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
-        sd = np.array(PRIOR_SD)
-        sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
-        self.prior_sd = sd
-
-    def without(self, group: slice) -> _Model:
-        """Return a model whose instrument has none of a group of parameters."""
-        other = copy(self)
-        other.prior_sd = self.prior_sd.copy()
-        other.prior_sd[group] = 0.0
-        return other
-
-    def allowed(self, at: _Fitted) -> _Fitted:
-        """Return a fit as a start for this model, without the parameters that it has not."""
-        return replace(at, instrument=np.where(self.prior_sd > 0, at.instrument, 0.0),
-                       prior_sd=self.prior_sd)
-
-    def lag_shows(self, rows: NDArray[np.bool_]) -> bool:
-        """Tell whether the stage moved both ways, without which a lag is a shift of the map."""
-        return bool(np.ptp(self.directions[rows], axis=0).max() > 1.5)
-
-    def start(self, fit: HarmonicFit) -> _Fitted:
-        """Return the fit of a perfect instrument."""
-        count = len(PRIOR_SD)
-        return _Fitted(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
-                       self.prior_sd, False)
-
-    def fit(self, at: _Fitted, rows: NDArray[np.bool_]) -> HarmonicFit:
-        """Return the fit of the field alone, read by an instrument that is known."""
-        design = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        readings = self.field[rows] - self.offsets(at, rows)
-        return fit_readings(design, [readings.ravel()])[0]
-
-    def offsets(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
-        """Return the change (n, 3) in T of the sensors' offsets."""
-        return np.asarray(self.time[rows, None] * (at.instrument * self.prior_sd)[OFFSETS])
-
-    def _sensor(
-        self, at: _Fitted, rows: NDArray[np.bool_], sensor: int
-    ) -> tuple[Floats, Floats]:
-        """Return the places (n, 3) in m of a sensor and the directions (n, 3) that it reads."""
-        value, waves, own = at.instrument * self.prior_sd, self.waves[rows], np.eye(3)[sensor]
-        turn, gain = waves @ value[TURNS].reshape(WAVES, 3), waves @ value[GAINS]
-        reads = own + at.mixing[sensor] + np.cross(turn, own) + gain[:, None] * own
-        return (self.points[rows] + at.sensors_m[sensor] - value[LAG] * self.directions[rows],
-                reads)
-
-    def by_amplitude(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
-        """Return the readings (n, 3, k) per amplitude."""
-        found = np.empty((int(rows.sum()), 3, len(self.charges)))
-        for sensor in range(3):
-            places, reads = self._sensor(at, rows, sensor)
-            found[:, sensor] = self.charges.fields_along(places, reads)
-        return found
-
-    def by_parameter(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
-        """Return the derivatives (n, 3, p) in T of the readings by the parameters / `PRIOR_SD`."""
-        found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
-        for sensor in range(3):
-            places, reads = self._sensor(at, rows, sensor)
-            field = self.charges.field(places, at.amplitudes)
-            gradient = np.einsum("nc,ncj->nj", reads,
-                                 self.charges.gradient(places, at.amplitudes))
-            for other in range(3):  # of the mean of the sensors, which stays where it is
-                found[:, sensor, 3 * other:3 * other + 3] = gradient * (
-                    (sensor == other) - 1 / 3)
-            found[:, sensor, 9 + 3 * sensor:12 + 3 * sensor] = field
-            for other in range(3):
-                found[:, sensor, 9 + 4 * other] -= field[:, sensor] / 3
-            found[:, sensor, TURNS] = np.einsum(
-                "nw,na->nwa", self.waves[rows], np.cross(np.eye(3)[sensor], field)
-            ).reshape(len(found), -1)
-            found[:, sensor, OFFSETS.start + sensor] = self.time[rows]
-            found[:, sensor, GAINS] = self.waves[rows] * field[:, sensor, None]
-            if at.lag:
-                found[:, sensor, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
-        return found * self.prior_sd
-
-    def readings(self, at: _Fitted, rows: NDArray[np.bool_] | None = None) -> Floats:
-        """Return what the instrument reads (n, 3) in T at some rows, by default at all."""
-        chosen = np.flatnonzero(np.ones(len(self.points), bool) if rows is None else rows)
-        found = np.empty((len(chosen), 3))
-        some = np.zeros(len(self.points), bool)
-        some[chosen] = True
-        for sensor in range(3):
-            places, reads = self._sensor(at, some, sensor)
-            found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
-        return np.asarray(found + self.offsets(at, some))
-
-    def expected(self, at: _Fitted, rows: NDArray[np.bool_]) -> Floats:
-        """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
-
-        Residuals are larger where the field is steep. Those of lines that are not fitted are no
-        measure of a single reading: at the edge of the map the field there is extrapolated.
-        """
-        gradient = self.charges.gradient(self.points, at.amplitudes)
-        noise, displaced = _noise(gradient[rows], (self.field - self.readings(at))[rows])
-        return np.sqrt(noise**2 + displaced**2 * np.sum(gradient**2, axis=2))
-
-    def ideal(self, at: _Fitted) -> Floats:
-        """Return what a probe without errors would have read (n, 3) in T.
-
-        What the fit leaves stays in it, along the axes that the sensors read.
-        """
-        every = np.ones(len(self.points), bool)
-        reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
-        left = self.field - self.readings(at)
-        return self.charges.field(self.points, at.amplitudes) + np.linalg.solve(
-            reads, left[..., None])[..., 0]
-
-
 def _confirmed(
-    model: _Model, rows: NDArray[np.bool_], left_out: NDArray[np.bool_], fit: HarmonicFit,
-    start: _Fitted,
-) -> tuple[_Model, _Fitted]:
+    model: ProbeModel, rows: NDArray[np.bool_], left_out: NDArray[np.bool_], fit: HarmonicFit,
+    start: ProbeFit,
+) -> tuple[ProbeModel, ProbeFit]:
     """Return the model without the changes that do not help to predict some of the rows.
 
     What is left of a field that is steeper than the charges, and positions that are off together
     along a line, is no white noise. Slow functions of time take to it with certainty, and fail
     where they were not fitted.
     """
-    def predicted(trial: _Model) -> tuple[float, _Fitted]:
+    def predicted(trial: ProbeModel) -> tuple[float, ProbeFit]:
         """Return the rms error in T of the rows that are left out, and the fit of the others."""
-        fitted = _fitted(trial, rows & ~left_out, fit, trial.allowed(start), NEXT_ITERATIONS)
+        fitted = fit_probe(trial, rows & ~left_out, fit, trial.allowed(start), NEXT_ITERATIONS)
         off = model.field[left_out] - trial.readings(fitted, left_out)
         return float(np.linalg.norm(_rms(off))), fitted
 
@@ -678,123 +446,12 @@ def _confirmed(
     return model, start
 
 
-def _fitted(
-    model: _Model, rows: NDArray[np.bool_], fit: HarmonicFit, start: _Fitted | None = None,
-    iterations: int = ITERATIONS
-) -> _Fitted:
-    """Fit field and instrument together by Gauss-Newton steps, each of which improves the fit.
-
-    ``fit`` is that of a perfect instrument, and has the prior width of the amplitudes.
-    """
-    at = replace(start or model.start(fit), lag=model.lag_shows(rows))
-    width2 = fit.sigma**2 / fit.penalty
-    state = _State.of(model, at, rows, width2)
-    for _ in range(iterations):
-        step, covariance, used = state.step()
-        for halving in range(HALVINGS):
-            after = _State.of(model, replace(
-                state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
-            if after.chi2 <= state.chi2:
-                break
-        else:
-            return state.at
-        sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
-        at_rest = state.chi2 - after.chi2 < AT_REST
-        state = after.with_noise(sigma, replace(
-            after.at, covariance=sigma**2 * covariance, used=used))
-        if at_rest:
-            break
-    return state.at
-
-
-@dataclass(frozen=True)
-class _State:
-    """The field of largest probability for an instrument and a noise.
-
-    Attributes
-    ----------
-    at : _Fitted
-    chi2 : float
-        With the prior of amplitudes and instrument.
-    left : ndarray, shape (m,), in T
-    by_amplitude : ndarray, shape (m, k)
-    information : ndarray, shape (k, k)
-        Of the amplitudes, without their prior and in units of 1 / sigma^2.
-    projected : ndarray, shape (k,)
-        Product of ``by_amplitude`` with the readings.
-    factor : tuple
-        Cholesky factor of the information with the prior.
-    """
-
-    model: _Model
-    rows: NDArray[np.bool_]
-    width2: float
-    at: _Fitted
-    chi2: float
-    left: Floats
-    by_amplitude: Floats
-    information: Floats
-    projected: Floats
-    factor: tuple[Floats, bool]
-
-    @classmethod
-    def of(cls, model: _Model, at: _Fitted, rows: NDArray[np.bool_], width2: float) -> _State:
-        """Fit the field for the instrument and the noise of ``at``."""
-        by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
-        target = (model.field[rows] - model.offsets(at, rows)).ravel()
-        return cls._solved(model, rows, width2, at, target, by_amplitude,
-                           by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
-
-    @classmethod
-    def _solved(
-        cls, model: _Model, rows: NDArray[np.bool_], width2: float, at: _Fitted, target: Floats,
-        by_amplitude: Floats, information: Floats, projected: Floats,
-    ) -> _State:
-        """Solve for the amplitudes."""
-        with_prior = information.copy()
-        with_prior[np.diag_indices(len(with_prior))] += (
-            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
-        amplitudes = linalg.cho_solve(factor, projected)
-        left = target - by_amplitude @ amplitudes
-        chi2 = (float(left @ left) / at.sigma**2 + float(amplitudes @ amplitudes) / width2
-                + float(at.instrument @ at.instrument))
-        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left,
-                   by_amplitude, information, projected, factor)
-
-    def with_noise(self, sigma: float, at: _Fitted) -> _State:
-        """Return the state of the same instrument for another noise in T."""
-        target = self.left + self.by_amplitude @ self.at.amplitudes
-        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma), target,
-                            self.by_amplitude, self.information, self.projected)
-
-    def step(self) -> tuple[Floats, Floats, float]:
-        """Return the step (p,) of the instrument, its covariance / sigma^2, and `_Fitted.used`.
-
-        The amplitudes, which are the best for the present instrument, are eliminated from the
-        normal equations.
-        """
-        noise2, count = self.at.sigma**2, len(PRIOR_SD)
-        design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
-        mixed = self.by_amplitude.T @ design
-        solved = linalg.cho_solve(self.factor, mixed)
-        inverse = np.linalg.inv(design.T @ design - mixed.T @ solved + noise2 * np.eye(count))
-        step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
-        # traces of the blocks of the inverse of all normal equations
-        amplitudes, info = linalg.lapack.dpotri(self.factor[0], lower=1)
-        assert info == 0  # the factor is that of a Cholesky decomposition
-        by_amplitude = float(np.trace(amplitudes)) + float(np.sum((solved @ inverse) * solved))
-        used = (len(mixed) - noise2 / self.width2 * by_amplitude
-                + count - noise2 * float(np.trace(inverse)))
-        return step, inverse, used
-
-
 CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
            "from the ends to the middle": {1: -1.5, 3: -0.625}}
 """Differences of the Legendre polynomials 1 to 4 between times of the scan."""
 
 
-def _terms(fitted: _Fitted) -> tuple[InstrumentTerm, ...]:
+def _terms(fitted: ProbeFit) -> tuple[InstrumentTerm, ...]:
     """Return the parameters of the instrument in the units of people."""
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
@@ -836,31 +493,6 @@ def _terms(fitted: _Fitted) -> tuple[InstrumentTerm, ...]:
 # --- what remains -------------------------------------------------------------------------------
 
 
-def _spikes(
-    points: Floats, residual: Floats, usable: NDArray[np.bool_], over_neighbours: float = SPIKE
-) -> NDArray[np.bool_]:
-    """Return the usable rows whose residual (n, 3) is far larger than all, and those around."""
-    rows = np.flatnonzero(usable)
-    size = np.abs(residual[rows])
-    near = _neighbours(points[rows])
-    least = 1.4826 * np.maximum(over_neighbours * np.median(size[near], axis=1),
-                                SPIKE * np.median(size, axis=0))
-    found = np.zeros(len(points), bool)
-    found[rows] = (size > least).any(axis=1)
-    return found
-
-
-def _neighbours(points: Floats) -> Ints:
-    """Return the numbers (n, k) of the nearest neighbours of points (n, 3).
-
-    Coordinates are rounded, so that which of equally distant points count does not depend on the
-    last digits of the file.
-    """
-    places = np.round(points / point_spacing(points), 6)
-    count = min(NEIGHBOURS + 1, len(points))
-    return np.asarray(KDTree(places).query(places, np.arange(2, count + 1))[1])
-
-
 def _windows(
     points: Floats, residual: Floats
 ) -> tuple[str, tuple[tuple[float, float, tuple[float, float, float]], ...]]:
@@ -874,21 +506,6 @@ def _windows(
             x, y, z = _rms(residual[number == window]).tolist()
             found.append((float(edges[window]), float(edges[window + 1]), (x, y, z)))
     return COMPONENTS[axis], tuple(found)
-
-
-def _noise(gradient: Floats, residual: Floats) -> tuple[float, float]:
-    """Return the noise in T of readings and in m of positions that residuals (n, 3) show.
-
-    A position noise s makes an error of s |grad B_c| in component c, for a gradient (n, 3, 3). It
-    is 0 if the gradient is about the same everywhere, so that nothing tells the two noises apart.
-    """
-    steepness = np.sum(gradient**2, axis=2).ravel()
-    flat, steep = np.quantile(steepness, [0.1, 0.9])
-    squares = residual.ravel()**2
-    if steep < STEEPER * flat:
-        return float(np.sqrt(squares.mean())), 0.0
-    constant = float(squares[steepness <= flat].mean())
-    return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())
 
 
 def _structure(points: Floats, residual: Floats) -> float:

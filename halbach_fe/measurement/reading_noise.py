@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.instrument import probe_points
+from halbach_fe.measurement.instrument import probe_points, sensor_matrix
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.exact_block_field import gradient_of
 from halbach_fe.stats.noise import NoiseCovariance
@@ -86,13 +86,16 @@ def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) ->
             settings, observation.positions[:, 2], observation.components)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
-        moved = readings_per_displacement(magnet, observation, np.array(settings.position_sd_m))
+        moved = readings_per_displacement(
+            magnet, observation.analysis, probe_points(magnet.study.instrument,
+                                                       observation.map_points),
+            np.array(settings.position_sd_m))
         covariance = covariance + moved @ moved.T
     return NoiseCovariance(_without_rounding(sparse.csr_array(covariance)))
 
 
 def readings_per_displacement(
-    magnet: Magnet, observation: Observation, sd: Floats
+    magnet: Magnet, analysis: sparse.csr_array, points: Floats, sd: Floats
 ) -> sparse.csr_array:
     """Return the changes of the readings if each of n points is displaced along each axis.
 
@@ -103,7 +106,11 @@ def readings_per_displacement(
     Parameters
     ----------
     magnet : Magnet
-    observation : Observation
+        With the instrument of the map in its study.
+    analysis : sparse array, shape (readings, 3 n)
+        Maps the values of a field map to the readings, see `Observation`.
+    points : ndarray, shape (n, 3), in m
+        Positions of the probe in the magnet.
     sd : ndarray, shape (3,), in m
         Displacements along x, y and z, usually standard deviations.
 
@@ -112,11 +119,10 @@ def readings_per_displacement(
     changes : sparse array, shape (readings, 3 n), in T
         One column for each point and axis.
     """
-    points = probe_points(magnet.study.instrument, observation.map_points)
-    gradient = gradient_of(magnet.blocks, points) * sd
+    gradient = sensor_matrix(magnet.study.instrument) @ gradient_of(magnet.blocks, points) * sd
     number = np.arange(len(gradient) + 1)
     return sparse.csr_array(
-        observation.analysis @ sparse.bsr_array((gradient, number[:-1], number)))
+        analysis @ sparse.bsr_array((gradient, number[:-1], number)))
 
 
 def _without_rounding(covariance: sparse.csr_array) -> sparse.csr_array:

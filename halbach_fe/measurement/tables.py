@@ -14,7 +14,7 @@ from halbach_fe.core.numbers import parse_number as number_in
 
 
 def csv_table(
-    raw: bytes, where: str
+    raw: bytes, where: str, hint: str = ""
 ) -> tuple[dict[str, str], list[str], Iterator[tuple[int, list[str]]]]:
     """Split the content of a CSV file into attributes, header and rows.
 
@@ -24,6 +24,8 @@ def csv_table(
         Content of the file.
     where : str
         Name of the file in error messages.
+    hint : str
+        What to do if the file has no header.
 
     Returns
     -------
@@ -57,8 +59,10 @@ def csv_table(
         elif line.strip():
             rows.append((number, _cells(line, number, where)))
     if not rows:
-        raise MeasurementError(must_be("content", where, "a table of readings", "only comments"))
+        raise MeasurementError(must_be("content", where, "a table with a header", "only comments"))
     header = rows[0][1]
+    if all(map(_is_number, header)):
+        raise MeasurementError(must_be("header", where, "the names of columns", "numbers", hint))
     if len(set(header)) < len(header):
         raise MeasurementError(must_be("header", where, "without repeated columns",
                                        ",".join(header)))
@@ -70,13 +74,22 @@ def _equally_long(
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows; raise MeasurementError if there are none, or one has not ``count`` cells."""
     if not rows:
-        raise MeasurementError(must_be("content", where, "at least one reading",
+        raise MeasurementError(must_be("content", where, "at least one row of numbers",
                                        "a header alone"))
     for number, cells in rows:
         if len(cells) != count:
             raise MeasurementError(must_be(f"line {number}", where, f"{count} values",
                                            str(len(cells)), "Is the file cut short?"))
         yield number, cells
+
+
+def _is_number(cell: str) -> bool:
+    """Tell whether a cell holds a number."""
+    try:
+        number_in(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def check_columns(header: Sequence[str], known: Sequence[str], where: str) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Ints
-from halbach_fe.report.page import POSTERIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.stats.sbc import BINS
 
 
+@own_style
 def write_calibration(
     ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, object]],
     folder: Path,

@@ -23,6 +23,7 @@ from halbach_fe.report.page import (
     SECOND,
     axis_of_points,
     geometry_figure,
+    own_style,
     save,
     stacked_axes,
     write_page,
@@ -34,6 +35,7 @@ from halbach_fe.synthetic.simulate import observed_components, point_noise
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 
+@own_style
 def write_campaign_page(
     study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: BlockTable,
     folder: Path, files: Sequence[str],

@@ -40,6 +40,15 @@ def term_table(result: InferenceResult) -> list[dict[str, str]]:
     return rows
 
 
+def pose_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: where the middles of the maps lie; none if that was known before."""
+    return [{"map": pose.name} | {
+        f"{axis} of its middle": f"{1e3 * value:.3f} ± {1e3 * sd:.3f} mm"
+        for axis, value, sd in zip("xyz", pose.middle_m, pose.middle_sd_m, strict=True)} | {
+        "turned about x, y, z": "± " + ", ".join(f"{1e3 * sd:.2g}" for sd in pose.turn_sd_rad)
+        + " mrad"} for pose in (result.terms.poses if result.terms else ())]
+
+
 def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
     """Return rows of text: how maps agree where they overlap; none if they do not."""
     return [{
@@ -76,5 +85,5 @@ def write_updated_study(path: Path, result: InferenceResult, folder: Path) -> No
     """Write study.updated.toml: the study in a file, with the instruments that were found."""
     study = with_paths_from(result.study, path.parent, folder)
     before = with_paths_from(read_study(path), path.parent, folder)
-    write_edited(folder / STUDY_FILE, path.read_text(encoding="utf-8"),
+    write_edited(folder / STUDY_FILE, path.read_text(encoding="utf-8-sig"),
                  [(before, "path from this folder"), (study, NOTE)])

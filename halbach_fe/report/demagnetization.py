@@ -18,7 +18,15 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    own_style,
+    save,
+    write_page,
+)
 
 PAST = "#D55E00"
 """Colour of the knee and of cells past it."""
@@ -51,6 +59,7 @@ def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
     }
 
 
+@own_style
 def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
     """Write demagnetization.json, .csv (a row per block), .vtu (cells), .html and the figures."""
     summary, rows = demagnetization_summary(found), found.by_block()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-import numpy as np
 
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
 from halbach_fe.diagnosis.effects import catalogue
@@ -31,17 +29,18 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
-from halbach_fe.inference.result import ALL_READINGS
+from halbach_fe.inference.result import ALL_READINGS, TRAINING
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.magnet_view_3d import view_of_inference
-from halbach_fe.report.page import save, write_page
+from halbach_fe.report.page import own_style, save, write_page
 from halbach_fe.report.unknown_cause import (
     more_readings,
     suspicion_sentences,
     unknown_advice,
     unknown_sentences,
 )
+from halbach_fe.report.words import flux_density, fraction
 
 UNUSUAL_AMPLITUDE = 20.0
 """Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
@@ -64,9 +63,6 @@ FIGURES = {
                        "magnet")}
 """Function that draws each figure of the page, and its caption."""
 
-SMALL_T = 1e-4
-"""Flux density below which tables give it in µT."""
-
 
 def verdict(diagnosis: Diagnosis) -> list[str]:
     """Describe the result of a diagnosis in sentences."""
@@ -79,17 +75,18 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
         return sentences
     if diagnosis.identified:
         fits = diagnosis.converged and after.prior_conflict <= after.conflict_limit
-        start = "The map is explained by" if fits else (
+        start = f"{_maps(diagnosis)} explained by" if fits else (
             "The best explanation from the catalogue is")
         sentences.append(f"{start}: " + "; ".join(
             _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
         sentences += [
-            f"The map does not tell {_title(effect.hypothesis.effect.name, titles)} from "
-            f"{_joined_by_or(_titles(effect, titles))}."
+            f"{_maps(diagnosis, 'do')} not tell {_title(effect.hypothesis.effect.name, titles)} "
+            f"from {_joined_by_or(_titles(effect, titles))}."
             for effect in diagnosis.identified if rivals(effect)]
         if diagnosis.positions:
             sentences.append(
-                "The magnet is the same from several sides, so that the map may be displaced by "
+                "The magnet is the same from several sides, so that the readings may be "
+                "displaced by "
                 f"{_joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
                 "first is used here.")
         unusual = [f"{_title(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
@@ -112,16 +109,20 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
     elif diagnosis.suspected:
         sentences.append("Nothing can be named for certain.")
     elif unknown is None and after.prior_conflict <= after.conflict_limit:
+        several = after.is_campaign
+        these = "these maps" if several else "this map"
         start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
-                 "Nothing else is missing that this map can show: with that," if sentences
-                 else "Nothing is missing that this map can show:")
-        return [*sentences, f"{start} the map agrees with the study within noise (chi² per reading "
-                f"{after.prior_conflict:.3g}).",
+                 f"Nothing else is missing that {these} can show: with that," if sentences
+                 else f"Nothing is missing that {these} can show:")
+        agree = "the maps agree" if several else "the map agrees"
+        return [*sentences, f"{start} {agree} with the study within noise (chi² per reading "
+                f"{after.prior_conflict:.3g}).", *([after.too_near] if after.too_near else []),
                 *([limits_in_words(diagnosis.limits)] if diagnosis.limits else [])]
     if unknown is not None:
         sentences += unknown_sentences(unknown, bool(diagnosis.identified))
     elif not diagnosis.identified and not diagnosis.suspected:
-        return [*sentences, f"The map disagrees with the study (chi² per reading "
+        disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
+        return [*sentences, f"{disagree} with the study (chi² per reading "
                 f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
                 "no effect of the catalogue explains the difference, nor does a smooth field or "
                 "sensor error. Check the noise of the study."]
@@ -129,7 +130,7 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
         sentences += suspicion_sentences(suspicion, titles)
     if diagnosis.identified:
         held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
-                        for fit in fits[1:2])
+                        for fit in [each for each in fits if each.part != TRAINING][:1])
                 for fits in (region_scores(before, diagnosis.loo_residuals_before),
                               region_scores(after, diagnosis.loo_residuals_after))]
         added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
@@ -138,7 +139,16 @@ def verdict(diagnosis: Diagnosis) -> list[str]:
             f"{after.prior_conflict:.3g}{held[1]} (before: {before.prior_conflict:.3g}{held[0]}).")
         if after.prior_conflict > after.conflict_limit and unknown is None:
             sentences.append("That is still too large: another cause is missing.")
+        sentences.append(f"{STUDY_FILE} is the study with {added}, for halbach-fe infer "
+                         "and all that follows.")
     return sentences
+
+
+def _maps(diagnosis: Diagnosis, verb: str = "are") -> str:
+    """Return the map, or the maps, as the subject of a sentence with a verb."""
+    if diagnosis.after.is_campaign:
+        return f"The maps {verb}"
+    return f"The map {'is' if verb == 'are' else 'does'}"
 
 
 def _cut_in_words(uncompared: int, rounds: int) -> str:
@@ -182,7 +192,7 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
         rows.append({"readings": f"{fit.part}{region}", "count": str(fit.readings)} | {
             name: " → ".join(text(getattr(fits[number], key)) for fits in found)
             for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
-                                    ("95 % band holds", "coverage95", _fraction))})
+                                    ("95 % band holds", "coverage95", fraction))})
     return rows
 
 
@@ -199,14 +209,24 @@ def residual_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
             sizes = {state.when: fits[number].rms_T[component]
                      for state, fits in zip(shown, found, strict=True)}
             if diagnosis.floor_T:
-                sizes["model-free floor"] = diagnosis.floor_T.get(component, float("nan"))
+                sizes["model-free floor"] = _floor(diagnosis, fit.region, component)
             rows.append({"readings": fit.part + (
                 "" if fit.region == ALL_READINGS else f", {fit.region}"), "component": component}
-                | {name: _flux_density(size) for name, size in sizes.items()}
+                | {name: flux_density(size) for name, size in sizes.items()}
                 | {"ppm of the main field": f"{1e6 * last / main:.3g}"})
     return rows
 
 
+def _floor(diagnosis: Diagnosis, region: str, component: str) -> float:
+    """Return the floor in T of a component in a region; NaN if it is not known."""
+    floors = diagnosis.floor_T or {}
+    own = floors.get(region.partition(":")[0], floors.get(component))
+    if isinstance(own, Mapping):
+        own = own.get(component)
+    return float("nan") if own is None else float(own)
+
+
+@own_style
 def write_diagnosis_report(
     diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path,
     assumptions: Sequence[str] = (),
@@ -234,10 +254,11 @@ def write_diagnosis_report(
                for finding in other_findings(diagnosis)]
         + [_entry(effect, titles) for effect in diagnosis.identified],
         changes=change_table(diagnosis), residuals=residual_table(diagnosis),
-        main_field=_flux_density(main_field_T(diagnosis)), disagreeing="; ".join(
+        main_field=flux_density(main_field_T(diagnosis)), disagreeing="; ".join(
             f"{state.when}: {_disagreement_summary(state.groups)}" for state in states(diagnosis)),
         states=[state.when for state in states(diagnosis)],
-        classes=[f"The map would be the same with {_joined_by_or(texts)}."
+        classes=[f"{f'Map {error.map}' if error.map else 'The map'} would be the same with "
+                 f"{_joined_by_or(texts)}."
                  for error in diagnosis.gross_errors
                  if (texts := [alternative.text for alternative in error.alternatives])]
         + [_equivalence_sentence(effect, titles)
@@ -251,6 +272,8 @@ def write_diagnosis_report(
                 "discoveries": DISCOVERIES},
         advice=unknown_advice(diagnosis.unknown) if diagnosis.unknown else
         " ".join(map(more_readings, diagnosis.suspected)) if diagnosis.suspected else
+        "Further measurements are not compared, because the study leaves terms of instruments open "
+        "(`instrument_sd`)." if diagnosis.before.terms is not None else
         "None of the candidate measurements would distinguish the effects from their alternatives."
         if any(rivals(effect) for effect in diagnosis.identified) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
@@ -335,19 +358,6 @@ def _further_measurements(
 def _gain(value: float) -> str:
     """Format a gain in the log Bayes factor."""
     return f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
-
-
-def _flux_density(value: float) -> str:
-    """Format a flux density in T as mT, or as µT if it is small."""
-    if np.isnan(value):
-        return EMPTY_CELL
-    size, unit = (1e3 * value, "mT") if abs(value) >= SMALL_T else (1e6 * value, "µT")
-    return f"{size:.3g}\u00a0{unit}"
-
-
-def _fraction(value: float) -> str:
-    """Format a fraction in percent, with one decimal."""
-    return f"{100 * value:.1f}\u00a0%"
 
 
 def _figure(value: float) -> str:

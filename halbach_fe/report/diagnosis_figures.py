@@ -19,6 +19,7 @@ from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
+from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
 from halbach_fe.report.prediction import axis_of_readings
 
@@ -27,7 +28,8 @@ MAX_BARS = 8
 RESIDUAL_LIMIT = 5.0
 """Standardized residual at the end of the colour scale."""
 
-GROUP_TITLES = {"z": "along z", "angle": "by angle", "radius": "by radius", "label": "by reading"}
+GROUP_TITLES = {"map": "by map", "z": "along z", "angle": "by angle", "radius": "by radius",
+                "label": "by reading"}
 """Titles of the kinds of groups of readings."""
 
 
@@ -61,7 +63,7 @@ def states(diagnosis: Diagnosis) -> list[State]:
                    diagnosis.loo_residuals_before, PRIOR, "o")
     after = State("after", diagnosis.after, diagnosis.groups_after,
                   diagnosis.loo_residuals_after, POSTERIOR, "s")
-    if diagnosis.study == diagnosis.before.study:
+    if diagnosis.study == diagnosis.corrected_study:
         return [replace(after, when="the study without changes")]
     return [before, after]
 
@@ -111,13 +113,18 @@ def groups(diagnosis: Diagnosis) -> Figure:
 
 
 def residuals(diagnosis: Diagnosis) -> Figure:
-    """Draw standardized residuals, one row for each component (or coefficient) and radius."""
-    observation = diagnosis.before.observation
-    chosen = ~diagnosis.before.held_out
+    """Draw standardized residuals, one row for each component (or coefficient) and radius, or
+    map of several.
+    """
+    before = diagnosis.before
+    observation, chosen = before.observation, ~before.held_out
     labels = np.array(["".join(c for c in label if not c.isdigit())
                        for label in observation.labels])[chosen]
-    radius = np.round(observation.radii[chosen], 5)
-    rows = [(label, r) for label in dict.fromkeys(labels.tolist()) for r in np.unique(radius)]
+    names = list(dict.fromkeys(before.maps))
+    group = np.array([names.index(name) for name in before.maps], float) if (
+        before.is_campaign) else np.round(observation.radii, 5)
+    group = group[chosen]
+    rows = [(label, one) for label in dict.fromkeys(labels.tolist()) for one in np.unique(group)]
     apart = len(rows) <= MAX_BARS
     if not apart:
         rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
@@ -125,12 +132,13 @@ def residuals(diagnosis: Diagnosis) -> Figure:
     figure = Figure(figsize=(9, 1.2 + 1.15 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), len(shown), sharex=True, sharey="row", squeeze=False)
     coloured = False
-    for (label, r), row in zip(rows, axes, strict=True):
-        mine = np.flatnonzero((labels == label) & ((radius == r) | (not apart)))
+    for (label, one), row in zip(rows, axes, strict=True):
+        mine = np.flatnonzero((labels == label) & ((group == one) | (not apart)))
         for axis, state in zip(row, shown, strict=True):
             coloured |= _residual_map(axis, diagnosis.before, np.flatnonzero(chosen)[mine],
                                       state.loo_residuals[mine])
-        row[0].set_ylabel(label + (f", {1e3 * r:.0f} mm" if apart and len(set(radius)) > 1 else "")
+        which = f"map {names[int(one)]}" if before.is_campaign else f"{1e3 * one:.0f} mm"
+        row[0].set_ylabel(label + (f", {which}" if apart and len(set(group)) > 1 else "")
                           + "\n" + row[0].get_ylabel())
         for axis in row[1:]:
             axis.set_ylabel("")
@@ -152,7 +160,8 @@ def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: F
     bool
         Whether the residuals are shown by colour.
     """
-    x, y, z = update.observation.positions[readings].T
+    observation = update.observation
+    x, y, z = (observation.places if update.is_campaign else observation.positions)[readings].T
     numbers = ["".join(c for c in update.observation.labels[reading] if c.isdigit())
                for reading in readings]
     up = np.degrees(np.arctan2(y, x)) % 360
@@ -243,9 +252,12 @@ def profile(diagnosis: Diagnosis) -> Figure:
              label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
-    x, y, _ = 1e3 * before.observation.positions[index[0]].round(6) + 0.0  # no -0
-    top.set_title(f"{label} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
-                  else f"{label} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
+    where = (before.observation.places if before.is_campaign
+             else before.observation.positions)[index[0]]
+    x, y, _ = 1e3 * where.round(6) + 0.0  # no -0
+    of_map = f" of map {before.maps[index[0]]}" if before.is_campaign else ""
+    top.set_title(f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
+                  else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     top.set_ylabel(f"{label} in T")
     top.legend(fontsize="small")
     bottom.set_ylabel("measured − predicted\nin mT")
@@ -285,6 +297,8 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
                        for label in update.observation.labels])
     apart = np.round(update.observation.positions[:, :2] if name.startswith("z")
                      else update.observation.radii[:, None], 6)
+    if update.is_campaign:
+        apart = _lines_of_maps(update)
     groups = [np.flatnonzero((labels == label) & (apart == location).all(axis=1))
               for label in dict.fromkeys(labels.tolist()) for location in np.unique(apart, axis=0)]
     longest = max(len(group) for group in groups)
@@ -293,6 +307,20 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
                 key=lambda group: float(np.nanmean(worst[group])))
     order = np.argsort(along[index], kind="stable")
     return str(labels[index[0]]), index[order], along[index][order], name
+
+
+def _lines_of_maps(update: InferenceResult) -> Floats:
+    """Return what readings (readings, 3) on one line along z in the magnet have in common: their
+    map, and x and y in steps of half the distance of its points, as stages may be inclined.
+    """
+    observation, maps = update.observation, np.array(update.maps)
+    found = np.empty((len(maps), 3))
+    for number, name in enumerate(dict.fromkeys(update.maps)):
+        own = maps == name
+        step = point_spacing(np.unique(observation.positions[own], axis=0)) / 2
+        found[own] = np.column_stack([np.full(own.sum(), number),
+                                      np.round(observation.places[own, :2] / step)])
+    return found
 
 
 def _parts(update: InferenceResult, vectors: Floats) -> dict[str, Floats]:

@@ -11,11 +11,12 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.report.campaign_inference import maps_figure, overlap_table, term_table
+from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
+from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
-from halbach_fe.report.page import POSTERIOR, save, write_page
+from halbach_fe.report.page import POSTERIOR, own_style, save, write_page
 from halbach_fe.report.prediction import (
     PublishedErrors,
     prediction_profile_figure,
@@ -55,6 +56,7 @@ def score_table(result: InferenceResult,
     return rows
 
 
+@own_style
 def write_inference_report(
     result: InferenceResult, folder: Path, published: PublishedErrors | None = None,
     assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
@@ -111,7 +113,8 @@ def write_inference_report(
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
         rows=score_table(result, published), assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet), conflict=result.disagreement,
-        terms=term_table(result), overlaps=overlap_table(result),
+        answer=answer(result),
+        terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
         view=view_of_inference(result))
 
 

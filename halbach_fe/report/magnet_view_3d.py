@@ -195,11 +195,26 @@ def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None =
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
         scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
                "yaxis": {"title": {"text": "y in m"}}, "zaxis": {"title": {"text": "z in m"}},
-               "camera": {"eye": CAMERA_2D if magnet.dimension == 2 else CAMERA_3D,
+               "camera": {"eye": CAMERA_2D if magnet.dimension == 2 else _camera_3d(figure),
                           "up": {"x": 0, "y": 1, "z": 0}}})
     return Markup(plotly.io.to_html(
         figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY,
         config={"displaylogo": False, "responsive": True}))
+
+
+def _camera_3d(figure: go.Figure) -> dict[str, float]:
+    """Return the place of a camera that sees all that is drawn.
+
+    plotly divides lengths by the geometric mean of the three sides of the drawn box, so that long
+    magnets need a camera farther off.
+    """
+    drawn = [np.array([np.ravel(trace[axis]) for axis in "xyz"], float) for trace in figure.data
+             if trace.x is not None and len(trace.x)]
+    sides = np.nanmax(np.hstack(drawn), axis=1) - np.nanmin(np.hstack(drawn), axis=1)
+    sides = np.maximum(sides, 1e-3 * sides.max())
+    diagonal = float(np.linalg.norm(sides / np.cbrt(sides.prod())))
+    farther = max(1.0, diagonal / np.sqrt(3))  # a cube has the diagonal sqrt(3)
+    return {axis: farther * value for axis, value in CAMERA_3D.items()}
 
 
 def _rings_per_prism(magnet: Magnet) -> int:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, save, write_page
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, own_style, save, write_page
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -24,6 +24,7 @@ def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
             "z_rms": float(np.sqrt(np.mean((error[free] / sd[free]) ** 2)))}
 
 
+@own_style
 def write_magnetizations(
     magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
     files: str, figures: Mapping[str, object] | None = None, ring: int = 1,

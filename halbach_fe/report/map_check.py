@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, write_map
+from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import MapCheck
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, save, write_page
+from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
 from halbach_fe.study.types import COMPONENTS
 
 VIOLATED = 0.02
@@ -126,6 +126,7 @@ def residual_table(check: MapCheck) -> list[dict[str, str]]:
               for low, high, values in windows)]
 
 
+@own_style
 def write_map_check(
     data: xr.Dataset, check: MapCheck, folder: Path, provenance: Mapping[str, str]
 ) -> None:
@@ -133,7 +134,8 @@ def write_map_check(
     corrected_map.csv if the map can tell.
     """
     points = points_of(data)
-    write_text(folder / "check.json", json.dumps(check.plain(), indent=1, allow_nan=False) + "\n")
+    write_text(folder / "check.json", json.dumps(check_summary(data, check), indent=1,
+                                                  allow_nan=False) + "\n")
     with atomic(folder / "check.csv") as temporary:
         write_csv(dict(zip(("x_m", "y_m", "z_m"), points.T, strict=True)) | {
             f"residual_{name}": column for name, column in zip(
@@ -157,6 +159,15 @@ def write_map_check(
     write_page(folder / "check.html", "map_check.html.j2", save(figures, folder),
                provenance=provenance, check=check, found=sentences(check), files=", ".join(files),
                instrument=instrument_table(check), residuals=residual_table(check))
+
+
+def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:
+    """Return the results as plain data, with `readings_sha256` of the maps to which they belong."""
+    maps = {"map": data, "oriented_map": oriented(data, check)}
+    if check.suffices:
+        maps["corrected_map"] = corrected(data, check)
+    return check.plain() | {
+        "maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
 
 
 def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:

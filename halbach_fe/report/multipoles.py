@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, own_style, save, write_page
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
 
@@ -41,8 +41,9 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, o
 def reference_text(model: MultipoleModel) -> str:
     """Return a sentence that states the reference and the convention of multipoles."""
     where = ("of the field integrated along z" if model.integrated
-             else f"at z = {model.z:g} m (Fourier coefficients of B_r)" if model.z is not None
-             else "of the cross-section")
+             else "of the cross-section" if model.z is None
+             # the middle of a magnet is 0 to rounding
+             else f"at z = {1e3 * round(model.z, 9):.4g} mm (Fourier coefficients of B_r)")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
             f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
             "the dipole). b_n is normal and a_n skew, in axes turned about z such that the main "
@@ -143,6 +144,7 @@ def multipoles_verdict(table: MultipoleTable, limit: float | None) -> str:
     return text
 
 
+@own_style
 def write_multipoles(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
     provenance: Mapping[str, str],

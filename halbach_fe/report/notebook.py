@@ -10,8 +10,9 @@ from functools import singledispatch
 
 from matplotlib.figure import Figure
 
-from halbach_fe.api import MultipoleTables
+from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.design.demagnetization import DemagnetizationMap
+from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
@@ -23,8 +24,10 @@ from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.demagnetization import worst_block_table
 from halbach_fe.report.diagnosis import change_table, found_table, verdict
+from halbach_fe.report.forces import force_rows
+from halbach_fe.report.homogeneity import homogeneity_rows
 from halbach_fe.report.multipoles import multipole_figure
-from halbach_fe.report.page import geometry_figure
+from halbach_fe.report.page import geometry_figure, own_style
 from halbach_fe.report.plan import plan_summary
 from halbach_fe.report.prediction import prediction_profile_figure
 from halbach_fe.report.shimming import move_table
@@ -39,7 +42,7 @@ from halbach_fe.synthetic.simulate import SimulatedCampaign
 DOTS_PER_INCH = 100
 
 
-@singledispatch
+@own_style
 def html_of(result: object) -> str:
     """Return the main figure or table of a result as HTML that needs no other file.
 
@@ -48,72 +51,87 @@ def html_of(result: object) -> str:
     TypeError
         If the result is of a type without figure or table.
     """
+    return _html_of(result)
+
+
+@singledispatch
+def _html_of(result: object) -> str:
     raise TypeError(f"a {type(result).__name__} has no figure or table")
 
 
-@html_of.register
+@_html_of.register
 def _(magnet: Magnet) -> str:
     points = points_from(magnet.study.observation.positions)
     return picture(geometry_figure(magnet, points), f"The magnet {magnet.name}, with the "
                    "magnetization of its blocks and the positions of its study")
 
 
-@html_of.register
+@_html_of.register
 def _(solution: Solution) -> str:
     return picture(field_figure(solution), f"The field of {solution.magnet.name} at the study's "
                    "positions, and the solver's error bar of each reading")
 
 
-@html_of.register
+@_html_of.register
 def _(result: InferenceResult) -> str:
     return picture(prediction_profile_figure(result), "Readings, and what the model predicts "
                    "before and after the update")
 
 
-@html_of.register
+@_html_of.register
 def _(diagnosis: Diagnosis) -> str:
     words = f"<p>{html.escape(' '.join(verdict(diagnosis)))}</p>"
     return words + table(found_table(diagnosis)) + table(change_table(diagnosis))
 
 
-@html_of.register
+@_html_of.register
 def _(result: MultipoleTables) -> str:
     return "".join(picture(multipole_figure(multipoles, None), "Multipoles in units of 1e-4")
                    for _, multipoles in result.tables)
 
 
-@html_of.register
+@_html_of.register
+def _(result: HomogeneityResult) -> str:
+    return table(homogeneity_rows(result))
+
+
+@_html_of.register
+def _(result: Forces) -> str:
+    return table(force_rows(result))
+
+
+@_html_of.register
 def _(verification: Verification) -> str:
     return table(difference_table(verification))
 
 
-@html_of.register
+@_html_of.register
 def _(plan: MeasurementPlan) -> str:
     return table([{"quantity": name, "value": str(value)}
                   for name, value in plan_summary(plan).items()])
 
 
-@html_of.register
+@_html_of.register
 def _(shim: Shim) -> str:
     return table(move_table(shim))
 
 
-@html_of.register
+@_html_of.register
 def _(assignment: SortedBlocks) -> str:
     return table(order_table(assignment))
 
 
-@html_of.register
+@_html_of.register
 def _(tolerance: Tolerance) -> str:
     return table(quantile_table(tolerance))
 
 
-@html_of.register
+@_html_of.register
 def _(demagnetization: DemagnetizationMap) -> str:
     return table(worst_block_table(demagnetization.by_block()))
 
 
-@html_of.register
+@_html_of.register
 def _(campaign: SimulatedCampaign) -> str:
     points = points_of(campaign.readings)
     return table([{"study": campaign.study.name, "points": str(len(points)),

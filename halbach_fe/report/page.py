@@ -13,6 +13,7 @@ from typing import Any
 import jinja2
 import numpy as np
 import tomlkit
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
@@ -24,11 +25,15 @@ from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
-SECOND = "#009E73"
+SECOND, THIRD = "#009E73", "#CC79A7"
 IRON = "#56B4E9"
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
+
+own_style = style.context("default")
+"""Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
+need LaTeX, or a font that is not there."""
 
 Picture = tuple[str, str]
 """A figure in a page: the PNG in base64, and its caption."""

@@ -17,7 +17,15 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, draw_cross_section, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    draw_cross_section,
+    own_style,
+    save,
+    write_page,
+)
 
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
@@ -34,6 +42,7 @@ def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
     }
 
 
+@own_style
 def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
     """Write plan.csv, plan.json, plan.html and its figures."""
     table = io.StringIO()

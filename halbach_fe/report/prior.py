@@ -15,7 +15,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
-from halbach_fe.report.page import MEASURED, PUBLISHED, save, write_page
+from halbach_fe.report.page import MEASURED, PUBLISHED, own_style, save, write_page
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -61,6 +61,7 @@ def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     }
 
 
+@own_style
 def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
     """Write prior.h5, prior.json, prior.html and its figure."""
     data = xr.Dataset(

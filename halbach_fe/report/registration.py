@@ -16,7 +16,7 @@ from halbach_fe.inference.registration import axes_of_map, odds
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
-from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, save, write_page
+from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -58,9 +58,10 @@ def sentences(found: Sequence[Registration], before: str = NOMINAL) -> list[str]
             f"{100 * probability[0]:.0f} %: the magnet looks the same from there.")
     if best.undetermined:
         answer.append(
-            f"The map does not determine the {', '.join(best.undetermined)}: the prior holds "
+            f"The map by itself does not determine the {', '.join(best.undetermined)}: what was "
+            "known before (the prior, or another map on the same stage) holds "
             f"{'it' if len(best.undetermined) == 1 else 'them'}, with the standard deviations of "
-            f"the table.")
+            "the table.")
     if len(by_hypothesis(found)) > 1:
         answer.append("Odds of what is open: " + "; ".join(
             f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
@@ -183,6 +184,7 @@ def write_campaign_registration(
                     UPDATED if number else NOMINAL, one.name)
 
 
+@own_style
 def _write_page(
     study: Study, data: xr.Dataset, found: Sequence[Registration], folder: Path,
     provenance: Mapping[str, str], before: str, name: str = "",

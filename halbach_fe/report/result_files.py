@@ -9,8 +9,10 @@ from pathlib import Path
 
 import tomlkit
 
-from halbach_fe.api import MultipoleTables
+from halbach_fe.api import HomogeneityResult, MultipoleTables
+from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.design.demagnetization import DemagnetizationMap
+from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
@@ -23,6 +25,8 @@ from halbach_fe.inference.storage import write_inference
 from halbach_fe.report.campaign import write_campaign_page
 from halbach_fe.report.demagnetization import write_demagnetization
 from halbach_fe.report.diagnosis import write_diagnosis_report
+from halbach_fe.report.forces import write_forces
+from halbach_fe.report.homogeneity import write_homogeneity
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.multipoles import write_multipoles
 from halbach_fe.report.plan import write_plan
@@ -43,14 +47,14 @@ def provenance(getdp: str | None = None) -> dict[str, str]:
     return versions if getdp is None else versions | {"GetDP": getdp}
 
 
-@singledispatch
 def write_report(result: object, folder: str | Path) -> Path:
     """Write the files of a result into a folder: its tables, and its HTML page with all figures.
 
     Parameters
     ----------
-    result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, MeasurementPlan, \
-Shim, SortedBlocks, Tolerance, DemagnetizationMap or SimulatedCampaign
+    result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
+HomogeneityResult, Forces, MeasurementPlan, Shim, SortedBlocks, \
+Tolerance, DemagnetizationMap or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path
         Folder for the files; it is made if it does not exist.
@@ -63,7 +67,7 @@ Shim, SortedBlocks, Tolerance, DemagnetizationMap or SimulatedCampaign
     Raises
     ------
     OutputError
-        If a file cannot be written.
+        If a file cannot be written, or another run is using the folder.
     TypeError
         If ``result`` is of any other type.
 
@@ -75,74 +79,93 @@ Shim, SortedBlocks, Tolerance, DemagnetizationMap or SimulatedCampaign
     >>> hf.write_report(solution, "results").name
     'report.html'
     """
+    with locked_folder(Path(folder)):
+        return _write(result, folder)
+
+
+@singledispatch
+def _write(result: object, folder: str | Path) -> Path:
+    """Write the files of a result of any type; return the path of the page."""
     raise TypeError(f"there is no report for a {type(result).__name__}")
 
 
-@write_report.register
+@_write.register
 def _(result: Solution, folder: str | Path) -> Path:
     write_solution(result, Path(folder))
     write_solution_report(result, Path(folder), provenance(result.getdp))
     return Path(folder) / "report.html"
 
 
-@write_report.register
+@_write.register
 def _(result: InferenceResult, folder: str | Path) -> Path:
     write_inference(result, Path(folder))
     write_inference_report(result, Path(folder), provenance=provenance())
     return Path(folder) / "report.html"
 
 
-@write_report.register
+@_write.register
 def _(result: Diagnosis, folder: str | Path) -> Path:
-    study = result.before.study
+    study = result.corrected_study
     text = tomlkit.dumps(study.model_dump(mode="json", exclude_defaults=True))
     return write_diagnosis(result, (), study, text, Path(folder))
 
 
-@write_report.register
+@_write.register
 def _(result: Verification, folder: str | Path) -> Path:
     write_verification(result.magnet, result, Path(folder), provenance())
     return Path(folder) / "verification.html"
 
 
-@write_report.register
+@_write.register
 def _(result: MultipoleTables, folder: str | Path) -> Path:
     write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance())
     return Path(folder) / "multipoles.html"
 
 
-@write_report.register
+@_write.register
+def _(result: HomogeneityResult, folder: str | Path) -> Path:
+    write_homogeneity(result, Path(folder), provenance())
+    return Path(folder) / "homogeneity.html"
+
+
+@_write.register
+def _(result: Forces, folder: str | Path) -> Path:
+    write_forces(result, Path(folder), provenance())
+    return Path(folder) / "forces.html"
+
+
+@_write.register
 def _(result: MeasurementPlan, folder: str | Path) -> Path:
     write_plan(result.magnet, result, Path(folder))
     return Path(folder) / "plan.html"
 
 
-@write_report.register
+@_write.register
 def _(result: Shim, folder: str | Path) -> Path:
     text = tomlkit.dumps(result.study.model_dump(mode="json", exclude_defaults=True))
     write_shim(result, result.result, text, Path(folder))
     return Path(folder) / "shim.html"
 
 
-@write_report.register
+@_write.register
 def _(result: SortedBlocks, folder: str | Path) -> Path:
     write_sorted(result, None, Path(folder))
     return Path(folder) / "sort.html"
 
 
-@write_report.register
+@_write.register
 def _(result: Tolerance, folder: str | Path) -> Path:
     write_tolerance(result, Path(folder))
     return Path(folder) / "tolerance.html"
 
 
-@write_report.register
+@_write.register
 def _(result: DemagnetizationMap, folder: str | Path) -> Path:
     write_demagnetization(result, Path(folder))
     return Path(folder) / "demagnetization.html"
 
 
-@write_report.register
+@_write.register
 def _(result: SimulatedCampaign, folder: str | Path) -> Path:
     written = write_campaign(result, Path(folder))
     write_campaign_page(result.study, result.readings, result.held_out, result.blocks,
@@ -152,7 +175,7 @@ def _(result: SimulatedCampaign, folder: str | Path) -> Path:
 
 def write_diagnosis(
     diagnosis: Diagnosis, separations: Sequence[Separation], study: Study, text: str, folder: Path,
-    assumptions: Sequence[str] = (),
+    assumptions: Sequence[str] = (), origin: Path | None = None,
 ) -> Path:
     """Write summary and page of a diagnosis, and the study with the identified effects added.
 
@@ -168,6 +191,8 @@ def write_diagnosis(
     folder : Path
     assumptions : sequence of str
         Sentences that are shown at the top of the page.
+    origin : Path, optional
+        Folder of the study's file, from which paths of maps start.
 
     Returns
     -------
@@ -176,5 +201,5 @@ def write_diagnosis(
     """
     write_summary(diagnosis, separations, folder)
     write_diagnosis_report(diagnosis, separations, folder, assumptions)
-    write_study(text, study, diagnosis, folder)
+    write_study(text, study, diagnosis, folder, origin)
     return folder / "diagnosis.html"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.study.model import Study
 
 Confusion = Mapping[tuple[str, tuple[str, ...]], int]
@@ -21,9 +21,11 @@ Confusion = Mapping[tuple[str, tuple[str, ...]], int]
 its alternatives."""
 
 
+@own_style
 def write_sealed_cases(
     study: Study, results: Sequence[Mapping[str, Any]], rates: Mapping[str, float],
-    reliability: Sequence[Mapping[str, float]], confusion: Confusion, folder: Path,
+    reliability: Sequence[Mapping[str, float]], naming: Sequence[Mapping[str, float]],
+    confusion: Confusion, folder: Path,
 ) -> None:
     """Write sealed_cases.html and its figures.
 
@@ -37,6 +39,8 @@ def write_sealed_cases(
     reliability : sequence of mapping
         Bins of stated probabilities: mean stated probability (stated), frequency of the effects
         (happened), and number of statements (statements).
+    naming : sequence of mapping
+        The same of the likeliest effect of each case only.
     confusion : mapping
         See `Confusion`.
     folder : Path
@@ -46,8 +50,11 @@ def write_sealed_cases(
             _confusion(confusion), "Number of cases by the effect that was hidden alone and by the "
             "effect that was identified. Effects that a map cannot distinguish count as one"),
         "reliability.png": (
-            _reliability(reliability), "How often effects were present, against the probability "
-            "that was stated; bars are binomial 95 % intervals"),
+            _reliability({"every effect": reliability, "the likeliest effect": naming}),
+            "How often effects were present, against the probability that was stated: every effect "
+            "of every case, and the likeliest one of each case. Bars are binomial 95 % intervals. "
+            "The expected calibration error is the mean distance of the points on the right from "
+            "the line, weighted with their numbers of statements"),
         "gap.png": (
             _gap(results), "Chi² per held-out reading of every case, before and after the "
             "diagnosis; the band is 0.9 to 1.1")}
@@ -87,23 +94,24 @@ def _confusion(confusion: Confusion) -> Figure:
     return figure
 
 
-def _reliability(rows: Sequence[Mapping[str, float]]) -> Figure:
-    """Draw stated probability against frequency, with the binomial 95 % interval."""
-    figure = Figure(figsize=(5, 4.6), layout="constrained")
-    axis = figure.subplots()
-    stated = np.array([row["stated"] for row in rows])
-    counts = np.array([row["statements"] for row in rows])
-    spread = 1.96 * np.sqrt(stated * (1 - stated) / np.maximum(counts, 1))
-    axis.plot([0, 1], [0, 1], color=PUBLISHED)
-    axis.errorbar(stated, stated, np.vstack([np.minimum(spread, stated),
-                                             np.minimum(spread, 1 - stated)]),
-                  fmt="none", ecolor=PUBLISHED, capsize=3)
-    axis.plot(stated, [row["happened"] for row in rows], "o", color=POSTERIOR)
-    for row in rows:
-        axis.annotate(f"{row['statements']:.0f}", (row["stated"], row["happened"]),
-                      textcoords="offset points", xytext=(6, -10), fontsize=8)
-    axis.set(xlabel="probability stated", ylabel="frequency", xlim=(-0.03, 1.06),
-             ylim=(-0.06, 1.06))
+def _reliability(kinds: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
+    """Draw stated probability against frequency, with the binomial 95 % interval, side by side."""
+    figure = Figure(figsize=(4.6 * len(kinds), 4.4), layout="constrained")
+    for axis, (kind, rows) in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds.items(),
+                                  strict=True):
+        stated = np.array([row["stated"] for row in rows])
+        counts = np.array([row["statements"] for row in rows])
+        spread = 1.96 * np.sqrt(stated * (1 - stated) / np.maximum(counts, 1))
+        axis.plot([0, 1], [0, 1], color=PUBLISHED)
+        axis.errorbar(stated, stated, np.vstack([np.minimum(spread, stated),
+                                                 np.minimum(spread, 1 - stated)]),
+                      fmt="none", ecolor=PUBLISHED, capsize=3)
+        axis.plot(stated, [row["happened"] for row in rows], "o", color=POSTERIOR)
+        for row in rows:
+            axis.annotate(f"{row['statements']:.0f}", (row["stated"], row["happened"]),
+                          textcoords="offset points", xytext=(6, -10), fontsize=8)
+        axis.set(title=kind, xlabel="probability stated", ylabel="frequency", xlim=(-0.03, 1.06),
+                 ylim=(-0.06, 1.06))
     return figure
 
 

@@ -22,6 +22,7 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     draw_cross_section,
+    own_style,
     save,
     write_page,
 )
@@ -63,6 +64,7 @@ class Sensitivity:
     information: Mapping[str, tuple[Ints, Floats]]
 
 
+@own_style
 def write_sensitivity(
     magnet: Magnet, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, object]],
 ) -> None:

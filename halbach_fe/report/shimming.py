@@ -20,6 +20,7 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     draw_cross_section,
+    own_style,
     save,
     write_page,
 )
@@ -101,6 +102,7 @@ def _place_text(shim: Shim, number: int) -> str:
     return block.label or f"ring {block.ring} slot {block.slot}"
 
 
+@own_style
 def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> None:
     """Write shim.json, shim.html and its figures, and study.shimmed.toml.
 
@@ -129,8 +131,8 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
                 "including their uncertainty")}
     write_page(folder / "shim.html", "shim.html.j2", save(figures, folder), study=shim.study,
                shim=shim, summary=summary, moves=move_table(shim), stop=STOPS[shim.stop],
-               reference=reference_text(shim.model), conflict=result.prior_conflict
-               > result.conflict_limit, rows=text_table(before=shim.before, after=shim.after))
+               reference=reference_text(shim.model), conflict=result.disagreement,
+               rows=text_table(before=shim.before, after=shim.after))
 
 
 def _moves_figure(shim: Shim) -> Figure:

@@ -18,6 +18,7 @@ from halbach_fe.report.page import (
     SECOND,
     axis_of_points,
     geometry_figure,
+    own_style,
     save,
     stacked_axes,
     write_page,
@@ -29,6 +30,7 @@ from halbach_fe.study.types import COMPONENTS
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 
+@own_style
 def write_solution_report(
     solution: Solution, folder: Path, provenance: Mapping[str, str]
 ) -> None:

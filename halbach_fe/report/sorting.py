@@ -12,7 +12,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.design.sorting import SortedBlocks
 from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.response.multipoles import Multipoles, plain, text_table
 
 QUANTILES = (0.01, 0.5, 0.99)
@@ -40,6 +40,7 @@ def order_table(found: SortedBlocks) -> list[dict[str, str]]:
     return text_table(**{found.own_order: found.numbered, "sorted": found.best})
 
 
+@own_style
 def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None:
     """Write blocks.sorted.csv, sort.json, sort.html and its figures."""
     write_blocks(found.table, folder / "blocks.sorted.csv")

@@ -12,7 +12,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.tolerance import QUANTILES, Tolerance
 from halbach_fe.report.multipoles import reference_summary, reference_text
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.response.multipoles import plain
 
 
@@ -51,6 +51,7 @@ def quantile_table(found: Tolerance) -> list[dict[str, str]]:
     return rows
 
 
+@own_style
 def write_tolerance(found: Tolerance, folder: Path) -> None:
     """Write tolerance.json, tolerance.html and its figures."""
     summary = tolerance_summary(found)

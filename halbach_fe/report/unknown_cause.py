@@ -81,7 +81,8 @@ def part_in_words(part: UnknownPart) -> str:
                  f"{names.replace(', ', ', B')}",
         "positions": f"an error of {1e3 * part.size:.2g} mm rms of the probe's position along "
                      f"{names}"}[part.acts_on]
-    text = f"{target}, a {texture} function of {COORDINATES[part.along]}"
+    where = f" in map {part.map}" if part.map else ""
+    text = f"{target}{where}, a {texture} function of {COORDINATES[part.along]}"
     if part.half_wave is not None:
         factor, unit = HALF_WAVES[part.along]
         text += f" that changes within some {factor * part.half_wave:.2g} {unit}"
@@ -92,9 +93,11 @@ def part_in_words(part: UnknownPart) -> str:
 
 
 def _alternative(text: str) -> str:
-    """Describe another family, given what it acts on and its coordinate."""
-    acts_on, _, along = text.partition(" ")
-    return f"{acts_on} along {COORDINATES[along]}" if along else "a field"
+    """Describe another family by its name, see `Family.name`."""
+    family, _, where = text.partition(" in map ")
+    acts_on, _, along = family.partition(" ")
+    said = f"{acts_on} along {COORDINATES[along]}" if along else "a field"
+    return f"{said} in map {where}" if where else said
 
 
 def suspicion_sentences(suspicion: Suspicion, titles: dict[str, str]) -> list[str]:

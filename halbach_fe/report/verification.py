@@ -21,17 +21,19 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
+    THIRD,
     axis_of_points,
     geometry_figure,
+    own_style,
     save,
     stacked_axes,
     write_page,
 )
 from halbach_fe.response.discretization_error import REFINEMENT
-from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, Verification
+from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, STEPS, Verification
 
-COLOURS = (PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
-MARKERS = ("^", "o", ".", "s", "x")
+COLOURS = (THIRD, PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
+MARKERS = ("v", "^", "o", ".", "s", "x")
 
 
 def difference_table(found: Verification) -> list[dict[str, str]]:
@@ -79,15 +81,17 @@ def error_basis(found: Verification) -> str:
     boundary = (", plus the change that a boundary farther away makes"
                 if found.route != "moments" else "")
     text = ("The estimated error is the total change that all further refinements would make"
-            f"{boundary}. It assumes that the changes by successive refinements decrease by the "
-            f"same factor as the last two do (order {found.order:.1f}{limit} in the element size).")
-    if len(found.differences) > 3:
+            f"{boundary}. It assumes that the changes by successive refinements go on to decrease "
+            f"by the same factor as these {STEPS} do, or as the last two if these decrease less "
+            f"(order {found.order:.1f}{limit} in the element size).")
+    if len(found.differences) > STEPS + 1:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
                  "concerned. The difference between the two formulations is the solver's error bar "
                  "of the readings, and not part of the estimate.")
     return text
 
 
+@own_style
 def write_verification(
     magnet: Magnet, found: Verification, folder: Path, provenance: Mapping[str, str]
 ) -> None:
@@ -99,10 +103,10 @@ def write_verification(
         write_csv(columns | {f"{difference.what} in T": change for difference, change in zip(
             found.differences, found.changes, strict=True)}, {"study": magnet.name}, temporary)
     figures = {}
-    if found.changes[:2].any():
+    if found.changes[:STEPS].any():
         figures["verification_convergence.png"] = _convergence_figure(found), (
             "Relative change of the field against element size, both logarithmic: change by the "
-            "next finer mesh with the slope between the two, estimated error of the study's own "
+            "next finer mesh with the slope of the order, estimated error of the study's own "
             "mesh, and for comparison the changes by a boundary farther away and by another "
             "formulation")
         figures["verification_along.png"] = _change_figure(found), (
@@ -110,7 +114,7 @@ def write_verification(
     figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (
         "The blocks of the first ring with their easy axes, the iron ring if the study has one, "
         "and the study's positions")
-    change = found.changes[1]
+    change = found.changes[STEPS - 1]
     write_page(
         folder / "verification.html", "verification.html.j2", save(figures, folder),
         study=magnet.study, magnet_rows=magnet_rows(magnet),
@@ -127,22 +131,22 @@ def _convergence_figure(found: Verification) -> Figure:
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
-    sizes = size * np.array([REFINEMENT, 1.0])
-    steps = np.array([difference.pointwise for difference in found.differences[:2]])
-    line = size * np.array([REFINEMENT, 1 / REFINEMENT])
+    sizes = size * np.array([REFINEMENT**2, REFINEMENT, 1.0])
+    steps = np.array([difference.pointwise for difference in found.differences[:STEPS]])
+    line = size * np.array([REFINEMENT**2, 1 / REFINEMENT])
     axis.plot(sizes, steps, "o", color=POSTERIOR, label="change by the next finer mesh")
-    axis.plot(line, steps[1] * (line / size)**found.order, "-", color=POSTERIOR, lw=0.8,
+    axis.plot(line, steps[-1] * (line / size)**found.order, "-", color=POSTERIOR, lw=0.8,
               label=f"order {found.order:.1f}")
     axis.plot(size, found.error_pointwise, "*", ms=12, color=PRIOR,
               label="estimated error of the study's mesh")
-    for difference, style, colour in zip(found.differences[2:], ("--", ":", "-."),
+    for difference, style, colour in zip(found.differences[STEPS:], ("--", ":", "-."),
                                          (PUBLISHED, SECOND, MEASURED), strict=False):
         if difference.pointwise > 0:
             axis.axhline(difference.pointwise, ls=style, color=colour,
                          label=difference.what.replace("_", " "))
     axis.set(xscale="log", yscale="log", xlabel="element size at the magnet in mm",
              ylabel="change of B over the largest field")
-    axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT]))
+    axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT, REFINEMENT**2]))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3, which="both")

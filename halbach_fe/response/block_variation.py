@@ -137,6 +137,16 @@ class Variations:
                 ).reshape(len(by_part), 3, -1)
         return found
 
+    def field(self, amplitudes: Floats, points: Floats) -> Floats:
+        """Return B (n, 3) in T of all variations together at points (n, 3) in m.
+
+        Distant cells are summed by expansions.
+        """
+        parts = np.split(amplitudes, np.cumsum([each.shape[-1] for each in self.polarization])[:-1])
+        polarization = np.concatenate([
+            each @ part for each, part in zip(self.polarization, parts, strict=True)])
+        return self.interaction.field_at(points, polarization)
+
 
 def _some(cells: Cells, chosen: slice) -> Cells:
     """Return some of the cells."""

@@ -14,9 +14,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +27,9 @@ import xarray as xr
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest
-from halbach_fe.core.errors import GetDPError, OutputError
+from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
-from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.core.hdf5 import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import Variations
@@ -64,23 +66,28 @@ class StoredMatrix:
     path : Path
     shape : tuple of int
         Numbers of rows and columns.
+    sha256 : str
+        SHA-256 of the file as it was written.
     """
 
     path: Path
     shape: tuple[int, int]
+    sha256: str
 
     @classmethod
     def of(cls, parts: Iterable[Floats], shape: tuple[int, int], path: Path) -> StoredMatrix:
         """Write a matrix whose rows arrive in parts (k, m)."""
+        digest = hashlib.sha256()
         with atomic(path) as temporary, temporary.open("wb") as file:
-            file.write(_npy_header(shape))
-            for part in parts:
-                file.write(np.ascontiguousarray(part, "<f8").data)
-        return cls(path, shape)
+            for content in chain([_npy_header(shape)], (
+                    np.ascontiguousarray(part, "<f8").tobytes() for part in parts)):
+                digest.update(content)
+                file.write(content)
+        return cls(path, shape, digest.hexdigest())
 
     @classmethod
-    def at(cls, path: Path, shape: tuple[int, int]) -> StoredMatrix:
-        """Return the matrix in a file that was written before.
+    def at(cls, path: Path, shape: tuple[int, int], sha256: str) -> StoredMatrix:
+        """Return the matrix in a file that was written before, after reading it once.
 
         Raises
         ------
@@ -91,8 +98,11 @@ class StoredMatrix:
         with path.open("rb") as file:
             if file.read(len(header)) != header or (
                     path.stat().st_size != len(header) + 8 * shape[0] * shape[1]):
-                raise ValueError(f"{path} is not a matrix {shape}")
-        return cls(path, shape)
+                raise ValueError(f"{path.name} is not a matrix {shape}")
+            file.seek(0)
+            if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+                raise ValueError(f"the content of {path.name} differs from its checksum")
+        return cls(path, shape, sha256)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -310,9 +320,11 @@ def _write(path: Path, key: str, built: Response) -> None:
          "error": ("reading", built.error, {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error})
-    if not isinstance(built.matrix, StoredMatrix):
+    if isinstance(built.matrix, StoredMatrix):
+        data.attrs["matrix_sha256"] = built.matrix.sha256
+    else:
         data["H"] = (("reading", "parameter"), built.matrix, {"units": "T m/A"})
-    write_hdf5(data, path)
+    write_hdf5(with_checksum(data), path)
     for other in path.parent.glob("response-*.npy"):
         if "H" in data or other != _beside(path, key):
             other.unlink()  # it belongs to other inputs
@@ -324,19 +336,27 @@ def _beside(path: Path, key: str) -> Path:
 
 
 def _read(path: Path, key: str) -> Response | None:
-    """Return the stored response; None if it is missing, damaged, or belongs to other inputs."""
+    """Return the stored response; None if it is missing, damaged, or belongs to other inputs.
+
+    A damaged one causes a warning.
+    """
     try:
-        data = untrusted.read_dataset(path)
+        data = read_hdf5(path)
         if data.attrs["key"] != key:
             return None
         names = tuple(map(str, data["parameter"].values))
         readings, parameters = (len(data["offset"]),), (len(names),)
         matrix = (untrusted.finite_array(data["H"], readings + parameters) if "H" in data
-                  else StoredMatrix.at(_beside(path, key), readings + parameters))
+                  else StoredMatrix.at(_beside(path, key), readings + parameters,
+                                       str(data.attrs["matrix_sha256"])))
         return Response(matrix, names,
                         untrusted.finite_array(data["nominal"], parameters),
                         untrusted.finite_array(data["offset"], readings),
                         untrusted.finite_array(data["error"], readings),
                         float(data.attrs["superposition_error"]), reused=True)
-    except (OSError, EOFError, KeyError, ValueError, TypeError):
+    except FileNotFoundError:
+        return None
+    except (OSError, EOFError, KeyError, ValueError, TypeError) as error:
+        warnings.warn(f"The stored response matrix {path} cannot be used ({error}) and is computed "
+                      "again.", HalbachWarning, stacklevel=2)
         return None

@@ -21,7 +21,7 @@ from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, far
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import Session, alone
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
@@ -29,8 +29,12 @@ HARMONICS = 8
 """Number of harmonics that are compared if the study does not state a number."""
 
 EXACT = "exact field"
-OWN, COARSER, FINER, FARTHER = (
-    "the study's mesh", "a coarser mesh", "a finer mesh", "a farther boundary")
+OWN, COARSEST, COARSER, FINER, FARTHER = (
+    "the study's mesh", "a much coarser mesh", "a coarser mesh", "a finer mesh",
+    "a farther boundary")
+
+STEPS = 3
+"""Number of changes by successive refinements, which come first among the differences."""
 
 FLATTEST, STEEPEST = 0.5, 4.0
 """Limits of the observed order of convergence, see `observed_order`."""
@@ -70,9 +74,10 @@ class Verification(ShownInNotebook):
         Formulation by which the field is solved, see
         `halbach_fe.solver.formulation_choice.choose_route`.
     differences : tuple of Difference
-        Between the coarser and the study's mesh, the study's and the finer mesh, and the nearer and
-        the farther boundary; then to the dual formulation if the route has one, and to the exact
-        field if it is known (method ``direct``, all permeabilities 1, no iron).
+        Between the much coarser and the coarser mesh, the coarser and the study's, the study's and
+        the finer mesh, and the nearer and the farther boundary; then to the dual formulation if the
+        route has one, and to the exact field if it is known (method ``direct``, all permeabilities
+        1, no iron).
     order : float
         Observed order of convergence in the element size, between 0.5 and 4.
     error_pointwise : float
@@ -97,7 +102,7 @@ class Verification(ShownInNotebook):
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
     >>> verification = hf.verify(magnet, hf.Session.open("results"))
-    >>> verification.differences[0].what
+    >>> verification.differences[1].what
     "coarser mesh to the study's"
     """
 
@@ -121,12 +126,13 @@ class Verification(ShownInNotebook):
             "differences": [asdict(difference) for difference in self.differences]}
 
 
+@alone
 def verify(
     magnet: Magnet, session: Session, say: Callable[[str], None] = lambda _: None
 ) -> Verification:
     """Estimate the error of the solved field of the nominal magnet.
 
-    The field is solved on a coarser mesh, the study's own and a finer one, with the boundary
+    The field is solved on two coarser meshes, the study's own and a finer one, with the boundary
     farther away, and by the dual formulation if the route has one.
 
     Parameters
@@ -164,7 +170,8 @@ def verify(
         fields[purpose] = solve_nominal(variant, points, session)
     base, coarse, fine = (fields[purpose] for purpose in (OWN, COARSER, FINER))
     compare = _Comparison(magnet, points, base)
-    pairs = {"coarser mesh to the study's": (coarse, base),
+    pairs = {"much coarser mesh to the coarser": (fields[COARSEST], coarse),
+             "coarser mesh to the study's": (coarse, base),
              "the study's mesh to a finer": (base, fine)}
     pairs |= {description: (base, fields[purpose]) for purpose, description in (
         (FARTHER, "boundary farther away"), (f"the dual route, {DUAL.get(route)}",
@@ -173,14 +180,15 @@ def verify(
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)
     steps = [compare(description, *pair) for description, pair in pairs.items()]
-    order = observed_order(steps[0].pointwise, steps[1].pointwise)
+    order = observed_order(*(step.pointwise for step in steps[:STEPS]))
+    last = steps[STEPS - 1]
     if EXACT in pairs:
         error, fourier = steps[-1].pointwise, steps[-1].fourier
     else:
         series = 1 / (1 - REFINEMENT**-order)
-        boundary = steps[2:3] if FARTHER in fields else []
-        error = series * steps[1].pointwise + sum(step.pointwise for step in boundary)
-        fourier = None if steps[1].fourier is None else series * steps[1].fourier + sum(
+        boundary = steps[STEPS:STEPS + 1] if FARTHER in fields else []
+        error = series * last.pointwise + sum(step.pointwise for step in boundary)
+        fourier = None if last.fourier is None else series * last.fourier + sum(
             step.fourier or 0.0 for step in boundary)
     return Verification(
         magnet=magnet, route=route, differences=tuple(steps), order=order, error_pointwise=error,
@@ -193,11 +201,12 @@ def verify(
 def variants_to_compare(magnet: Magnet, points: Floats) -> dict[str, Magnet]:
     """Return the magnets that `verify` solves at the points (n, 3) in m, by a description.
 
-    They are the magnet with the study's mesh, with a coarser and a finer one, with a farther
+    They are the magnet with the study's mesh, with two coarser ones and a finer one, with a farther
     boundary if there is one, and with the dual formulation if the route has one.
     """
     route = choose_route(magnet, points)
-    variants = {OWN: magnet, COARSER: refined(magnet, 1 / REFINEMENT),
+    coarser = refined(magnet, 1 / REFINEMENT)
+    variants = {OWN: magnet, COARSEST: refined(coarser, 1 / REFINEMENT), COARSER: coarser,
                 FINER: refined(magnet, REFINEMENT)}
     if route != "moments":
         variants[FARTHER] = farther(magnet, MESHES[route], REFINEMENT)
@@ -216,16 +225,26 @@ def _element_size(magnet: Magnet, route: str) -> float:
     return magnet.study.mesh.block_size_m
 
 
-def observed_order(first: float, second: float) -> float:
-    """Return the order of convergence from two successive changes, limited to 0.5 ... 4.
+def observed_order(*changes: float) -> float:
+    """Return the order of convergence from successive changes, limited to 0.5 ... 4.
+
+    It is the slope of the straight line through all changes, on logarithmic scales, or that between
+    the last two if it is smaller: coarse meshes may converge fast where the study's own no longer
+    does. Leading changes of 0, by meshes that cannot be made any coarser, are left out.
 
     The lower limit makes the error estimate of a solve that does not converge large (5.4 times the
-    last change) but finite. The upper limit keeps a second change that is small by chance from
+    last change) but finite. The upper limit keeps a last change that is small by chance from
     passing for an exact result.
     """
-    if first <= 0 or second <= 0:
-        return STEEPEST if second <= 0 else FLATTEST
-    return float(np.clip(np.log(first / second) / np.log(REFINEMENT), FLATTEST, STEEPEST))
+    if changes[-1] <= 0:
+        return STEEPEST
+    first = next(number for number, change in enumerate(changes) if change > 0)
+    seen = np.log(np.maximum(changes[first:], np.finfo(float).tiny))
+    if len(seen) < 2:
+        return FLATTEST
+    slope = np.polyfit(np.arange(len(seen)), seen, 1)[0]
+    drop = -max(slope, seen[-1] - seen[-2])
+    return float(np.clip(drop / np.log(REFINEMENT), FLATTEST, STEEPEST))
 
 
 class _Comparison:

@@ -42,6 +42,11 @@ UNITS = 1e4
 DEFAULT_RADIUS = 2 / 3
 """Default reference radius relative to the inner radius of the blocks, the usual choice."""
 
+LEAST_RADIUS, MOST_RADIUS = 1e-3, 0.95
+"""Smallest and largest reference radius relative to the inner radius of the blocks. Far inside,
+multipoles of high orders are zero to all digits; nearer to the blocks, sums over angles and z need
+very many points, and finite elements are inexact."""
+
 DEFAULT_ORDERS = tuple(range(1, 11))
 """Default orders of multipoles."""
 
@@ -263,16 +268,9 @@ def multipole_models(
     main = magnet.array.multipole_order
     wanted, observations = [], []
     for reference in references:
-        orders = tuple(sorted(set(reference.orders) - {main}))
-        if not orders:
-            raise StudyError(must_be("--orders", f"study {magnet.name}",
-                                     "those of unwanted multipoles", "only the main order"))
-        if magnet.dimension == 2 and reference.z_m is not None:
-            raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
-                                     f"{reference.z_m:g}"))
-        wanted.append((orders, _radius(magnet, reference), reference.z_m))
-        observations.append(
-            _observation(magnet, wanted[-1][1], max(*orders, main), reference.z_m))
+        orders, radius = unwanted_orders(magnet, reference)
+        wanted.append((orders, radius, reference.z_m))
+        observations.append(_observation(magnet, radius, max(*orders, main), reference.z_m))
     bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(concatenate, observations), session)
     models, first = [], 0
@@ -292,6 +290,31 @@ def multipole_models(
             phases * _complexes(model.offset[part])[index], model.error[part][index],
             model.nominal, -turn))
     return models
+
+
+def unwanted_orders(
+    magnet: Magnet, reference: MultipoleReference
+) -> tuple[tuple[int, ...], float]:
+    """Return the orders of the unwanted multipoles, and the reference radius in m.
+
+    Raises
+    ------
+    StudyError
+        If the reference does not fit the study.
+    """
+    orders = tuple(sorted(set(reference.orders) - {magnet.array.multipole_order}))
+    if not orders:
+        raise StudyError(must_be("--orders", f"study {magnet.name}",
+                                 "those of unwanted multipoles", "only the main order"))
+    if magnet.dimension == 2 and reference.z_m is not None:
+        raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
+                                 f"{reference.z_m:g}"))
+    if reference.z_m is not None and abs(reference.z_m) > _reach(magnet):
+        raise StudyError(must_be(
+            "--at-z-m", f"study {magnet.name}",
+            f"from {-_reach(magnet):.3g} to {_reach(magnet):.3g} m, where there is some field",
+            f"{reference.z_m:g}", "Was it meant in millimetres?"))
+    return orders, _radius(magnet, reference)
 
 
 def circle_models(
@@ -415,7 +438,7 @@ def _read_circles(
             rows & (positions[:, 0] == radius) & (positions[:, 2] == z))]) for radius, z in circles]
     x, y = (np.flatnonzero(labels == name) for name in ("Bx", "By"))
     harmonics = min(len(DEFAULT_ORDERS), (settings.angles - 1) // 2)
-    if len(x) != len(y) or harmonics < 1 or (positions[x] != positions[y]).any():
+    if not len(x) or len(x) != len(y) or harmonics < 1 or (positions[x] != positions[y]).any():
         return []
     try:
         analysis, _, where = fourier_analysis(positions[x], FourierCoefficients(
@@ -477,10 +500,12 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
     if radius is None:
         own = positions.radius_m if isinstance(positions, CirclePositions) else ()
         radius = own[0] if len(own) == 1 else DEFAULT_RADIUS * bore
-    if not 0 < radius < bore:
-        raise StudyError(must_be("--reference-radius-m", f"study {magnet.name}",
-                                 f"between 0 and the blocks' inner radius of {bore:g} m",
-                                 f"{radius:g}", "Was it meant in millimetres?"))
+    if not LEAST_RADIUS * bore <= radius <= MOST_RADIUS * bore:
+        raise StudyError(must_be(
+            "--reference-radius-m", f"study {magnet.name}",
+            f"from {LEAST_RADIUS * bore:g} to {MOST_RADIUS * bore:.4g} m, as the blocks' inner "
+            f"radius is {bore:g} m", f"{radius:g}",
+            "Was it meant in millimetres?" if radius >= bore else ""))
     return radius
 
 
@@ -511,17 +536,27 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
                        positions[:2 * highest])
 
 
+MAIN_UNITS = 9000.0
+"""Size of a multipole that can only be the main one, in units of it; its axes turn by little."""
+
+
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     """Return a row of text per order, with ``b_n ± sd`` and ``a_n ± sd`` in units.
 
-    The columns are multipoles of the same orders, each by a name for the heading.
+    The columns are multipoles of the same orders, each by a name for the heading. The main
+    multipole, 10 000 units by definition, is no error: its cell has a word.
     """
+    def text(known: Multipoles, number: int) -> str:
+        if known.mean[number] > MAIN_UNITS:
+            return "main"
+        return f"{known.mean[number]:+.2f} ± {known.sd[number]:.2f}"
+
     first = next(iter(columns.values()))
     rows = []
     for i, order in enumerate(first.orders):
         row = {"n": str(order)}
         for letter, number in (("b", i), ("a", len(first.orders) + i)):
-            row |= {f"{letter}_n {name}": f"{column.mean[number]:+.2f} ± {column.sd[number]:.2f}"
+            row |= {f"{letter}_n {name}": text(column, number)
                     for name, column in columns.items()}
         rows.append(row)
     return rows

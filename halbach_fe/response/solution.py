@@ -19,7 +19,7 @@ from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import Session, alone
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ def study_observation(magnet: Magnet) -> Observation:
     return observation
 
 
+@alone
 def solve(magnet: Magnet, session: Session) -> Solution:
     """Solve for the field of the nominal magnet at the study's positions.
 

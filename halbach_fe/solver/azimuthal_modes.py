@@ -202,7 +202,8 @@ class _Case:
 
 
 def solve_modes(
-    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session
+    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
+    highest: int | None = None,
 ) -> Floats:
     """Return the finite-element part of B of the nominal array and of single blocks, mode by mode.
 
@@ -220,6 +221,8 @@ def solve_modes(
         Numbers, from 0, of the blocks to solve for with a remanence of 1 T along x, y and z. Since
         the blocks of a ring share their solutions, more blocks of the same ring cost nothing more.
     session : Session
+    highest : int, optional
+        The highest mode, by default `modes_needed`.
 
     Returns
     -------
@@ -229,7 +232,7 @@ def solve_modes(
     r = np.hypot(points[:, 0], points[:, 1])
     r[r < AXIS_RADIUS * magnet.bore_radius] = 0.0
     meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
-    highest = modes_needed(magnet, points)
+    highest = modes_needed(magnet, points) if highest is None else highest
     mesh: VerifiedMesh | CountedMesh
     if session.counter is None:
         mesh = verify_mesh(build_meridian(magnet, make_folder(session.folder)))

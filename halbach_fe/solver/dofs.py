@@ -72,7 +72,9 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
     try:
         text = path.read_text(encoding="ascii")
         rows = _section(text, "DofData", skip=5)
-        table = np.array([line.split()[:5] for line in rows], float)
+        if not rows:
+            raise ValueError("no unknowns")
+        table = np.loadtxt(rows, usecols=range(5), comments=None, ndmin=2)
         if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
             raise ValueError("an entity or unknown has an impossibly large number")
         table = table.astype(int)
@@ -106,9 +108,11 @@ def _entities(text: str, name: str, count: int) -> Ints:
 
     The elements with other numbers of edges or faces are those of the boundary.
     """
-    rows = [line.split() for line in _section(text, name, skip=1)]
-    wanted = [row[2:] for row in rows if row[1] == str(count)]
-    return np.array(wanted, int).reshape(-1, count)
+    wanted = [line for line in _section(text, name, skip=1)
+              if line.split(maxsplit=2)[1] == str(count)]
+    if not wanted:
+        return np.zeros((0, count), int)
+    return np.loadtxt(wanted, int, comments=None, usecols=range(2, 2 + count), ndmin=2)
 
 
 def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> NDArray[np.floating]:

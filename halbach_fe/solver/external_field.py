@@ -11,13 +11,20 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.magnet import Neighbour
+from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
 
 def external_field(magnet: Magnet, points: Floats) -> Floats:
-    """Return B (n, 3) in T of the study's external sources at points (n, 3) in m."""
+    """Return B (n, 3) in T of the study's external sources at points (n, 3) in m.
+
+    Raises
+    ------
+    StudyError
+        If a point is at a dipole.
+    """
     external = magnet.external
+    check_apart(external, points, magnet.name)
     field = np.tile(external.background_T, (len(points), 1)).astype(float)
     for neighbour in external.neighbours:
         field += neighbour_field(magnet, neighbour, points)

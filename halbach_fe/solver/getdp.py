@@ -25,7 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import GetDPError, GetDPNotFoundError
+from halbach_fe.core.errors import GetDPError, GetDPNotFoundError, HalbachError, OutputError
+from halbach_fe.core.files import is_full
 
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
 LOG_NAME = "getdp.log"
@@ -84,9 +85,11 @@ processes is the user's choice, even if it exceeds the cores that Open MPI count
 _INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp libopenblas0-pthread`), or name it "
             f"with --getdp or {ENVIRONMENT_VARIABLE}.")
 _COLOURS = re.compile(r"\x1b\[\d*m")
+DISK_FULL = "the disk is full"
 _NAMED_FAILURES = (  # pattern in the log, and its meaning
     (r"KSPSolve has not converged|KSP_DIVERGED|DIVERGED_", "the linear solver did not converge"),
-    (r"[Nn]o space left", "the disk is full"),
+    (r"[Nn]o space left|[Dd]isk quota|[Ff]ile too large", DISK_FULL),
+    (r"bad_alloc|[Oo]ut of memory|[Cc]annot allocate", "memory ran out"),
     (r"Newton's method did not converge", "Newton's method did not converge"),
     (r"MUMPS|INFOG|MatSolve.*mumps|factorization", "MUMPS could not factorize the matrix"),
     (r"IterativeLoop did NOT converge|not converge", "an iteration did not converge"),
@@ -343,14 +346,25 @@ def _check_before(job: Job, folder: Path) -> None:
                        "declares, and GetDP would ignore it", folder)
 
 
+WARDEN = """exec 3<&0 </dev/null
+(read _ <&3; kill -KILL -$$) >/dev/null 2>&1 &
+exec "$@" 3<&-
+"""
+"""Shell script that becomes GetDP, whose process group ends when standard input does: when this
+process closes it, or ends in whatever way. GetDP may be a wrapper that starts other processes, such
+as the modules of a cluster."""
+
+
 def _launcher(job: Job) -> list[str]:
     """Return the command that GetDP's own command line is appended to.
 
-    The operating system then kills GetDP when its parent process ends, in whatever way. With
-    several processes ``mpirun`` starts GetDP.
+    With several processes ``mpirun`` starts GetDP in process groups of its own; there the operating
+    system kills GetDP when ``mpirun`` ends.
     """
-    tether = _tether()
-    return tether if job.processes == 1 else [*tether, "mpirun", "-n", str(job.processes), *tether]
+    warden = ["/bin/sh", "-c", WARDEN, "getdp"]
+    if job.processes == 1:
+        return warden
+    return [*warden, "mpirun", "-n", str(job.processes), *_tether()]
 
 
 @cache
@@ -382,7 +396,7 @@ def _execute(
         raise _failure("`mpirun` was not found (Debian: openmpi-bin)", folder)
     try:
         process = subprocess.Popen(
-            [*_launcher(job), *arguments], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+            [*_launcher(job), *arguments], cwd=folder, env=environment, stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
             start_new_session=True)
     except OSError as error:
@@ -415,6 +429,8 @@ def _execute(
     finally:
         if process.poll() is None:
             _kill(process)
+        assert process.stdin is not None
+        process.stdin.close()  # ends what GetDP has left behind
         if reader.is_alive():
             reader.join(timeout=10)
         _save_log(folder, arguments, lines)
@@ -422,8 +438,12 @@ def _execute(
         raise _failure(reason, folder)
     if process.returncode < 0:
         name = signal.Signals(-process.returncode).name
-        hint = {"SIGKILL": "; out of memory?", "SIGXFSZ": "; a file grew over its limit"}
+        if name == "SIGXFSZ":
+            raise _failure(f"{DISK_FULL}, or a file grew over its limit ({name})", folder)
+        hint = {"SIGKILL": "; out of memory?"}
         raise _failure(f"it crashed ({name}{hint.get(name, '')})", folder)
+    if process.returncode in (126, 127) and not os.access(arguments[0], os.X_OK):
+        raise _failure("it could not be started (No such file, or none that can be run)", folder)
     if process.returncode:
         error_line = next((line for line in lines if re.match(r"\s*Error\s*:", line)), "")
         quoted = error_line.partition(":")[2].strip() or (
@@ -508,11 +528,16 @@ def _name_of(text: str, otherwise: str) -> str:
     return next((name for pattern, name in _NAMED_FAILURES if re.search(pattern, text)), otherwise)
 
 
-def _failure(reason: str, folder: Path) -> GetDPError:
-    """Return the error of a run, with a hint if the disk is full and the log if there is one."""
-    hint = ""
-    if shutil.disk_usage(folder).free < 10_000_000:
-        hint = " The disk is full: free some space."
+def _failure(reason: str, folder: Path) -> HalbachError:
+    """Return the error of a run: of the disk if that is full, else GetDP's with its log."""
+    if is_full(folder) or reason.startswith(DISK_FULL):
+        return disk_error(folder.parent, reason)
     log = folder / LOG_NAME
-    return GetDPError(f"GetDP did not give a result that can be trusted: {reason}.{hint}",
+    return GetDPError(f"GetDP did not give a result that can be trusted: {reason}.",
                       log if log.is_file() else None)
+
+
+def disk_error(folder: Path, reason: str) -> OutputError:
+    """Return the error of a run that failed for want of space in a folder of results."""
+    return OutputError(f"The disk of {folder} is full, and GetDP failed: {reason}. Free some space "
+                       "there, or choose another folder.")

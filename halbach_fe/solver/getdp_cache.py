@@ -6,16 +6,23 @@ GetDP. The entry holds the files that GetDP wrote, and a manifest with the SHA-2
 which is verified whenever the entry is used. Entries are complete when they become visible (by a
 rename), and no process owns them, so that several processes may share a cache. When the cache
 exceeds its size limit, the least recently used entries are removed.
+
+The hashes reveal damage, not malice: whoever may write into the cache can replace an answer
+together with its hash. So a cache that other users may write to is refused unless the user trusts
+them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import grp
 import hashlib
 import json
 import os
+import pwd
 import re
 import shutil
+import stat
 import time
 import uuid
 import warnings
@@ -25,7 +32,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
-from halbach_fe.core.errors import HalbachWarning, OutputError
+from halbach_fe.core.errors import MAX_QUOTED, HalbachWarning, OutputError, printable
 from halbach_fe.core.temporary_files import remove_orphans, temporary_name
 from halbach_fe.solver.getdp import LOG_NAME, GetDP, Job
 
@@ -34,6 +41,9 @@ FOLDER_VARIABLE = "HALBACH_FE_CACHE"
 
 LIMIT_VARIABLE = "HALBACH_FE_CACHE_LIMIT_GIB"
 """Environment variable with the size limit of the cache in GiB; 0 switches the cache off."""
+
+TRUST_VARIABLE = "HALBACH_FE_CACHE_TRUSTED"
+"""Environment variable that is 1 if a cache to which other users may write is used as well."""
 
 DEFAULT_LIMIT_GIB = 20.0
 MANIFEST = "manifest.json"
@@ -216,7 +226,9 @@ class Entry:
         if sum(path.stat().st_size for path in written) > self.cache.limit_bytes:
             return False
         try:
-            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            # whatever the umask, others may not write
+            self.cache.folder.mkdir(0o755, parents=True, exist_ok=True)
+            self.folder.parent.mkdir(0o755, exist_ok=True)
             # not by tempfile.mkdtemp, whose folders only their owner may read
             temporary = self.folder.with_name(
                 temporary_name(self.folder.name[:8]) + uuid.uuid4().hex)
@@ -259,7 +271,8 @@ def default_cache(folder: Path | None = None) -> Cache | None:
     Raises
     ------
     OutputError
-        If the limit in the environment is not a number of at least 0.
+        If the limit in the environment is not a number of at least 0, or other users may write to
+        the cache and $HALBACH_FE_CACHE_TRUSTED is not 1.
     """
     text = os.environ.get(LIMIT_VARIABLE, str(DEFAULT_LIMIT_GIB))
     try:
@@ -277,7 +290,32 @@ def default_cache(folder: Path | None = None) -> Cache | None:
         if home.startswith("~"):  # the user has no home folder
             return None
         named = Path(home, "halbach-fe")
+    if os.environ.get(TRUST_VARIABLE) != "1" and _others_may_write(Path(named)):
+        raise OutputError(
+            f"Other users may write to the cache {printable(named, MAX_QUOTED)}, so that its "
+            f"answers may be made up. Set {TRUST_VARIABLE}=1 if you trust all of them, or name "
+            f"another folder in {FOLDER_VARIABLE}.")
     return Cache(Path(named), limit * 2**30)
+
+
+def _others_may_write(folder: Path) -> bool:
+    """Tell whether a folder exists that users other than this one and root may write to.
+
+    A group that has the user's name is the user's own, as most systems make one for every user.
+    """
+    try:
+        status = folder.stat()
+    except OSError:
+        return False
+    if status.st_uid not in (os.geteuid(), 0) or status.st_mode & stat.S_IWOTH:
+        return True
+    if not status.st_mode & stat.S_IWGRP or status.st_gid == 0:
+        return False
+    try:
+        group, user = grp.getgrgid(status.st_gid), pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return True
+    return group.gr_name != user or bool(set(group.gr_mem) - {user})
 
 
 def _manifest(folder: Path) -> Manifest | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
@@ -20,8 +19,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, NotConvergedError, OutputError
-from halbach_fe.core.files import make_folder
-from halbach_fe.core.temporary_files import remove_orphans, temporary_name
+from halbach_fe.core.files import is_full, make_folder
+from halbach_fe.core.temporary_files import remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import Job
 from halbach_fe.solver.session import Progress, RunSize, Session
@@ -206,13 +205,16 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
         If a file cannot be written.
     """
     remove_orphans(make_folder(parent))
-    folder = Path(tempfile.mkdtemp(prefix=temporary_name(name), dir=parent))
+    folder = temporary_path(parent / name)
     try:
+        folder.mkdir()
         yield folder
         _replace(folder, parent / name)
     except GetDPError as error:
         if cancel.is_set():
             raise
+        if is_full(parent):  # what GetDP wrote is cut off, which it does not notice
+            raise runner.disk_error(parent, error.sentence.rstrip(".")) from None
         failed = parent / f"{name}-failed"
         _replace(folder, failed)
         if error.log is not None:
@@ -225,6 +227,8 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
 
 
 def _replace(folder: Path, target: Path) -> None:
-    """Rename a folder to ``target``, and remove an older folder of that name."""
+    """Rename a folder to ``target``, and remove an older folder or a link of that name."""
+    if target.is_symlink():
+        target.unlink()
     shutil.rmtree(target, ignore_errors=True)
     folder.rename(target)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
+from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Run, find_getdp
 from halbach_fe.solver.getdp_cache import Cache, default_cache
@@ -14,6 +18,9 @@ from halbach_fe.solver.getdp_cache import Cache, default_cache
 DEFAULT_JOBS = 2
 """Number of parallel runs of GetDP, if the machine has as many cores. Most problems consist of two
 runs, with the real materials and with vacuum in their place."""
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 Progress = Callable[[int, int], None]
 """A function that is called with the number of finished solves and the number of all solves."""
@@ -150,3 +157,22 @@ class Session:
     def within(self, name: str) -> Session:
         """Return the same session with a subfolder of this session's folder."""
         return replace(self, folder=self.folder / name)
+
+
+def alone(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function with an argument ``session``, in whose folder nobody else may write.
+
+    A second run in the same folder raises OutputError until the function has returned. Functions
+    may call each other.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def locked(*arguments: P.args, **options: P.kwargs) -> R:
+        session = signature.bind(*arguments, **options).arguments["session"]
+        if session.counter is not None:  # which writes nothing
+            return function(*arguments, **options)
+        with locked_folder(session.folder):
+            return function(*arguments, **options)
+
+    return locked

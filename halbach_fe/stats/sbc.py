@@ -15,7 +15,10 @@ from scipy import stats
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.noise import NoiseCovariance
+
+Simulator = Callable[[Floats, np.random.Generator], Floats]
+"""Maps true parameters (m,) to readings (n,), with their noise. The field should be that of another
+model than the one that is tested."""
 
 Sampler = Callable[[Floats, np.random.Generator], Floats]
 """Maps readings (n,) to nearly independent draws (draws, m) from the posterior."""
@@ -25,9 +28,8 @@ BINS = 10
 
 
 def ranks(
-    prior: Gaussian, model: Callable[[Floats], Floats], noise: NoiseCovariance, sampler: Sampler,
-    repeats: int, generator: np.random.Generator,
-    say: Callable[[int], None] = lambda number: None,
+    prior: Gaussian, simulate: Simulator, sampler: Sampler, repeats: int,
+    generator: np.random.Generator, say: Callable[[int], None] = lambda number: None,
 ) -> tuple[Ints, int]:
     """Simulate ``repeats`` inferences and rank the true parameters among posterior draws.
 
@@ -35,10 +37,8 @@ def ranks(
     ----------
     prior : Gaussian
         Distribution of the true parameters (m,).
-    model : callable
-        Maps parameters (m,) to noise-free readings (n,).
-    noise : NoiseCovariance
-        Noise that is added to the readings.
+    simulate : callable
+        Measures the truth, see `Simulator`.
     sampler : callable
         The inference under test, see `Sampler`.
     repeats : int
@@ -58,8 +58,7 @@ def ranks(
     draws = np.empty((0, 0))
     for number in range(repeats):
         truth = prior.sample(1, generator)[0]
-        readings = model(truth) + noise.sample(generator)
-        draws = sampler(readings, generator)
+        draws = sampler(simulate(truth, generator), generator)
         found.append((draws < truth).sum(axis=0))
         say(number + 1)
     return np.array(found), len(draws)

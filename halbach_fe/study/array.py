@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
+from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.halbach_order import check_order
 from halbach_fe.study.material_keys import Material, with_grade
@@ -246,9 +247,7 @@ class Array(StudyModel):
                 try:
                     self.of_ring(number)
                 except ValidationError as error:
-                    reason = error.errors(include_url=False)[0]["msg"]
-                    raise ValueError(f"ring {number}: {reason.removeprefix('Value error, ')}"
-                                     ) from None
+                    raise ValueError(f"ring {number}: {sentences.reason(error)}") from None
         elif self.rings:
             self._check_strength()
             check_order(self.multipole_order, self.blocks_per_ring)
@@ -283,8 +282,9 @@ class Array(StudyModel):
                 if not possible or (slot or 1) > max(possible) or (
                         ring is not None and ring > self.rings and slot is not None
                         and (ring - self.rings, slot) not in places):
-                    raise ValueError(f"{text} ring {ring}, slot {slot} of an array of "
-                                     f"{_described(sizes)}")
+                    place = ", ".join(f"{name} {number}" for name, number in (
+                        ("ring", ring), ("slot", slot)) if number is not None)
+                    raise ValueError(f"{text} {place} of an array of {_described(sizes)}")
 
     @property
     def is_uniform(self) -> bool:

@@ -20,10 +20,11 @@ from pydantic import ValidationError
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.errors import OutputError, StudyError, must_be
-from halbach_fe.core.files import write_text
+from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.core.numbers import MAX_CELL, parse_number
 from halbach_fe.core.tables import csv_text
+from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import COLUMNS, MAX_BLOCKS, FreeBlocks, RowError
 
 Cell = float | int | str | tuple[tuple[float, ...], ...] | None
@@ -166,6 +167,8 @@ def _read(path: Path, where: str) -> _Content:
 
 def _csv(raw: bytes, where: str) -> _Content:
     """Return the cells of a CSV file as text, "" where they are empty."""
+    if (workbook := workbook_in(raw)) is not None:
+        raise StudyError(workbook_sentence(where, workbook))
     try:
         text = raw.decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError as error:
@@ -315,7 +318,7 @@ def _outline_text(outline: Iterable[Iterable[float]] | None) -> str | None:
 def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) -> str:
     """Return one sentence about the first of pydantic's errors."""
     first = error.errors(include_url=False)[0]
-    reason, given = first["msg"].removeprefix("Value error, "), first.get("input")
+    given, ours = first.get("input"), sentences.contradiction(first)
     cause = first.get("ctx", {}).get("error")
     column, place = ([*first["loc"], None, None])[:2]
     what = "content" if column is None else f"`{column}`"
@@ -323,9 +326,9 @@ def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) ->
         what = rows(cause.number)
     elif isinstance(place, int):
         what += f" in {rows(place)}"
-    if first["type"] == "value_error":
-        return f"Input {what} of {where} must be consistent: {reason}."
+    if ours is not None:
+        return f"Input {what} of {where} must be consistent: {ours}."
     if given is None:
         return must_be(what, where, "given", "nothing")
     received = f"{given:g}" if isinstance(given, int | float) else "something else"
-    return must_be(what, where, reason.removeprefix("Input should be ").lower(), received)
+    return must_be(what, where, sentences.expected(first), received)

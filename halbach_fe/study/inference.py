@@ -9,13 +9,14 @@ from pydantic import BeforeValidator, Field, model_validator
 from halbach_fe.study.measurement import Positions
 from halbach_fe.study.types import (
     COMPONENTS,
+    MAX_POINTS,
     Component,
     Coordinate,
     Gap,
     Length,
     Line,
+    ReferenceTemperature,
     StudyModel,
-    Temperature,
 )
 
 
@@ -51,7 +52,7 @@ class Prior(StudyModel):
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
     types: dict[Line, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}  # noqa: RUF012
     temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
-    reference_temperature_C: Temperature | None = None
+    reference_temperature_C: ReferenceTemperature | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Prior:
@@ -137,3 +138,10 @@ class Plan(StudyModel):
 
     points: Annotated[int, Field(ge=1, le=100_000)] | None = None
     candidates: tuple[Positions, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Plan:
+        total = sum(one.size for one in self.candidates)
+        if total > MAX_POINTS:
+            raise ValueError(f"candidates may have {MAX_POINTS} points together, not {total}")
+        return self

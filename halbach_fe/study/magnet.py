@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.types import (
     Angle,
     Coordinate,
     FluxDensityVector,
     Moment,
     Point,
+    ReferenceTemperature,
     StudyModel,
     Temperature,
 )
@@ -20,11 +24,16 @@ MOST_SQUARE = 0.99
 """Largest squareness for which irreversible losses are computed."""
 
 
+CLOSEST_M = 1e-6
+"""Smallest distance of a reading from a point dipole: nearer than any probe can be."""
+
+
 class Neighbour(StudyModel):
     """Another magnet with the same blocks, in vacuum, on the same axis.
 
     Its middle is at ``z_m``; it is rotated by ``turn_deg`` about the axis, and its magnetizations
-    are those of this magnet multiplied by ``factor``.
+    are those of this magnet multiplied by ``factor``. It must stand clear of this magnet and of
+    other neighbours, and needs a 3D study.
     """
 
     z_m: Coordinate
@@ -50,6 +59,24 @@ class External(StudyModel):
     dipoles: tuple[PointDipole, ...] = ()
 
 
+def check_apart(external: External, points: Floats, study: str) -> None:
+    """Refuse points (n, 3) in m at a dipole, where its field is infinite.
+
+    Raises
+    ------
+    StudyError
+    """
+    for number, dipole in enumerate(external.dipoles):
+        distance = np.linalg.norm(points - np.array(dipole.position_m), axis=1)
+        if len(points) and distance.min() < CLOSEST_M:
+            x, y, z = points[np.argmin(distance)]
+            raise StudyError(must_be(
+                f"`external.dipoles[{number}].position_m`", f"study {study}",
+                f"at least {1e6 * CLOSEST_M:g} µm from the readings",
+                f"the place of the reading at ({x:g}, {y:g}, {z:g}) m",
+                "An object that near is no point; leave it or the reading out."))
+
+
 class Demagnetization(StudyModel):
     """Resistance of the magnet material to demagnetization, and the temperature to assess it at.
 
@@ -68,7 +95,7 @@ class Demagnetization(StudyModel):
     squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     remanence_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)]
     coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
-    reference_temperature_C: Temperature = 20.0
+    reference_temperature_C: ReferenceTemperature = 20.0
     temperature_C: Temperature = 20.0
     irreversible: bool = False
 

@@ -12,9 +12,14 @@ from halbach_fe.study.types import Line, PositionSd, StudyModel
 
 SmallSd = Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False)]
 
-PROBE_KEYS = ("crosstalk", "gain", "offset_T", "sensor_position_m", "drift_T")
+PROBE_KEYS = ("crosstalk", "gain", "sensor_position_m", "planar_hall_per_T", "quadratic_per_T",
+              "cubic_per_T2")
 """Keys of an instrument that belong to its probe, and may be shared by several maps. All others
-belong to a map: its pose and its stage."""
+belong to a map: its pose and its stage, and the offsets, which change from day to day."""
+
+
+POSE_KEYS = ("translation_m", "rotation_rad")
+"""Keys of an instrument that say how a map lies in the magnet."""
 
 
 class InstrumentSd(StudyModel):
@@ -44,13 +49,19 @@ class MapSettings(StudyModel):
     ``file`` is its path from the folder of the study file. ``instrument``, ``instrument_sd``,
     ``noise`` and ``inference`` replace the study's tables of the same name as a whole for this map;
     where they are left out, those of the study hold. Maps that name the same ``probe`` share its
-    terms (crosstalk, gain, offset, drift and places of the sensors), which are then estimated from
-    all of them together; otherwise every map has a probe of its own.
+    terms (crosstalk, gain, nonlinearity and places of the sensors), which are then estimated from
+    all of them together; otherwise every map has a probe of its own. Maps that name the same
+    ``stage`` were made on one that was not mounted anew between them. They move and turn in the
+    magnet together, but for ``stage_shift_sd_m``: the prior standard deviations of an own shift of
+    this map along the three axes of the stage, whose origin was set anew. `halbach-fe register`
+    finds shifts from nothing whose standard deviation is 1 mm or more.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     file: Annotated[Line, Field(min_length=1, max_length=4096)]
     probe: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
+    stage: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
+    stage_shift_sd_m: tuple[PositionSd, PositionSd, PositionSd] = (0.0, 0.0, 0.0)
     instrument: Instrument | None = None
     instrument_sd: InstrumentSd | None = None
     noise: NoiseSettings | None = None
@@ -60,4 +71,6 @@ class MapSettings(StudyModel):
     def _consistent(self) -> MapSettings:
         if "\0" in self.file:
             raise ValueError("file must be a path")
+        if self.stage is None and any(self.stage_shift_sd_m):
+            raise ValueError("stage_shift_sd_m needs a stage that other maps share")
         return self

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import parse_number as number_in
 
 MU_0 = 4e-7 * math.pi
@@ -349,8 +350,11 @@ def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]
     OSError
         If the file cannot be read.
     """
+    raw = path.read_bytes()
+    if (workbook := workbook_in(raw)) is not None:
+        raise ValueError(f"it is an {workbook} workbook; save the sheet as CSV")
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets write a byte order mark
+        text = raw.decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError:
         raise ValueError("it must be UTF-8 text; save it as such") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)

@@ -25,6 +25,7 @@ from halbach_fe.study.types import (
     PositionSd,
     RadiusScale,
     RotationVector,
+    Sigma,
     StudyModel,
     Unit,
     one_or_list,
@@ -94,6 +95,11 @@ class LinePositions(StudyModel):
     end_m: Point
     count: Annotated[int, Field(ge=1, le=MAX_POINTS)]
 
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return self.count
+
 
 class CirclePositions(StudyModel):
     """Circles about the z axis, with ``angles`` equally spaced points each.
@@ -119,7 +125,14 @@ class CirclePositions(StudyModel):
             )
         if len(set(self.radius_m)) < len(self.radius_m):
             raise ValueError(f"radius_m must name each radius once, but is {self.radius_m}")
+        if self.size > MAX_POINTS:
+            raise ValueError(f"circles may have {MAX_POINTS} points together, not {self.size}")
         return self
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return len(self.radius_m) * self.angles * self.count
 
 
 class GridPositions(StudyModel):
@@ -142,16 +155,26 @@ class GridPositions(StudyModel):
                 raise ValueError(
                     f"{count} points from {axis} = {start} to {end} make no sense; one point "
                     "needs equal limits, several need start_m < end_m")
-        if math.prod(self.count) > MAX_POINTS:
-            raise ValueError(f"a grid may have {MAX_POINTS} points, not {math.prod(self.count)}")
+        if self.size > MAX_POINTS:
+            raise ValueError(f"a grid may have {MAX_POINTS} points, not {self.size}")
         return self
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return math.prod(self.count)
 
 
 class PointPositions(StudyModel):
     """A list of points."""
 
     kind: Literal["points"]
-    points_m: Annotated[tuple[Point, ...], Field(min_length=1)]
+    points_m: Annotated[tuple[Point, ...], Field(min_length=1, max_length=MAX_POINTS)]
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return len(self.points_m)
 
 
 Positions = Annotated[
@@ -202,7 +225,7 @@ class NoiseRegion(StudyModel):
     z_min_m: Coordinate | None = None
     z_max_m: Coordinate | None = None
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = COMPONENTS
-    sigma_T: Annotated[float, Field(gt=0.0, le=1.0, allow_inf_nan=False)]
+    sigma_T: Sigma
 
     @model_validator(mode="after")
     def _consistent(self) -> NoiseRegion:

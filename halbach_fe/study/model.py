@@ -10,26 +10,30 @@ neither ``B_r / mu_0`` nor the magnetization at the working point.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import product
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.study import materials
+from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array
 from halbach_fe.study.inference import Inference, Plan, Prior
 from halbach_fe.study.iron import Iron, IronMaterial, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
-from halbach_fe.study.maps import PROBE_KEYS, InstrumentSd, MapSettings
+from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd, MapSettings
 from halbach_fe.study.material_keys import STRENGTHS, grade_of
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
 from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 
-FIELD_KEYS = {"dimension", "array", "iron_ring", "iron", "external", "mesh", "open_boundary",
-              "solver", "demagnetization"}
+MAGNET_KEYS = {"dimension", "array", "iron_ring", "iron"}
+"""Keys of a study that describe its magnet: blocks and iron."""
+
+FIELD_KEYS = MAGNET_KEYS | {"external", "mesh", "open_boundary", "solver", "demagnetization"}
 """Keys of a study that its computed field depends on."""
 
 
@@ -89,6 +93,9 @@ class Study(StudyModel):
                 or self.solver.route not in ("auto", "moments")):
             raise ValueError("demagnetization.irreversible needs a 3D study, and the route moments "
                              "of the method reaction: leave solver.route and solver.method out")
+        if self.external.neighbours and self.dimension == 2:
+            raise ValueError("external.neighbours needs a 3D study: beside a cross-section, which "
+                             "has no end, there is no other magnet on the axis")
         if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
             raise ValueError("prior.variation_sd needs a 3D study without iron")
         self._check_maps()
@@ -112,7 +119,7 @@ class Study(StudyModel):
         return self
 
     def _check_maps(self) -> None:
-        """Check that the maps of a campaign differ, and that those of one probe agree on it."""
+        """Check that maps of a campaign differ, and agree on the probe and stage they share."""
         for key in ("name", "file"):
             given = [getattr(one, key) for one in self.maps]
             twice = [value for value in given if given.count(value) > 1]
@@ -122,22 +129,28 @@ class Study(StudyModel):
         uncertain = [self.instrument_sd, *(one.instrument_sd for one in self.maps)]
         if self.dimension == 2 and any(sd not in (None, InstrumentSd()) for sd in uncertain):
             raise ValueError("instrument_sd needs a 3D study")
-        first: dict[str, Study] = {}
+        for one, key in product(self.maps, ("probe", "stage")):
+            if any(other.name == getattr(one, key) != getattr(other, key) for other in self.maps):
+                raise ValueError(f"the {key} '{getattr(one, key)}' of map '{one.name}' has the "
+                                 "name of a map of another one")
+        first: dict[tuple[str, str], Study] = {}
         for number, one in enumerate(self.maps):
             try:
                 own = self.of_map(number)
             except ValidationError as error:
-                reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-                raise ValueError(f"map '{one.name}' does not fit the study: {reason}") from None
-            if one.probe is None:
-                continue
-            other = first.setdefault(one.probe, own)
-            for key in PROBE_KEYS:
-                for table in ("instrument", "instrument_sd"):
-                    if getattr(getattr(own, table), key) != getattr(getattr(other, table), key):
+                raise ValueError(f"map '{one.name}' does not fit the study: "
+                                 f"{sentences.reason(error)}") from None
+            for shared, name, tables, keys in (
+                    ("probe", one.probe, ("instrument", "instrument_sd"), PROBE_KEYS),
+                    ("stage", one.stage, ("instrument_sd",), POSE_KEYS)):
+                other = own if name is None else first.setdefault((shared, name), own)
+                for table, key in product(tables, keys):
+                    mine, theirs = (getattr(getattr(each, table), key, None)
+                                    for each in (own, other))  # not every key can be uncertain
+                    if mine != theirs:
                         raise ValueError(
-                            f"maps of one probe must state the same {table}.{key}, but those of "
-                            f"probe '{one.probe}' do not")
+                            f"maps of one {shared} must state the same {table}.{key}, but those of "
+                            f"{shared} '{name}' do not")
 
     def of_map(self, number: int) -> Study:
         """Return the study of one of the maps alone, with the map's own tables."""
@@ -146,6 +159,10 @@ class Study(StudyModel):
             "instrument", "instrument_sd", "noise", "inference") if getattr(one, key) is not None}
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self).model_validate(values | own | {"maps": ()})
+
+    def with_tables(self, tables: Mapping[str, Mapping[str, Any]]) -> Study:
+        """Return the study with other tables of some of its maps, by the names of the maps."""
+        return self.with_(maps=tuple(one.with_(**tables.get(one.name, {})) for one in self.maps))
 
 
 def is_nonlinear(study: Study) -> bool:
@@ -157,6 +174,21 @@ def is_nonlinear(study: Study) -> bool:
 def iron_of(study: Study) -> IronMaterial | None:
     """Return the material of the study's iron, or None if it has no iron."""
     return study.iron_ring or study.iron
+
+
+def magnet_description(study: Study) -> dict[str, Any]:
+    """Return the keys and values that describe a study's magnet, as plain data.
+
+    They are those of `MAGNET_KEYS`, what irreversible losses follow from, and how magnetizations
+    vary within blocks, of which the parameters follow.
+    """
+    keys = MAGNET_KEYS | ({"demagnetization"} if study.demagnetization is not None
+                          and study.demagnetization.irreversible else set())
+    found = study.model_dump(mode="json", include=keys)
+    if study.prior.variation_sd:
+        found["prior"] = {"variation_sd": study.prior.variation_sd,
+                          "variation_length_m": study.prior.variation_length_m}
+    return found
 
 
 def curve_of(study: Study) -> Curve | None:

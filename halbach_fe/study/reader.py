@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.study import materials
+from halbach_fe.core.files import as_path
+from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import TableCurve
@@ -50,7 +51,7 @@ def read_study(path: str | Path) -> Study:
     >>> hf.read_study("dipole.toml").array.blocks_per_ring
     16
     """
-    path = Path(path)
+    path = as_path(path)
     where = f"study file {path}"
     try:
         raw = path.read_bytes()
@@ -65,7 +66,7 @@ def read_study(path: str | Path) -> Study:
                     "Start from one of the files under studies/.")
         )
     try:
-        text = raw.decode("utf-8")
+        text = raw.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
         raise StudyError(
             must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
@@ -124,10 +125,9 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
                                  f"{str(path)!r} ({error.strerror})",
                                  "Give its path from the study's folder.")) from None
     except ValueError as error:
-        reason = (error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-                  if isinstance(error, ValidationError) else error)
+        wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
         raise StudyError(must_be(f"`{key}.curve.file`", where, "a table of H(B)",
-                                 f"{str(path)!r}, which cannot be used: {reason}")) from None
+                                 f"{str(path)!r}, which cannot be used: {wrong}")) from None
     return study.with_(**{key: iron.with_(curve=table)})
 
 
@@ -138,31 +138,29 @@ def _sentence(error: ValidationError, where: str) -> str:
     errors.sort(key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
     key, model = _locate(first["loc"])
-    received, kind = first.get("input"), first["type"]
-    hint = ""
+    value, kind = first.get("input"), first["type"]
+    expected, received, hint = sentences.expected(first), sentences.received(value), ""
+    if (ours := sentences.contradiction(first)) is not None:
+        return (f"Input `{key or 'the whole'}` of {where} must be consistent: {ours}."
+                + _more(errors))
     if kind == "extra_forbidden":
-        expected = "a known key"
         name = str(first["loc"][-1])
         near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
         hint = (f"Did you mean `{near[0]}`?" if near
                 else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
         received = f"`{name}`"
     elif kind == "missing":
-        expected, received = "given", "nothing"
-        hint = "Add the key."
-    elif kind == "value_error":
-        expected = "consistent"
-        received = first["msg"].removeprefix("Value error, ")
-        sentence = f"Input `{key or 'the whole'}` of {where} must be {expected}: {received}."
-        return sentence + _more(errors)
-    else:
-        expected = first["msg"].removeprefix("Input should be ").lower()
-        if isinstance(received, int | float) and not isinstance(received, bool):
-            hint = _unit_hint(key, received)
-        elif isinstance(received, dict | list):
-            received = "a table" if isinstance(received, dict) else "a list"
-        else:
-            received = repr(received)
+        received, hint = "nothing", "Add the key."
+    elif kind.startswith("union_tag"):  # pydantic locates the table, of which one key says its kind
+        name = first["ctx"]["discriminator"].strip("'")
+        key, received = f"{key}.{name}", sentences.received(value.get(name))
+        tags = _tags_at(first["loc"], name)
+        near = difflib.get_close_matches(str(value.get(name)), tags, 1, 0.5)
+        hint = f"Did you mean '{near[0]}'?" if near else ""
+        if kind == "union_tag_not_found":
+            hint = f"Add the key, as one of {', '.join(map(repr, tags))}."
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        hint = _unit_hint(key, value)
     return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
 
 
@@ -194,6 +192,8 @@ def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | Non
     owner: type[BaseModel] | None = Study
     parts: list[str] = []
     for part in location:
+        if part == sentences.KEY:
+            continue
         if isinstance(part, int):
             parts[-1] += f"[{part}]"
             continue
@@ -207,6 +207,19 @@ def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | Non
         field = owner.model_fields.get(part) if owner else None
         models = _models_in(field.annotation) if field else []
     return ".".join(parts), owner
+
+
+def _tags_at(location: tuple[int | str, ...], name: str) -> list[str]:
+    """Return the possible values of the key ``name``, the kind of table, at a pydantic location."""
+    models: list[type[BaseModel]] = [Study]
+    for part in location:
+        tagged = [model for model in models if len(models) > 1 and part in _tags(model)]
+        if tagged or isinstance(part, int):
+            models = tagged or models
+            continue
+        field = models[0].model_fields.get(part) if models else None
+        models = _models_in(field.annotation) if field else []
+    return [str(tag) for model in models for tag in get_args(model.model_fields[name].annotation)]
 
 
 def _tags(model: type[BaseModel]) -> set[str]:

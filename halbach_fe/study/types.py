@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
@@ -17,9 +18,13 @@ from pydantic import (
 )
 
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.study import sentences
 
 MAX_LENGTH_M = 10.0
 MIN_LENGTH_M = 1e-4
+MIN_SIGMA_T, MAX_SIGMA_T = 1e-15, 1.0
+"""Limits of the standard deviation of a reading in T: no probe is as exact, or as bad, and squares
+of other numbers may be zero or infinite."""
 MAX_POINTS = 1_000_000
 
 # The limits are there to reveal a wrong unit (mm for m, mT for T); they are wider than is sensible.
@@ -41,6 +46,7 @@ Turn = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 RotationVector = tuple[Turn, Turn, Turn]
 RadiusScale = Annotated[float, Field(ge=-0.9, le=2.0, allow_inf_nan=False)]
 Unit = Annotated[float, Field(ge=1e-9, le=1e3, allow_inf_nan=False)]
+Sigma = Annotated[float, Field(ge=MIN_SIGMA_T, le=MAX_SIGMA_T, allow_inf_nan=False)]
 SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Axes = tuple[SignedAxis, SignedAxis, SignedAxis]
 FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
@@ -48,6 +54,9 @@ FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffse
 GridCount = Annotated[int, Field(ge=1, le=10_000)]
 PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(ge=-273.15, le=500.0, allow_inf_nan=False)]
+ReferenceTemperature = Annotated[float, Field(ge=-200.0, le=200.0, allow_inf_nan=False)]
+"""Temperature in degrees Celsius at which a material was measured; room temperature in kelvin is
+beyond the limit."""
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
@@ -85,6 +94,13 @@ def _leaves(annotation: Any) -> set[Any]:
     if get_origin(annotation) is Annotated:
         inner = inner[:1]
     return set().union(*(_leaves(each) for each in inner if each is not ...))
+
+
+@cache
+def _numbers(model: type[BaseModel]) -> frozenset[str]:
+    """Return the keys of a table whose values are numbers, or lists of numbers."""
+    return frozenset(name for name, field in model.model_fields.items()
+                     if _leaves(field.annotation) <= {int, float, NoneType})
 
 
 def _elements(value: Any) -> Iterator[Any]:
@@ -127,8 +143,7 @@ class StudyModel(BaseModel):
     def _no_number_from_words(cls, data: Any) -> Any:
         """Refuse true, false and text for numbers, which pydantic would convert."""
         for name, value in data.items() if isinstance(data, dict) else ():
-            field = cls.model_fields.get(name)
-            if field and _leaves(field.annotation) <= {int, float, NoneType}:
+            if name in _numbers(cls):
                 for each in _elements(value):
                     if isinstance(each, bool) or (isinstance(each, str) and _is_number(each)):
                         raise ValueError(f"`{name}` is a number, not {_as_toml(each)}")
@@ -157,7 +172,9 @@ class StudyModel(BaseModel):
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             key = ".".join(map(str, first["loc"])) or "the whole"
-            raise StudyError(must_be(
-                f"`{key}`", f"changed {type(self).__name__}",
-                first["msg"].removeprefix("Input should be ").removeprefix("Value error, "),
-                repr(first["input"]))) from None
+            where = f"changed {type(self).__name__}"
+            if (ours := sentences.contradiction(first)) is not None:
+                raise StudyError(
+                    f"Input `{key}` of {where} must be consistent: {ours}.") from None
+            raise StudyError(must_be(f"`{key}`", where, sentences.expected(first),
+                                     sentences.received(first["input"]))) from None

@@ -26,6 +26,7 @@ from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
+from halbach_fe.study.magnet import check_apart
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -150,6 +151,7 @@ def simulate_campaign(
         drawn.single, site, hidden, single=True), coil_sd, coil)
     magnet, instrument = with_effects(drawn.mounted, site, hidden), instrument_with(site, hidden)
     nominal_places = np.vstack([points, others])
+    check_apart(study.external, nominal_places, study.name)
     offsets = real_places(study, nominal_places, noise) - nominal_places
     recorded, readings = measured(
         magnet, instrument, points, others, elements, faults, progress, offsets)

@@ -1,8 +1,14 @@
-"""Simulation-based calibration of the linear and the non-linear posterior, and a control.
+"""Simulation-based calibration of the linear and the non-linear posterior, and its controls.
 
-In the cross-section of studies/nonlinear-2d: truths drawn from a prior, readings from the model
-with noise, posteriors sampled, and the ranks of the truths tested for uniformity. The paper's
-sampler, pCN with s = 1/80 from the prior's mean, is the control: so few steps must fail::
+In the cross-section of studies/nonlinear-2d, truths are drawn from the prior. Their fields are not
+those of the model that fits them: with linear iron they are a closed form, with iron that saturates
+those of a mesh of half the size. The probe reads them at positions that are moved by the stated
+standard deviation, with noise; the model knows neither the moves nor its own error, only their
+stated sizes. The ranks of the truths among draws of the posterior must be uniform.
+
+Three controls must fail: position noise that is not stated, the error of a coarse mesh that is not
+stated, and the paper's sampler, pCN with s = 1/80 from the prior's mean, which takes too few
+steps::
 
     python studies/calibration/run.py -o results/calibration
 """
@@ -12,84 +18,283 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.mcmc import LAPLACE_STEPS, PRIOR_STEP
-from halbach_fe.measurement.observation import observe
+from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.calibration import write_calibration
-from halbach_fe.response.nonlinear import nonlinear_model
+from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
+from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field
+from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import nominal_prior
-from halbach_fe.stats.noise import independent_noise
+from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
-from halbach_fe.stats.sbc import ranks, uniformity
+from halbach_fe.stats.sbc import Sampler, Simulator, ranks, uniformity
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 
 STUDY = Path(__file__).parent.parent / "nonlinear-2d" / "study.toml"
-DRAWS, THIN, WARM_UP = 99, 4, 40
-PCN_STEP, PCN_STEPS = 1 / 80, 1000  # each repeat; the paper's one chain had 18 000
-SIGMA_T = 1e-4
+DRAWS, THIN, WARM_UP = 19, 4, 24
+PCN_STEP, PCN_STEPS = 1 / 80, 300  # each repeat; the paper's one chain had 18 000
+
+RADIUS_M = 0.08
+"""Radius of the circle of readings. The stated position noise is that of the nominal gradient. The
+deviations of the blocks have a gradient of their own, so that the true noise is larger, here by a
+tenth. On the study's own circle, of 75 mm, the nominal gradient is 2.5 times smaller."""
+
+SIGMA_T, POSITION_SD_M = 5e-5, 3e-4
+"""Standard deviations of a reading, and of the probe's position along each axis. The latter makes
+twice as much noise as the former."""
+
+LINEAR_PERMEABILITY = 1000.0
+FINER = 2.0
+"""Ratio of the element sizes of the model and of the truth, with iron that saturates."""
+
+COARSE_M = 0.04
+"""Element size of the control in which the model's own error is not stated. It is larger than the
+noise there."""
+
+TRUTH_RADIUS, TRUTH_ANGLES = 0.9, 192
+"""Circle on which the truth is computed, relative to the inner radius of the blocks, and number of
+points. Multipoles beyond that number are taken for lower ones; they are below 0.9^192 = 2e-9 of the
+field."""
+
 TOLERANCE_T = 1e-7
 PASS, FAIL = 0.01, 1e-4
 """p-values, corrected for 32 parameters: above the first is calibrated, below the second is not."""
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run all three, write the ranks, print the table; CheckFailedError if one is off."""
-    study = read_study(arguments.study)
-    study = study.with_(mesh__block_size_m=arguments.block_size_m)
-    points = points_from(study.observation.positions)[::2]
-    measured = np.ones_like(points, bool)
-    observation = observe(study, points, measured)
-    generator = np.random.default_rng(arguments.seed)
-    with common.session(arguments) as session:
-        model = nonlinear_model(build_magnet(study), observation, replace(
-            session, folder=session.folder / "model"), generator)
-    prior = nominal_prior(model.nominal, 2, 0.01, 1.0)
-    noise = independent_noise(np.full(len(observation), SIGMA_T))
-    tangent = model.jacobian(model.nominal)
+@dataclass(frozen=True)
+class Truth:
+    """The field in the bore of any magnetizations, at any points.
 
-    def closed_form(readings: Floats, generator: np.random.Generator) -> Floats:
-        return linear_gaussian.posterior(tangent, readings, noise, prior).sample(DRAWS, generator)
+    In a cross-section B_x - i B_y is a power series of x + i y in the bore. Its coefficients are
+    those of the field on a circle around all points.
 
-    def target(readings: Floats) -> Posterior:
-        return Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
+    Attributes
+    ----------
+    on_circle : callable
+        Maps magnetizations (32,) in A/m to B (angles, 2) in T at `circle`.
+    radius : float
+        Of the circle, in m.
+    """
 
-    def chains(readings: Floats, generator: np.random.Generator) -> Floats:
-        posterior = target(readings)
+    on_circle: Callable[[Floats], Floats]
+    radius: float
+
+    def field(self, magnetizations: Floats, points: Floats) -> Floats:
+        """Return B (n, 3) in T at points (n, 3) in m within the circle."""
+        field = self.on_circle(magnetizations)
+        powers = np.fft.fft(field[:, 0] - 1j * field[:, 1]) / len(field)
+        z = (points[:, 0] + 1j * points[:, 1]) / self.radius
+        series = np.polynomial.polynomial.polyval(z, powers[:len(field) // 2])
+        return np.column_stack([series.real, -series.imag, 0 * series.real])
+
+
+def circle(magnet: Magnet) -> tuple[Floats, float]:
+    """Return the points (angles, 3) in m at which a truth is computed, and their radius in m."""
+    radius = TRUTH_RADIUS * magnet.bore_radius
+    angle = 2 * np.pi * np.arange(TRUTH_ANGLES) / TRUTH_ANGLES
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle]), radius
+
+
+def closed_form_truth(magnet: Magnet, permeability: float) -> Truth:
+    """Return the exact field of sectors of recoil permeability in a tube of linear iron."""
+    points, radius = circle(magnet)
+    array, (tube,) = magnet.array, magnet.iron
+    columns = []
+    for block in magnet.blocks:
+        for direction in (1, 1j):
+            sector = SectorMagnetization(np.radians(block.angle_deg), np.pi / len(magnet.blocks),
+                                         MU_0 * block.recoil_permeability * direction)
+            columns.append(layered_bore_field(
+                [sector], array.inner_radius_m, array.outer_radius_m, block.recoil_permeability,
+                points[:, :2], (tube.inner_radius, tube.outer_radius, permeability)))
+    matrix = np.stack(columns, axis=-1)  # (angles, 2, parameters)
+    return Truth(lambda p: matrix @ p, radius)
+
+
+def fine_truth(study: Study, session: Session, generator: np.random.Generator) -> Truth:
+    """Return the field of a finer mesh, with iron that saturates."""
+    magnet = build_magnet(study.with_(
+        mesh__block_size_m=study.mesh.block_size_m / FINER))
+    points, radius = circle(magnet)
+    model = nonlinear_model(magnet, observe(study, points, np.ones_like(points, bool)), session,
+                            generator)
+    return Truth(lambda p: model(p, TOLERANCE_T).reshape(-1, 2), radius)
+
+
+def simulator(truth: Truth, observation: Observation) -> Simulator:
+    """Return the measurement of a truth: at positions that are moved, with noise."""
+    def simulate(parameters: Floats, generator: np.random.Generator) -> Floats:
+        moved = observation.points + POSITION_SD_M * generator.standard_normal(
+            observation.points.shape)
+        readings = observation.apply(truth.field(parameters, moved))
+        return readings + SIGMA_T * generator.standard_normal(len(readings))
+
+    return simulate
+
+
+def stated_noise(magnet: Magnet, observation: Observation) -> NoiseCovariance:
+    """Return the noise of readings and positions as `halbach-fe infer` states it."""
+    noise = magnet.study.noise
+    assert noise is not None  # the study has a noise region
+    stated = magnet.with_(noise=noise.with_(
+        regions=(noise.regions[0].with_(sigma_T=SIGMA_T),), position_sd_m=(POSITION_SD_M,)))
+    return reading_noise(stated, observation, xr.Dataset())
+
+
+def linear_sampler(response: Response, noise: NoiseCovariance, prior: Gaussian) -> Sampler:
+    """Return draws of the linear posterior, in closed form."""
+    matrix = response.whole
+
+    def draw(readings: Floats, generator: np.random.Generator) -> Floats:
+        return linear_gaussian.posterior(
+            matrix, readings - response.offset, noise, prior).sample(DRAWS, generator)
+
+    return draw
+
+
+def chain_sampler(model: NonlinearModel, noise: NoiseCovariance, prior: Gaussian) -> Sampler:
+    """Return draws of the non-linear posterior, by the Markov chains of `halbach-fe infer`."""
+    def draw(readings: Floats, generator: np.random.Generator) -> Floats:
+        posterior = Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
         reference, _ = laplace(posterior, model.jacobian)
         moves = [Proposal(reference, step) for step in LAPLACE_STEPS] + [
             Proposal(prior_reference(prior), PRIOR_STEP)]
         chain = sample(posterior, moves, WARM_UP + THIN * DRAWS, generator, reference.centre)
         return chain.samples[WARM_UP::THIN]
 
-    def short(readings: Floats, generator: np.random.Generator) -> Floats:
-        chain = sample(target(readings), [Proposal(prior_reference(prior), PCN_STEP)], PCN_STEPS,
+    return draw
+
+
+def short_sampler(model: NonlinearModel, noise: NoiseCovariance, prior: Gaussian) -> Sampler:
+    """Return draws of the paper's chain, which is too short."""
+    def draw(readings: Floats, generator: np.random.Generator) -> Floats:
+        posterior = Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
+        chain = sample(posterior, [Proposal(prior_reference(prior), PCN_STEP)], PCN_STEPS,
                        generator, np.zeros(prior.root.shape[1]))
         return chain.samples[:: PCN_STEPS // DRAWS][:DRAWS]
 
-    cases = {
-        "linear, closed form": (lambda p: tangent @ p, closed_form, arguments.repeats, True),
-        "non-linear, chains": (lambda p: model(p, TOLERANCE_T), chains, arguments.repeats, True),
-        "control: the paper's chain, too short": (
-            lambda p: model(p, TOLERANCE_T), short, max(40, arguments.repeats // 5), False)}
+    return draw
+
+
+@dataclass(frozen=True)
+class Case:
+    """One calibration.
+
+    Attributes
+    ----------
+    simulate : callable
+    sampler : callable
+    repeats : int
+        Number of truths.
+    good : bool
+        Whether the ranks must be uniform; a control's must not.
+    error_over_noise : float
+        Stated error of the model over the stated noise, rms over the readings.
+    """
+
+    simulate: Simulator
+    sampler: Sampler
+    repeats: int
+    good: bool
+    error_over_noise: float
+
+
+def linear_cases(
+    study: Study, session: Session, prior: Gaussian, repeats: int
+) -> dict[str, Case]:
+    """Return the linear posterior, and the controls that leave something out of its noise."""
+    iron = study.iron_ring
+    assert iron is not None
+    study = study.with_(iron_ring=iron.with_(
+        curve=None, relative_permeability=LINEAR_PERMEABILITY))
+    truth = closed_form_truth(build_magnet(study), LINEAR_PERMEABILITY)
+    cases = {}
+
+    def add(name: str, size: float, left_out: str = "") -> None:
+        magnet = build_magnet(study.with_(mesh__block_size_m=size))
+        observation = observation_of(study)
+        response = response_matrix(magnet, observation, session.within(f"linear-{size:g}"))
+        stated = stated_noise(magnet, observation)
+        noise = independent_noise(np.full(len(observation), SIGMA_T)) if (
+            left_out == "positions") else stated
+        if left_out != "error":
+            noise = noise.with_independent_errors(response.error)
+        cases[name] = Case(
+            simulator(truth, observation), linear_sampler(response, noise, prior),
+            repeats, not left_out, error_over_noise(response.error, stated))
+
+    add("linear, closed form", study.mesh.block_size_m)
+    add("control: position noise not stated", study.mesh.block_size_m, "positions")
+    add("control: error of a coarse mesh not stated", COARSE_M, "error")
+    return cases
+
+
+def sampled_cases(
+    study: Study, session: Session, prior: Gaussian, repeats: int, generator: np.random.Generator
+) -> dict[str, Case]:
+    """Return the sampled posterior with iron that saturates, and chains that are too short."""
+    observation = observation_of(study)
+    model = nonlinear_model(build_magnet(study), observation, session.within("model"), generator)
+    truth = fine_truth(study, session.within("truth"), generator)
+    stated = stated_noise(build_magnet(study), observation)
+    noise = stated.with_independent_errors(model.error)
+    simulate, ratio = simulator(truth, observation), error_over_noise(model.error, stated)
+    return {
+        "non-linear, chains": Case(simulate, chain_sampler(model, noise, prior), repeats, True,
+                                   ratio),
+        "control: the paper's chain, too short": Case(
+            simulate, short_sampler(model, noise, prior), max(40, repeats // 10), False, ratio)}
+
+
+def observation_of(study: Study) -> Observation:
+    """Return the readings: every second point of the study's circle."""
+    points = points_from(study.observation.positions)[::2]
+    return observe(study, points, np.ones_like(points, bool))
+
+
+def error_over_noise(error: Floats, noise: NoiseCovariance) -> float:
+    """Return the ratio of two standard deviations (readings,), rms over the readings."""
+    return float(np.sqrt(np.mean(error**2) / np.mean(noise.sd**2)))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run all cases, write the ranks, print the table; CheckFailedError if one is off."""
+    study = read_study(arguments.study)
+    study = study.with_(mesh__block_size_m=arguments.block_size_m,
+                        observation__positions__radius_m=RADIUS_M)
+    generator = np.random.default_rng(arguments.seed)
+    prior = nominal_prior(nominal_magnetizations(build_magnet(study)), 2, 0.01, 1.0)
     results, found = {}, {}
-    for name, (forward, sampler, repeats, good) in cases.items():
-        common.say(f"{name}: {repeats} truths")
-        found[name], draws = ranks(prior, forward, noise, sampler, repeats, generator)
+    with common.session(arguments) as session:
+        cases = linear_cases(study, session, prior, arguments.repeats) | sampled_cases(
+            study, session, prior, arguments.repeats, generator)
+    for name, case in cases.items():
+        common.say(f"{name}: {case.repeats} truths")
+        found[name], draws = ranks(prior, case.simulate, case.sampler, case.repeats, generator)
         values, together = uniformity(found[name], draws)
-        results[name] = {"repeats": repeats, "p_value": together,
-                         "smallest_p_of_a_parameter": float(values.min()),
-                         "as_expected": together > PASS if good else together < FAIL}
+        results[name] = {
+            "repeats": case.repeats, "p_value": together,
+            "smallest_p_of_a_parameter": float(values.min()),
+            "model_error_over_noise": case.error_over_noise,
+            "as_expected": together > PASS if case.good else together < FAIL}
     write_calibration(found, DRAWS, results, arguments.output)
     write_text(arguments.output / "calibration.json", json.dumps(results, indent=1) + "\n")
     common.print_table([{"what": name} | {key: f"{value:.3g}" if isinstance(value, float)
@@ -101,12 +306,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def nominal_magnetizations(magnet: Magnet) -> Floats:
+    """Return the nominal M_x, M_y of all blocks (32,) in A/m."""
+    return np.concatenate([
+        block.remanence / (MU_0 * block.recoil_permeability) * np.array(block.easy_axis)[:2]
+        for block in magnet.blocks])
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--repeats", type=common.positive, default=200, metavar="N",
+    parser.add_argument("--repeats", type=common.positive, default=500, metavar="N",
                         help="truths drawn (default: %(default)s)")
     parser.add_argument("--seed", type=common.positive, default=5, metavar="N")
-    parser.add_argument("--block-size-m", type=float, default=0.02,
+    parser.add_argument("--block-size-m", type=common.positive_number, default=0.01,
                         help="of the mesh (default: %(default)s)")
 
 

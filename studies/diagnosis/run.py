@@ -9,7 +9,6 @@ independent, and --jobs of them run at a time::
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import sys
@@ -17,7 +16,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,6 +41,11 @@ from halbach_fe.report.sealed_cases import write_sealed_cases
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.stated_probabilities import (
+    error_if_calibrated,
+    expected_calibration_error,
+    frequencies,
+)
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
@@ -272,23 +276,39 @@ def truly_there(result: dict[str, Any]) -> set[str]:
     return hidden & result["probabilities"].keys() or {NONE}
 
 
-def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
-    """Return how often effects are present, for bins of the probability that was stated.
+def single_cases(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the cases whose probabilities are compared with frequencies.
 
-    Cases with at most one hidden effect count, unless the effect is not detectable.
+    The probabilities assume at most one effect. Cases with at most one hidden effect count, unless
+    the effect is not detectable.
     """
-    single = [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]
-              and all(detectable(one, name) for name in one["hidden"])]
-    stated = [(probability, name in truly_there(one))
-              for one in single for name, probability in one["probabilities"].items()]
+    return [one for one in results if len(one["hidden"]) <= 1 and not one["outside"]
+            and all(detectable(one, name) for name in one["hidden"])]
+
+
+def reliability(results: list[dict[str, Any]]) -> list[dict[str, float]]:
+    """Return how often effects are present, for bins of the probability that was stated."""
+    stated = [(probability, name in truly_there(one)) for one in single_cases(results)
+              for name, probability in one["probabilities"].items()]
     probability, there = np.array(stated, float).reshape(-1, 2).T
-    rows = []
-    for low, high in itertools.pairwise(STATED):
-        some = (probability >= low) & (probability < high)
-        if some.any():
-            rows.append({"stated": float(probability[some].mean()),
-                         "happened": float(there[some].mean()), "statements": int(some.sum())})
-    return rows
+    return [asdict(row) for row in frequencies(probability, there > 0, STATED)]
+
+
+def naming(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the expected calibration error of the likeliest name of each case, with its bins.
+
+    ``limit`` is the error that calibrated probabilities exceed in 5 % of such sets of cases.
+    """
+    stated = []
+    for one in single_cases(results):
+        if one["probabilities"]:
+            name = max(one["probabilities"], key=one["probabilities"].__getitem__)
+            stated.append((one["probabilities"][name], name in truly_there(one)))
+    probability, right = np.array(stated, float).reshape(-1, 2).T
+    bins = frequencies(probability, right > 0, STATED)
+    return {"error": expected_calibration_error(bins), "statements": len(probability),
+            "limit": error_if_calibrated(probability, STATED, np.random.default_rng(1)),
+            "bins": [asdict(row) for row in bins]}
 
 
 _known: dict[int, tuple[TemporaryDirectory[str], Session, NominalSolver]] = {}
@@ -351,13 +371,17 @@ def sentence(one: dict[str, Any]) -> str:
 
 def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[str, float]:
     """Write rates, table and page; print and return the rates."""
-    rates, stated = summary(results), reliability(results)
+    stated, named_first = reliability(results), naming(results)
+    rates = summary(results) | {
+        "naming_ece": named_first["error"], "naming_ece_limit": named_first["limit"],
+        "naming_statements": named_first["statements"]}
     known = {name: None if np.isnan(value) else value for name, value in rates.items()}
     write_text(folder / "summary.json", json.dumps(
-        {"rates": known, "reliability": stated}, indent=1, allow_nan=False) + "\n")
+        {"rates": known, "reliability": stated, "naming": named_first["bins"]}, indent=1,
+        allow_nan=False) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
                         if len(one["hidden"]) == 1 for names in one["named"] or [[NONE]])
-    write_sealed_cases(study, results, rates, stated, confusion, folder)
+    write_sealed_cases(study, results, rates, stated, named_first["bins"], confusion, folder)
     common.print_table([{"hidden": hidden, "named": ", ".join(names), "cases": str(count)}
                         for (hidden, names), count in sorted(confusion.items())],
                        "What was hidden alone, and what was named")
@@ -365,6 +389,9 @@ def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[st
                        "Rates")
     common.print_table([{name: f"{value:.3g}" for name, value in row.items()} for row in stated],
                        "Probabilities of effects, and how often they were there")
+    common.print_table([{name: f"{value:.3g}" for name, value in row.items()}
+                        for row in named_first["bins"]],
+                       "Probabilities of the likeliest name, and how often it was right")
     common.say(f"Report: {folder / 'sealed_cases.html'}")
     return rates
 

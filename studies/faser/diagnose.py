@@ -44,6 +44,7 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     draw_cross_section,
+    own_style,
     save,
     write_page,
 )
@@ -304,6 +305,7 @@ def place_figure(poses: list[Registration]) -> Figure:
     return figure
 
 
+@own_style
 def run(arguments: argparse.Namespace) -> int:
     """Compare the answers, register, update and diagnose by the best, write the page."""
     folder = arguments.output

@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--z-step-m", type=float, default=Z_STEP_M,
+    parser.add_argument("--z-step-m", type=common.positive_number, default=Z_STEP_M,
                         help="assumed distance of the readings (default: %(default)g m)")
 
 

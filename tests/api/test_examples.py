@@ -15,6 +15,7 @@ import tomlkit
 
 import halbach_fe as hf
 from tests.conftest import DIPOLE, changed
+from tests.support import cuboids
 
 MODULES = sorted(
     module.name for module in pkgutil.walk_packages(hf.__path__, "halbach_fe.")
@@ -26,11 +27,12 @@ HEAVY = {"numpy", "scipy", "pydantic", "xarray", "matplotlib", "gmsh", "rich", "
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """A folder with the files that the examples name: study, map, block table, spare blocks."""
+    """A folder with the files that the examples name: studies, map, block table, spare blocks."""
     folder = tmp_path_factory.mktemp("examples")
     study = changed(DIPOLE, array__recoil_permeability=1.0,
                     noise={"regions": [{"name": "all", "sigma_T": 1e-5}]})
     (folder / "dipole.toml").write_text(tomlkit.dumps(study))
+    (folder / "mri.toml").write_text(tomlkit.dumps(cuboids.DOCUMENT))
     hf.write_report(hf.simulate_measurement(hf.read_study(folder / "dipole.toml")), folder)
     header, *rows = (folder / "blocks.csv").read_text().splitlines()
     names = header.split(",")

@@ -14,10 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
-from halbach_fe.cli import main, parser
+from halbach_fe.cli import main
 from halbach_fe.cli.common import print_table
+from halbach_fe.cli.verbs import parser
 from halbach_fe.core.errors import EXIT_CODES
 from halbach_fe.design.demagnetization import ACROSS
 from halbach_fe.geometry.magnet import build_magnet
@@ -167,8 +169,8 @@ def test_prior_of_measured_blocks(study, table, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["prior", str(study), str(table), "-o", str(out)]) == 0
     assert "along in %" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == {"prior.h5", "prior.json", "prior.html",
-                                                     "prior_qq.png"}
+    assert {path.name for path in out.iterdir()} == {
+        "prior.h5", "prior.json", "prior.html", "prior_qq.png", "run.json"}
     assert main(["prior", str(study), str(table), "-o", str(out), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary == json.loads((out / "prior.json").read_text())
@@ -346,7 +348,6 @@ def fake_getdp(tmp_path, body):
     ("kill -SEGV $$", "SIGSEGV"),
     ("sleep 60", "time limit"),
     ("echo 'Info : System 1/1: 10 Dofs'; echo 0 > flux_density.txt", "unknowns"),
-    ("echo 'Error   : No space left on device'; exit 1", "disk is full"),
 ])
 def test_getdp_that_fails(study, tmp_path, capsys, body, said):
     out = tmp_path / "out"
@@ -366,31 +367,72 @@ def test_output_that_cannot_be_written(study, tmp_path, capsys):
     assert "Cannot" in sentence
 
 
-@pytest.fixture
-def small_disk(tmp_path, request):
-    """A file system of a few kilobytes, where the test may mount one."""
-    path = tmp_path / "disk"
-    path.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={request.param}k", "tmpfs",
-                              str(path)], capture_output=True, check=False)
-    if mounted.returncode:
-        pytest.skip("mounting a small file system needs root")
-    yield path
-    subprocess.run(["umount", str(path)], check=True)
+@pytest.mark.parametrize("body", [
+    "echo 'Error   : No space left on device'; exit 1", "kill -XFSZ $$"])
+def test_getdp_without_space(study, tmp_path, capsys, body):
+    """On a disk that is not that of the results, or under a limit."""
+    out = tmp_path / "out"
+    code, sentence = refused(["solve", study, "-o", out, "--getdp", fake_getdp(tmp_path, body)],
+                             capsys)
+    assert code == 8
+    assert f"disk of {out} is full" in sentence
 
 
-@pytest.mark.parametrize("small_disk", [16, 64, 128, 256], indirect=True)
+@pytest.mark.parametrize("small_disk", [16, 64, 128, 192, 256, 320, 400], indirect=True)
 def test_full_disk(study, small_disk, capsys):
     """Whoever meets the end of the disk first (mesh, run folder, GetDP, results): one sentence,
     and no result half-written.
     """
     code, sentence = refused(["solve", study, "-o", small_disk / "out"], capsys)
-    assert code in (5, 7, 8)
-    assert "No space left" in sentence or "disk is full" in sentence
+    assert code == 8
+    assert "No space left" in sentence or "is full" in sentence
+    assert str(small_disk / "out") in sentence
     for path in small_disk.rglob("field_map.[ch]*"):
         assert read_map(path).sizes["point"] == 10
-    assert not list(small_disk.rglob(".*.tmp*"))
-    assert not list(small_disk.rglob(".field_map*"))
+    assert not list(small_disk.rglob(".*"))
+
+
+def test_limit_of_file_sizes(study, tmp_path):
+    """A mesh that is cut off is no mesh that could not be built."""
+    done = subprocess.run(
+        ["bash", "-c", f"ulimit -f 8; exec '{sys.executable}' -m halbach_fe solve '{study}' -o "
+         f"'{tmp_path / 'out'}'"], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 8
+    assert "File too large" in done.stderr
+    assert f"{tmp_path / 'out' / 'mesh.msh'}" in done.stderr
+
+
+def test_links_are_replaced_and_not_followed(study, tmp_path):
+    """Someone may have put them into the folder of results."""
+    out, precious, own = tmp_path / "out", tmp_path / "precious", tmp_path / "folder"
+    out.mkdir()
+    own.mkdir()
+    precious.write_text("precious")
+    (own / "kept").write_text("kept")
+    main(["solve", str(study), "-o", str(tmp_path / "plain"), "--json"])
+    written = [path.name for path in (tmp_path / "plain").iterdir()
+               if path.is_file() and path.name != "run.json"]  # which a command reads first
+    assert {"mesh.msh", "regions.json", "report.html", "field_map.h5"} <= set(written)
+    for name in [*written, ".mesh.tmp.msh"]:
+        (out / name).symlink_to(precious)
+    (out / "getdp-real").symlink_to(own, target_is_directory=True)
+    assert main(["solve", str(study), "-o", str(out), "--json"]) == 0
+    assert precious.read_text() == "precious"
+    assert [path.name for path in own.iterdir()] == ["kept"]
+    assert not any((out / name).is_symlink() for name in [*written, "getdp-real"])
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077, 0o002])
+def test_the_umask_says_who_may_read(study, tmp_path, umask):
+    """Files and run folders alike."""
+    before = os.umask(umask)
+    try:
+        assert main(["solve", str(study), "-o", str(tmp_path / "out"), "--json"]) == 0
+    finally:
+        os.umask(before)
+    for path in (tmp_path / "out").rglob("*"):
+        full = 0o777 if path.is_dir() else 0o666
+        assert path.stat().st_mode & 0o777 == full & ~umask, path
 
 
 @pytest.mark.parametrize("small_disk", [16, 256], indirect=True)
@@ -475,18 +517,48 @@ def test_interruption_ends_getdp_too(study, tmp_path, number):
     process = subprocess.Popen(
         [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(out), "--getdp",
          str(fake)], stderr=subprocess.PIPE, text=True,
-        # a shell's background jobs ignore Ctrl-C, and so would their children
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+        # a shell's background jobs ignore Ctrl-C, those of nohup SIGHUP: so would their children
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL))
     while not (marker.exists() and marker.read_text().strip()):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
     process.send_signal(number)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=50)  # GetDP itself would take 60
     assert process.returncode == 130
     assert said.strip().endswith("interrupted")
     with pytest.raises(ProcessLookupError):
         os.kill(int(marker.read_text()), 0)
     assert not list(out.glob("field_map*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_end_of_halbach_fe_ends_wrapped_getdp(study, tmp_path, number):
+    """A wrapper's child is GetDP, and a cluster's modules wrap it."""
+    marker = tmp_path / "pid"
+    fake = fake_getdp(tmp_path, f"sleep 60 & echo $! > {marker}; wait")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(tmp_path / "out"),
+         "--getdp", str(fake)], stderr=subprocess.DEVNULL)
+    while not (marker.exists() and marker.read_text().strip()):
+        assert process.poll() is None
+        time.sleep(0.05)
+    child = psutil.Process(int(marker.read_text()))
+    process.send_signal(number)
+    process.wait()
+    gone, _ = psutil.wait_procs([child], timeout=50)
+    assert gone or child.status() == psutil.STATUS_ZOMBIE
+
+
+def test_what_a_wrapper_leaves_behind_is_ended(study, tmp_path, capsys):
+    """Also if the wrapper itself has ended."""
+    marker = tmp_path / "pid"
+    fake = fake_getdp(tmp_path, f"sleep 60 >/dev/null 2>&1 & echo $! > {marker}")
+    refused(["solve", study, "-o", tmp_path / "out", "--getdp", fake], capsys)
+    child = int(marker.read_text())
+    deadline = time.monotonic() + 10
+    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_every_exit_code_is_documented():

@@ -6,7 +6,8 @@ import subprocess
 
 import pytest
 
-from halbach_fe.cli import VERBS, main
+from halbach_fe.cli import main
+from halbach_fe.cli.verbs import VERBS
 
 ASK = """source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
 $(complete -p halbach-fe | sed 's/.*-F \\([^ ]*\\).*/\\1/'); printf '%s\\n' "${COMPREPLY[@]}" """

@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.map_conventions import ERRORS_BY_PLAUSIBILITY
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, read_map, readings_sha256, write_map
 from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT, circle
 
@@ -191,10 +191,11 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
     assert f"{sag['value']!r}" in line
     assert re.search(r"# arm_sag: sag .* m, log Bayes factor [\d.]+$", line)
     assert text.startswith(STUDY.rstrip("\n"))
-    again = [str(out / "study.diagnosed.toml"), "-o", str(tmp_path / "again"), "--json"]
-    assert main(["solve", *again]) == 0
+    written = str(out / "study.diagnosed.toml")
+    assert main(["solve", written, "-o", str(tmp_path / "solved"), "--json"]) == 0
     capsys.readouterr()
-    assert main(["infer", *again, "--measurements", str(data)]) == 0
+    assert main(["infer", written, "-o", str(tmp_path / "again"), "--json", "--measurements",
+                 str(data)]) == 0
     conflict = json.loads(capsys.readouterr().out)["prior_conflict"]
     assert conflict == pytest.approx(after["training", "all"]["chi2_per_reading"], rel=1e-9)
 
@@ -202,8 +203,14 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
 def test_nothing_is_missing(study, tmp_path, capsys):
     """Negative control: the same without sag."""
     out, data = tmp_path / "out", measured(tmp_path, 0.0)
-    assert main(["diagnose", str(study), "--measurements", str(data), "-o", str(out), "--json",
-                 "--effects", CHOICE, "--held-out", str(data)]) == 0
+    arguments = ["diagnose", str(study), "--measurements", str(data), "-o", str(out), "--json",
+                 "--effects", CHOICE, "--held-out"]
+    assert main([*arguments, str(data)]) == 4
+    assert "other readings" in capsys.readouterr().err
+    again = tmp_path / "again.csv"
+    write_map(read_map(data).isel(point=slice(None, None, -1)).pipe(
+        lambda old: old.assign(B_T=old["B_T"] + 1e-6)), again)
+    assert main([*arguments, str(again)]) == 0
     shown = capsys.readouterr()
     found = json.loads(shown.out)
     assert found == json.loads((out / "diagnosis.json").read_text())
@@ -228,7 +235,13 @@ def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):
             check.write_text(wrong)
         assert main(arguments) == 4
         assert "check.json" in capsys.readouterr().err
-    check.write_text('{"floor_T": [4.25e-5, 1.5e-4, 2e-5]}')
+    floor = {"floor_T": [4.25e-5, 1.5e-4, 2e-5]}
+    other = readings_sha256(read_map(data).isel(point=slice(1, None)))
+    check.write_text(json.dumps(floor | {"maps_sha256": {"map": other}}))
+    assert main(arguments) == 4
+    assert "another map" in capsys.readouterr().err
+    own = readings_sha256(read_map(data))
+    check.write_text(json.dumps(floor | {"maps_sha256": {"map": other, "oriented_map": own}}))
     assert main(arguments) == 0
     shown = capsys.readouterr().out
     assert "model-free floor" in shown
@@ -333,12 +346,13 @@ def test_the_documentation_says_what_is_in_the_file():
     keys = re.findall(r"^\| `([A-Za-z_]+)` \|", section, re.MULTILINE)
     study = parse_study(tomllib.loads(STUDY))
     update = SimpleNamespace(
-        study=study, parts=("training",), regions=("all",), prior_conflict=1.0, conflict_limit=2.0,
+        study=study, parts=("training",), maps=("map",), regions=("all",), is_campaign=False,
+        prior_conflict=1.0, conflict_limit=2.0,
         readings=np.zeros(1), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
         before=update, after=update, gross_errors=(), outliers=(), identified=(),
-        position_noise=None, solver_error=None, unknown=None, suspected=(), found_anything=False,
+        position_noise=(), solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, converged=True, positions=(), limits=None,
         floor_T=None, uncompared=None)

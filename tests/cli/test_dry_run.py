@@ -30,6 +30,14 @@ def test_it_starts_and_writes_nothing(commands, verb, tmp_path, capsys):
     before = set(tmp_path.rglob("*"))
     assert main([*commands[verb], "--dry-run", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
+    folder = commands[verb].index("-o")
+    bare = commands[verb][:folder] + commands[verb][folder + 2:]
+    assert main([*bare, "--dry-run", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert (again["solves"], again["disk_GiB"]) == (shown["solves"], shown["disk_GiB"])
+    with pytest.raises(SystemExit):
+        main(bare)
+    assert "-o/--output" in capsys.readouterr().err
     assert set(tmp_path.rglob("*")) == before
     assert shown["route"] == "cross_section"
     assert (shown["blocks"], shown["parameters"]) == (8, 16 if verb == "infer" else 0)
@@ -66,6 +74,12 @@ def test_the_machine_says_what_it_has():
     assert 0 < resource_estimate.available_memory() < 1e6
 
 
+def with_getdp(arguments, getdp):
+    """The arguments with a GetDP that there is."""
+    place = arguments.index("--getdp") + 1
+    return [*arguments[:place], str(getdp.executable), *arguments[place + 1:]]
+
+
 @pytest.mark.parametrize(("old", "new"), [
     ("block_size_m = 0.02", "block_size_m = 20"), ("radius_m = 0.03", "radius_m = 0.07"),
     ("radius_m = 0.03", "radius_m = 9.0"), ("inner_radius_m = 0.05", "inner_radius_m = 0.1")])
@@ -73,8 +87,8 @@ def test_the_machine_says_what_it_has():
 def test_bad_studies_are_refused_as_ever(commands, verb, tmp_path, capsys, getdp, old, new):
     (tmp_path / "study.toml").write_text(STUDY.replace(old, new, 1))
     codes, said = [], []
-    for more in (["--dry-run"], ["--getdp", str(getdp.executable)]):
-        codes.append(main([*commands[verb], *more]))
+    for arguments in ([*commands[verb], "--dry-run"], with_getdp(commands[verb], getdp)):
+        codes.append(main(arguments))
         said.append(capsys.readouterr().err.splitlines()[-1])
     assert codes[0] == codes[1] != 0
     assert said[0] == said[1]
@@ -84,8 +98,8 @@ def test_a_bad_map_is_refused_as_ever(commands, tmp_path, capsys, getdp):
     for radius in (0.07, 9.0):
         write_map(field_map(circle(radius, 10), np.ones((10, 3))), tmp_path / "map.csv")
         codes, said = [], []
-        for more in (["--dry-run"], ["--getdp", str(getdp.executable)]):
-            codes.append(main([*commands["infer"], *more]))
+        for arguments in ([*commands["infer"], "--dry-run"], with_getdp(commands["infer"], getdp)):
+            codes.append(main(arguments))
             sentence = capsys.readouterr().err.splitlines()[-1]
             said.append(sentence.partition("the first at")[0])  # of places in another order
         assert codes[0] == codes[1] != 0

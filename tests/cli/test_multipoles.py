@@ -137,7 +137,7 @@ def test_multipoles_of_the_measured_magnet(made, tmp_path, capsys):
     other.write_text(STUDY.replace("1.3", "1.31"))
     error = run(capsys, "multipoles", other, "--posterior", tmp_path / "posterior.h5", "-o",
                 tmp_path / "x", code=4)
-    assert "another nominal magnet" in error
+    assert "another `array.remanence_T`" in error
     error = run(capsys, "multipoles", study, "--posterior", folder / "map.csv", "-o",
                 tmp_path / "x", code=4)
     assert "posterior.h5" in error

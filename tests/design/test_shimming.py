@@ -391,7 +391,7 @@ def test_moves_that_a_study_cannot_say():
 
 
 @pytest.mark.parametrize(("reference", "said"), [
-    (MultipoleReference(0.2), "between 0 and the blocks' inner radius"),
+    (MultipoleReference(0.2), "as the blocks' inner radius is"),
     (MultipoleReference(RADIUS, (1,)), "unwanted multipoles")])
 def test_references_that_make_no_sense(session, reference, said):
     with pytest.raises(StudyError, match=said):
@@ -400,9 +400,12 @@ def test_references_that_make_no_sense(session, reference, said):
 
 def test_stock_of_another_magnet(one_magnet, generator):
     _, update, model, made = one_magnet
-    stock = replace(made.blocks, type=("x",) * 12)
+    moves = {"swap": 0, "turn": 0, "replace": 1}
+    with pytest.raises(MeasurementError, match="a block of the stock stands in no slot"):
+        shim(update, model, generator, moves, stock=made.blocks)
+    stock = replace(made.blocks, type=("x",) * 12, ring=np.zeros(12, int), slot=np.zeros(12, int))
     with pytest.raises(MeasurementError, match="type of block"):
-        shim(update, model, generator, {"swap": 0, "turn": 0, "replace": 1}, stock=stock)
+        shim(update, model, generator, moves, stock=stock)
 
 
 def test_a_shimmed_study_solves(session):

@@ -29,8 +29,7 @@ def test_it_is_the_amplitude_at_the_threshold(generator, size):
     amplitude = smallest_amplitude(information, threshold)
     direction = np.linalg.eigh(information)[1][:, 0]
     for factor, above in ((0.95, False), (1.0, True), (1.05, True)):
-        evidence = Evidence(information, factor * amplitude * information @ direction, 0.0, 9,
-                            np.ones(size))
+        evidence = Evidence.of(information, factor * amplitude * information @ direction, 0.0, 9)
         (found,) = log_bayes_factors(evidence, [Candidate("one", "", tuple(range(size)))])
         assert (found >= threshold) == above
     assert smallest_amplitude(np.zeros((size, size)), threshold) == np.inf

@@ -9,8 +9,10 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
-from halbach_fe.diagnosis.result import Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
@@ -81,7 +83,8 @@ def test_no_recoil_permeability_is_below_one():
     for value, there in ((0.1, True), (-0.1, False)):
         named = IdentifiedEffect(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
                       SelectedEffect(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
-        assert possible(with_array(recoil_permeability=1.05), [named], CIRCLES) == there
+        assert possible(with_array(recoil_permeability=1.05), [named],
+                        Campaign.of(STUDY, field_map(CIRCLES, 0 * CIRCLES))) == there
 
 
 def test_sides_that_are_equal_are_told_with_their_odds(session, generator):

@@ -22,9 +22,10 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.effects.offset import OffsetEffect
 from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.diagnosis.result import Diagnosis, Hypothesis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.infer import infer
@@ -75,7 +76,8 @@ def case(inferred):
         one = IdentifiedEffect(Hypothesis(effect, at), np.array(values), np.array(values) / 10,
                                found)
         return Diagnosis(
-            corrected_study=update.study, before=update, after=update, identified=(one,),
+            corrected_study=update.study, before=update, after=update, study=update.study,
+            identified=(one,),
             unknown=None,
             probabilities={}, evidence=None, candidates=(), groups_before=[], groups_after=[],
             loo_residuals_before=np.zeros(0),

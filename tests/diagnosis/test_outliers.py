@@ -9,14 +9,17 @@ import pytest
 import scipy.sparse as sparse
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.outliers import excluding, find_outliers, outliers_of
+from halbach_fe.diagnosis.outliers import Outlier, excluding, find_outliers, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,
     estimate_position_noise,
-    has_settled,
+    have_settled,
     with_position_noise,
 )
+from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.campaign import ONLY_MAP
+from halbach_fe.measurement.field_map import field_map
 from halbach_fe.solver.exact_block_field import gradient_of, unit_fields
 from halbach_fe.stats.noise import independent_noise
 from halbach_fe.study.reader import parse_study
@@ -125,14 +128,18 @@ def update_of(residual, root, points=POINTS):
     return SimpleNamespace(
         study=STUDY, magnet=build_magnet(STUDY), observation=observation,
         errors=independent_noise(np.full(count, NOISE_T)),
-        held_out=np.zeros(count, bool), parts=("training",) * count, readings=residual,
-        prior=SimpleNamespace(root=np.eye(root.shape[1])), response=SimpleNamespace(matrix=root),
-        prediction_prior=SimpleNamespace(mean=np.zeros(count)), prior_conflict=2.0)
+        held_out=np.zeros(count, bool), parts=("training",) * count, maps=(ONLY_MAP,) * count,
+        readings=residual,
+        prediction_prior=SimpleNamespace(mean=np.zeros(count), root=root.__getitem__))
+
+
+def campaign_of(points=POINTS):
+    return Campaign.of(STUDY, field_map(points, np.zeros(points.shape)))
 
 
 def test_outliers_are_told_and_left_out(root, clean):
     clean[[4, 5, 3000]] += OFF_T
-    found = outliers_of(update_of(clean, root))
+    found = outliers_of(update_of(clean, root), campaign_of())
     assert [(one.row, one.component) for one in found] == [(2, "y"), (2, "z"), (1001, "x")]
     assert found[2].at_m == tuple(POINTS[1000])
     assert all(abs(one.off_T - OFF_T) < 5 * one.sd_T < 0.1 * OFF_T for one in found)
@@ -144,7 +151,7 @@ def test_outliers_are_told_and_left_out(root, clean):
     # coefficients are made of many readings
     update = update_of(clean, root)
     update.observation.analysis = sparse.csr_array(np.ones((COUNT, 2)))
-    assert outliers_of(update) == ()
+    assert outliers_of(update, campaign_of()) == ()
 
 
 SHAKEN_M = 1e-4
@@ -166,26 +173,40 @@ def test_vibration(added, root, gradient, clean, generator):
     some = np.arange(len(POINTS)) % 6 == 0  # lest it take long
     rows = np.repeat(some, 3)
     found = estimate_position_noise(
-        update_of(residual[rows], root[rows], POINTS[some]), Marginal.of(root[rows] / NOISE_T),
-        columns[rows], residual[rows] / NOISE_T, None)
+        update_of(residual[rows], root[rows], POINTS[some]), campaign_of(POINTS[some]),
+        Marginal.of(root[rows] / NOISE_T), columns[rows], residual[rows] / NOISE_T, ())
     if added == "vibration":
+        (found,) = found
         # of 672 readings half are in the fringe, which smooth terms halve again: 5 %; 3 sd
         assert found.sd_m == pytest.approx(SHAKEN_M, rel=0.15)
         assert found.log_bayes_factor > 50
     else:
-        assert found is None
+        assert found == ()
 
 
 def test_a_study_with_vibration():
     found = PositionNoise(20.0, 3e-4)
-    assert with_position_noise(STUDY, None) == STUDY
-    assert with_position_noise(STUDY, found).noise.position_sd_m == (3e-4,)
-    assert with_position_noise(STUDY, found).noise.regions == STUDY.noise.regions
+    assert with_position_noise(STUDY, ()) == STUDY
+    assert with_position_noise(STUDY, [found]).noise.position_sd_m == (3e-4,)
+    assert with_position_noise(STUDY, [found]).noise.regions == STUDY.noise.regions
     shaky = parse_study(DOCUMENT | {"noise": {"position_sd_m": [4e-4, 0.0, 4e-4]}})
-    assert with_position_noise(shaky,
-                               found).noise.position_sd_m == pytest.approx((5e-4, 3e-4, 5e-4))
-    assert has_settled(None, None)
-    assert has_settled(found, PositionNoise(1.0, 3.1e-4))
-    assert not has_settled(found, None)
-    assert not has_settled(None, found)
-    assert not has_settled(found, PositionNoise(1.0, 4e-4))
+    assert with_position_noise(shaky, [found]).noise.position_sd_m == pytest.approx(
+        (5e-4, 3e-4, 5e-4))
+    assert have_settled([], [])
+    assert have_settled([found], [PositionNoise(1.0, 3.1e-4)])
+    assert not have_settled([found], [])
+    assert not have_settled([], [found])
+    assert not have_settled([found], [PositionNoise(1.0, 4e-4)])
+
+
+def test_outliers_and_vibration_belong_to_a_map():
+    study = parse_study(DOCUMENT | {"maps": [
+        {"name": "one", "file": "1.csv"},
+        {"name": "two", "file": "2.csv", "inference": {"excluded_readings": [3]}}]})
+    odd = excluding(study, [Outlier(7, "y", (0.0, 0.0, 0.0), 1.0, 0.1, "two")])
+    assert odd.maps[0] == study.maps[0]
+    assert [one.row for one in odd.of_map(1).inference.excluded_readings] == [3, 7]
+    shaken = with_position_noise(study, [PositionNoise(20.0, 3e-4, "two")])
+    assert shaken.maps[0] == study.maps[0]
+    assert shaken.of_map(1).noise.position_sd_m == (3e-4,)
+    assert shaken.of_map(1).noise.regions == study.noise.regions

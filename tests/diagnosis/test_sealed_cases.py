@@ -92,6 +92,49 @@ def test_rates_count_what_they_say(study, tmp_path):
         assert (tmp_path / name).exists()
 
 
+def made_up_cases(generator, sharpened):
+    """300 cases that state a probability of gain_z and give the rest to offset_z.
+
+    gain_z is hidden with that probability. If ``sharpened`` is not 1, the log odds are multiplied
+    by it before they are stated.
+    """
+    true = generator.uniform(0.05, 0.95, 300)
+    odds = (true / (1 - true)) ** sharpened
+    stated = odds / (1 + odds)
+    return [result(["gain_z" if there else "offset_z"],
+                   probabilities={"gain_z": p, "offset_z": 1 - p, "none": 0.0})
+            for p, there in zip(stated.tolist(), generator.random(300) < true, strict=True)]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_naming_error_of_calibrated_and_over_confident_cases(study, seed):
+    """The limit is exceeded by chance in 5 % of seeds, and over-confident names (the control) are
+    far above it.
+    """
+    generator = np.random.default_rng(seed)
+    right = study.naming(made_up_cases(generator, 1.0))
+    assert right["statements"] == 300 == sum(row["statements"] for row in right["bins"])
+    assert right["error"] < right["limit"] < 0.08
+    sure = study.naming(made_up_cases(generator, 3.0))
+    assert sure["error"] > 1.5 * sure["limit"]
+
+
+def test_naming_error_leaves_out_what_it_cannot_judge(study, tmp_path):
+    """Pairs, causes outside the catalogue and effects that cannot be seen state nothing."""
+    probabilities = {"gain_z": 0.8, "none": 0.2}
+    counted = [result(["gain_z"], probabilities=probabilities), result(probabilities=probabilities)]
+    others = [result(["gain_z", "arm_sag"], probabilities=probabilities),
+              result(outside="coil", probabilities=probabilities),
+              result(["z_scale"], best={"z_scale": 1.0}, probabilities=probabilities)]
+    found = study.naming(counted + others)
+    assert found["bins"] == [{"stated": pytest.approx(0.8), "happened": 0.5, "statements": 2}]
+    assert found["error"] == pytest.approx(0.3)
+    study.report(read_study(ROOT / "studies" / "diagnosis" / "study.toml"), counted, tmp_path)
+    rates = json.loads((tmp_path / "summary.json").read_text())["rates"]
+    assert rates["naming_ece"] == pytest.approx(0.3)
+    assert rates["naming_statements"] == 2
+
+
 def test_every_effect_that_can_be_hidden_is_in_a_case(study):
     cases = study.cases(1, 20, 20, 12)
     assert {name for one in cases for name in one.hidden} == set(study.CAN_BE_HIDDEN)

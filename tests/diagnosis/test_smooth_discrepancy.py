@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.flexible_causes import families, fit_family
+from halbach_fe.diagnosis.flexible_causes import field_family, fit_family, instrument_families
 from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields
 from tests.conftest import circle
 
@@ -41,8 +41,8 @@ def factors(field):
     residual = field.ravel() / SIGMA + noise
     marginal = Marginal.of(np.zeros((field.size, 1)))
     nothing = np.zeros_like(POINTS)  # no field: no gains, and no gradient
-    every = families(POINTS, np.linspace(0, 1, len(POINTS)), nothing, np.zeros((*POINTS.shape, 3)),
-                     SIGMA)
+    every = [field_family(POINTS, SIGMA), *instrument_families(
+        POINTS, np.linspace(0, 1, len(POINTS)), nothing, np.zeros((*POINTS.shape, 3)), SIGMA)]
     found = {}
     for family in every:
         fields = family.fields()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from halbach_fe.cli import VERBS
+from halbach_fe.cli.verbs import VERBS
 from halbach_fe.study.model import Study
 from tests.conftest import ROOT
 

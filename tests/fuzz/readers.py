@@ -7,14 +7,19 @@ import io
 import tempfile
 import tomllib
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
 
 import meshio
 import numpy as np
 import xarray as xr
 
+from halbach_fe.core import untrusted
 from halbach_fe.core.errors import (
     GetDPError,
     HalbachWarning,
@@ -24,16 +29,18 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.regions import Regions
-from halbach_fe.inference import mcmc
+from halbach_fe.inference import mcmc, storage
 from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.storage import _stored_root, read_posterior
+from halbach_fe.measurement.assembly_order import read_order
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
-from halbach_fe.measurement.formats import READERS as FORMATS
-from halbach_fe.measurement.formats import import_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import READERS as FORMATS
+from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.measurement.formats.grid import grid_of
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
+from halbach_fe.response import matrix as matrix_module
 from halbach_fe.response.matrix import Response, StoredMatrix, _beside
 from halbach_fe.response.matrix import _read as read_response
 from halbach_fe.response.matrix import _write as write_response
@@ -147,7 +154,8 @@ def posterior() -> bytes:
         {name: ("parameter", nominal * factor) for name, factor in (
             ("nominal", 1), ("prior_mean", 1), ("prior_sd", 0.01), ("posterior_mean", 1.01),
             ("posterior_sd", 0.001))},
-        coords={"parameter": [f"p{n}" for n in range(count)]}, attrs={"study": "{}"})
+        coords={"parameter": [f"p{n}" for n in range(count)]},
+        attrs={"study": TINY.model_dump_json()})
     prior = nominal_prior(nominal, 2, 0.01, 1.0, 0.005)
     size = prior.root.shape[1]
     after = Gaussian(nominal, CovarianceFactor(
@@ -163,6 +171,16 @@ def a_response() -> bytes:
     return written(".h5", lambda path: write_response(path, "the key", built))
 
 
+def unverified(module: ModuleType, read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    """A reader that takes every checksum for right: who makes a hostile file can compute it."""
+    def reading(path: Path) -> Any:
+        with (mock.patch.object(module, "read_hdf5", untrusted.read_dataset),
+              warnings.catch_warnings()):
+            warnings.simplefilter("ignore", HalbachWarning)
+            return read(path)
+    return reading
+
+
 def a_matrix() -> bytes:
     return written(".npy", lambda path: StoredMatrix.of([np.ones((3, 2))], (3, 2), path))
 
@@ -174,7 +192,8 @@ def with_matrix(path: Path) -> np.ndarray | None:
         beside = _beside(main, "the key")
         beside.write_bytes(path.read_bytes())
         write_response(main, "the key", Response(
-            StoredMatrix(beside, (3, 2)), ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3),
+            StoredMatrix(beside, (3, 2), hashlib.sha256(beside.read_bytes()).hexdigest()),
+            ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3),
             np.zeros(3), 1e-9))
         found = read_response(main, "the key")
         return None if found is None else found.whole
@@ -430,9 +449,18 @@ LOG = (b"  0 KSP Residual norm 1.0\n", b"KSP Residual norm nan\n", b" 3 KSP Resi
        b"NEWTON 1 0 x\n", b"NEWTON 1 3 1e-9\n", b"Error : ")
 
 
+ORDER_CSV = b"block,step\nr01s02,1\nr01s01,2\n"
+
+
+def check_order(names: tuple[str, ...]) -> None:
+    """Every row has a name."""
+    assert names
+
+
 NAMES = (
     "study", "changed study", "steel", "free blocks (CSV)", "free blocks (HDF5)", "map (CSV)",
-    "map (HDF5)", "map (VTU)", "block table", "import: columns", "import: opera", "import: comsol",
+    "map (HDF5)", "map (VTU)", "block table", "order of assembly",
+    "import: columns", "import: opera", "import: comsol",
     "import: openpmd", "import as columns", "import as opera", "import as comsol",
     "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains", "mesh",
     "regions", "GetDP: unknowns", "GetDP: unknowns of edges", "GetDP: solutions",
@@ -476,6 +504,8 @@ def readers() -> tuple[Reader, ...]:
                read_map, MeasurementError, check_map, XML),
         Reader("block table", "blocks.csv", (BLOCKS_CSV,), read_blocks, MeasurementError,
                check_blocks, COLUMNS),
+        Reader("order of assembly", "order.csv", (ORDER_CSV,), read_order, MeasurementError,
+               check_order, (b"block",)),
         replace(foreign, name="import: columns", seeds=columns),
         replace(foreign, name="import: opera", seeds=((OPERA + rows(field=FIELD)).encode(),)),
         replace(foreign, name="import: comsol", seeds=(
@@ -487,15 +517,18 @@ def readers() -> tuple[Reader, ...]:
                   seeds=(columns[0], (OPERA + rows(field=FIELD)).encode(), sheet, grid))
           for name in FORMATS),
         Reader("posterior", "posterior.h5", (posterior(),),
-               lambda path: read_posterior(build_magnet(TINY), path), MeasurementError,
+               unverified(storage, lambda path: read_posterior(build_magnet(TINY), path)),
+               MeasurementError,
                check_posterior, HDF5),
         Reader("stored response", "response.h5", (a_response(),),
-               lambda path: read_response(path, "the key"), None, check_response, HDF5),
-        Reader("stored matrix", "response.npy", (a_matrix(),), with_matrix, None, check_matrix,
+               unverified(matrix_module, lambda path: read_response(path, "the key")), None,
+               check_response, HDF5),
+        Reader("stored matrix", "response.npy", (a_matrix(),),
+               unverified(matrix_module, with_matrix), None, check_matrix,
                (b"'descr'", b"'<f8'", b"'|O'", b"'fortran_order': True", b"(3, 2)", b"(10**9, 2)",
                 b"(-1, 2)", b"(", b"{", b"\x93NUMPY\x02\x00")),
-        Reader("stored chains", "chains.nc", (chains(),), resumed, None, check_resumed,
-               (*HDF5, b"PCG64", b"bit_generator", b"state", b"has_uint32")),
+        Reader("stored chains", "chains.nc", (chains(),), unverified(mcmc, resumed), None,
+               check_resumed, (*HDF5, b"PCG64", b"bit_generator", b"state", b"has_uint32")),
         Reader("mesh", "mesh.msh", (left["mesh"], ascii_mesh), mesh_beside(
             left["regions"]), MeshError, tokens=MSH),
         Reader("regions", "regions.json", (left["regions"],), Regions.read, MeshError,

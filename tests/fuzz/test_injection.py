@@ -41,6 +41,7 @@ FIELDS = {
     "array.material": lambda text: {"array__material": text},
     "maps.name": lambda text: {"maps": [{"name": text, "file": "map.csv"}]},
     "maps.probe": lambda text: {"maps": [{"name": "a", "file": "map.csv", "probe": text}]},
+    "maps.stage": lambda text: {"maps": [{"name": "a", "file": "map.csv", "stage": text}]},
     "array.ring.material": lambda text: {"array__ring": [{"material": text}]},
 }
 """All free text of a study, with what makes a study of it; names of files have tests below."""
@@ -63,7 +64,7 @@ def test_there_is_no_other_text():
     assert set(text_fields(Study.model_json_schema())) == {
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
         "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file", "MapSettings.name",
-        "MapSettings.file", "MapSettings.probe"}
+        "MapSettings.file", "MapSettings.probe", "MapSettings.stage"}
 
 
 def hostile_studies():
@@ -99,7 +100,7 @@ def test_nothing_of_a_study_becomes_code_of_getdp(staged):
             content = content.replace(f"study {study.name},", "study dipole,")
             assert content == harmless[name], (field, text)
     assert taken == {"name", "description", "noise.regions.name", "prior.types", "maps.name",
-                     "maps.probe"}
+                     "maps.probe", "maps.stage"}
     assert refused == set(FIELDS)
     for payload in ("}; Exit; Group {", "../../../etc/passwd", "a\nb", "<< 7*7 >>"):
         with pytest.raises(StudyError):

@@ -188,9 +188,3 @@ def test_an_export_of_an_export_is_the_same(short_dipole):
             np.testing.assert_allclose(values, second[column], atol=1e-15)
         else:
             assert values == second[column]
-
-
-def test_nothing_to_export(dipole):
-    magnet = build_magnet(dipole(array__exceptions=[{"magnetization_factor": 0.0}]))
-    with pytest.raises(StudyError, match="all are missing"):
-        blocks_table(magnet)

@@ -458,7 +458,7 @@ def test_calibration_of_the_coil_is_not_mistaken_for_a_discovery(dipole, generat
     assert score[1] > 2  # 2.2 to 2.6
     assert good.prior_conflict < good.conflict_limit
     assert bad.prior_conflict > bad.conflict_limit
-    assert good.measured_blocks == 16
+    assert len(good.measured_blocks) == 16
 
 
 # --- refusals ----------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import magpylib
 import numpy as np
@@ -13,6 +14,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.result import TOO_NEAR
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.observation import observe
@@ -142,6 +144,28 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     text = page(tmp_path / "report.html")
     assert text.count("<img alt=") == 6
     assert "disagree" not in text
+
+
+@pytest.mark.parametrize(("factor", "every", "said"), [
+    (100.0, 1, "sigma_T, position_sd_m or prior is too large"),
+    (20.0, 12, r"updated model is [\d.]+ times nearer .* sigma_T or position_sd_m is too large"),
+    (1.0, 12, None), (1.0, 1, None),
+    (0.01, 1, "cannot all be right.*Held-out readings are .* sigma_T is too small")])
+def test_noise_that_is_stated_wrongly(short_dipole, generator, session, factor, every, said):
+    """Truth by magpylib. If readings are few, a prior that allows much does not hide it."""
+    study, data, _ = magpylib_campaign(short_dipole, generator)
+    changes = {"noise": {"regions": [{"name": "bore", "sigma_T": 1e-5 * factor}]}}
+    if every > 1:
+        changes["inference"] = {}
+    update = infer(build_magnet(study.with_(**changes)), data.isel(point=slice(0, None, every)),
+                   session)
+    if said is not None:
+        assert re.search(said, update.disagreement)
+        assert update.noise_ratio < TOO_NEAR if factor > 1 else update.noise_ratio > 1000
+        return
+    assert update.disagreement == ""
+    # 960 or 120 training readings, of which some 80 or 60 are learnt: sd 0.05 or 0.2
+    assert update.noise_ratio == pytest.approx(1.0, abs=0.25 if every == 1 else 0.8)
 
 
 def test_a_second_map_is_only_predicted(short_dipole, generator, session, tmp_path):
@@ -365,7 +389,7 @@ def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, session):
         infer(build_magnet(short_dipole(noise=NOISE)), far, session)
     with pytest.raises(MeasurementError, match="Check the units"):
         infer(build_magnet(short_dipole(noise=NOISE)), far.isel(point=[0]), session,
-              validation_map=far)
+              validation_map=far.isel(point=[1]))
 
 
 def test_readings_that_vanish_by_symmetry(short_dipole, session):

@@ -12,10 +12,17 @@ import pytest
 import xarray as xr
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import SamplingError
+from halbach_fe.core.errors import OutputError, SamplingError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
+from halbach_fe.inference.mcmc import (
+    _resume,
+    _Run,
+    _store,
+    sample_posterior,
+    with_samples,
+    write_sampled,
+)
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
@@ -195,3 +202,18 @@ sigma_T = 1e-4
                  str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--samples", "10"])
     assert code == 3
     assert "closed form" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("small_disk", [64], indirect=True)
+def test_chains_on_a_full_disk(small_disk):
+    """The HDF5 library must not crash, and what was stored before stays whole."""
+    def runs(draws):
+        return [_Run(np.random.default_rng(seed), np.ones(2), np.full((draws, 2), seed, float))
+                for seed in (1, 2)]
+
+    path, names = small_disk / "chains.nc", ("a", "b")
+    _store(path, "key", runs(10), names, 7)
+    with pytest.raises(OutputError, match="No space left"):
+        _store(path, "key", runs(10_000), names, 8)
+    assert [one.name for one in small_disk.iterdir()] == ["chains.nc"]
+    assert _resume(path, "key", runs(0)) == 7

@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse as sparse
 from scipy import stats
 
+from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
@@ -209,7 +210,8 @@ def test_a_matrix_on_the_disk(monkeypatch, session, tmp_path):
     assert again.reused
     np.testing.assert_array_equal(again.matrix[np.arange(9)], parts.matrix[np.arange(9)])
     parts.matrix.path.write_bytes(b"")
-    assert not response_matrix(build_magnet(study), observation, session).reused
+    with pytest.warns(HalbachWarning, match="is computed again"):
+        assert not response_matrix(build_magnet(study), observation, session).reused
     assert len(list(session.folder.glob("response-*.npy"))) == 1
 
 

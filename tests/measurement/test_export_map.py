@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.measurement.field_map import field_map, points_of, read_map
-from halbach_fe.measurement.formats import WRITERS, export_map, import_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import WRITERS, export_map, import_map
 from tests.measurement.test_import_map import FIELD, POINTS
 
 with warnings.catch_warnings():  # its plots use what matplotlib will drop
@@ -49,7 +49,7 @@ def exchanged(data):
 
 @pytest.mark.parametrize("name", ["openpmd", "geant4", "csv"])
 def test_what_is_exported_reads_back(tmp_path, shuffled, name):
-    path = tmp_path / f"map.{name}"
+    path = tmp_path / ("map.h5" if name == "openpmd" else f"map.{name}")
     export_map(shuffled, name, path)
     assert agrees(import_map(path, DeclaredFormat()).data)
     points, field = ordered(shuffled)
@@ -272,7 +272,7 @@ CIRCLE = np.column_stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) 
 def test_points_that_are_no_grid_are_refused(tmp_path, points, asked, name):
     data = field_map(points, np.ones((len(points), 3)))
     with pytest.raises(MeasurementError) as caught:
-        export_map(data, name, tmp_path / "map.out")
+        export_map(data, name, tmp_path / "map.h5")
     assert asked in str(caught.value)
     assert 'kind = "grid"' in str(caught.value)
     assert not list(tmp_path.iterdir())
@@ -291,9 +291,10 @@ def test_missing_components_and_suffixes(tmp_path):
     data = field_map(POINTS, np.where(np.arange(72).reshape(24, 3) == 7, np.nan, FIELD))
     for name in WRITERS[:3]:
         with pytest.raises(MeasurementError, match="none of By in reading 3"):
-            export_map(data, name, tmp_path / "map.out")
+            export_map(data, name, tmp_path / "map.h5")
     export_map(data, "csv", tmp_path / "map.csv")
-    with pytest.raises(OutputError, match="suffix"):
-        export_map(data, "csv", tmp_path / "map.vtu")
+    for name in ("csv", "openpmd"):
+        with pytest.raises(OutputError, match="suffix"):
+            export_map(data, name, tmp_path / "map.vtu")
     with pytest.raises(OutputError, match="Cannot write"):
         export_map(field_map(POINTS, FIELD), "bdsim", tmp_path / "map.csv" / "map.dat")

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import points_of, read_map, write_map
-from halbach_fe.measurement.formats import export_map, format_of, import_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import export_map, format_of, import_map
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
 
 AXES = [-0.01, 0.01], [0.0, 0.005, 0.01], [0.1, 0.2, 0.3, 0.4]

@@ -10,7 +10,13 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    field_map,
+    points_of,
+    read_map,
+    readings_sha256,
+    write_map,
+)
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields
 from halbach_fe.measurement.map_check import check_map, scan_lines
 from halbach_fe.report.map_check import instrument_table, oriented, sentences, verdict
@@ -169,6 +175,11 @@ def test_command(generator, tmp_path, capsys):
     turned = read_map(tmp_path / "out" / "oriented_map.csv")
     np.testing.assert_allclose(turned["B_T"].values, field * [1, 1, -1], atol=1e-12)
     corrected = read_map(tmp_path / "out" / "corrected_map.csv")
+    assert found["maps_sha256"] == {  # by which `diagnose --check` knows that the floor is theirs
+        name: readings_sha256(read_map(file)) for name, file in {
+            "map": tmp_path / "map.csv", "oriented_map": tmp_path / "out" / "oriented_map.csv",
+            "corrected_map": tmp_path / "out" / "corrected_map.csv"}.items()}
+    assert len(set(found["maps_sha256"].values())) == 3
     # nothing was wrong but the sign: noise decides what the instrument's parameters are
     np.testing.assert_allclose(corrected["B_T"].values, field * [1, 1, -1], atol=2e-4)
     assert main(["check", str(tmp_path / "map.csv"), "--json"]) == 0

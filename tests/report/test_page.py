@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import os
+import subprocess
+import sys
+
+import matplotlib
 import pytest
 from matplotlib.figure import Figure
 
-from halbach_fe.report.page import save, write_page
-from tests.conftest import DIPOLE, parse_study
+from halbach_fe.cli import main
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.page import own_style, save, write_page
+from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page
 
 SEEN = "what the picture shows, in words"
@@ -40,3 +48,49 @@ def test_pages_that_are_not(written, old, new):
     written.write_text(text.replace(old, new))
     with pytest.raises(AssertionError):
         page(written)
+
+
+HOSTILE = {"text.usetex": True, "figure.facecolor": "red", "savefig.format": "pdf",
+           "axes.prop_cycle": matplotlib.cycler(color=["y"]), "font.size": 40.0}
+EXAMPLE = ROOT / "studies" / "quadrupole"
+
+
+def test_figures_are_the_same_whatever_the_settings(tmp_path):
+    """A user's matplotlibrc may need LaTeX, which is not there; and it is left alone."""
+    magnet = build_magnet(parse_study(DIPOLE))
+
+    def drawn(name):
+        folder = tmp_path / name
+        assert main(["prior", str(EXAMPLE / "study.toml"), str(EXAMPLE / "campaign" / "blocks.csv"),
+                     "-o", str(folder), "--json"]) == 0
+        return [path.read_bytes() for path in sorted(folder.glob("*.png"))], magnet._repr_html_()
+
+    figures, shown = drawn("plain")
+    assert figures
+    with matplotlib.rc_context(HOSTILE):
+        assert drawn("hostile") == (figures, shown)
+        assert matplotlib.rcParams["text.usetex"]
+    with matplotlib.rc_context(HOSTILE | {"text.usetex": False}):  # the control
+        def plain():
+            return save({"one.png": (Figure(), SEEN)}, tmp_path)
+
+        assert plain() != own_style(plain)()
+
+
+def test_every_page_has_its_own_style():
+    """Whatever saves figures draws them in it."""
+    for path in (ROOT / "halbach_fe" / "report").glob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef) and "save(" in ast.unparse(node) and (
+                    path.name, node.name) != ("page.py", "save"):
+                assert [ast.unparse(one) for one in node.decorator_list] == ["own_style"], node.name
+
+
+@pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend", "nonsense", "tkagg"])
+def test_the_backend_of_a_notebook_is_not_needed(backend):
+    """Which a terminal started from it inherits."""
+    code = ("import sys; from halbach_fe.cli.guard import guarded; "
+            "sys.exit(guarded(lambda: bool(__import__('halbach_fe.report.page') and 0)))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
+                          check=False, env=os.environ | {"MPLBACKEND": backend})
+    assert (done.returncode, done.stderr) == (0, "")

@@ -36,6 +36,10 @@ def known_of(study):
         percent, "in %", [f"{one:+.2f} ± 0.40 %" for one in percent]))
 
 
+PATIENCE_MS = 300_000
+"""Time for a page to be shown, on a machine that has other work too."""
+
+
 @pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api")
@@ -55,6 +59,7 @@ def page(browser, tmp_path):
     """Open a part of a page; errors in it fail the test."""
     errors = []
     context = browser.new_context(offline=True, viewport={"width": 1000, "height": 800})
+    context.set_default_timeout(PATIENCE_MS)
     page = context.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
 
@@ -63,7 +68,7 @@ def page(browser, tmp_path):
         path.write_text(f'<!doctype html><meta charset="utf-8"><body>{part}</body>',
                         encoding="utf-8")
         page.goto(path.as_uri())
-        page.wait_for_selector("#magnet-view canvas", timeout=30_000)
+        page.wait_for_selector("#magnet-view canvas")
         page.wait_for_function("document.getElementById('magnet-view')._fullLayout")
         return page
 
@@ -106,7 +111,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
         assert known.colours.words[slot - 1] in text
     shown.locator("#magnet-view .legendtoggle").first.click()
     shown.wait_for_function(
-        "document.getElementById('magnet-view').data[0].visible == 'legendonly'", timeout=10_000)
+        "document.getElementById('magnet-view').data[0].visible == 'legendonly'")
     assert not any("slot" in one for one in words(shown))
 
 

@@ -66,8 +66,8 @@ def test_separate_blocks_are_verified_by_their_cells(short_dipole, session):
     study = short_dipole(array__block={"shape": "trapezoid", "side_gap_m": 0.002})
     found = verify(build_magnet(study), session)
     assert found.route == "moments"
-    assert len(found.differences) == 2
-    coarser, finer = (difference.pointwise for difference in found.differences)
+    assert len(found.differences) == 3
+    _, coarser, finer = (difference.pointwise for difference in found.differences)
     assert 0 < finer < coarser < 1e-3
     assert finer < found.error_pointwise < 1e-3
 
@@ -87,6 +87,18 @@ def test_observed_order():
     assert observed_order(1.0, 3.0) == 0.5
     assert observed_order(1.0, 0.0) == 4.0
     assert observed_order(1e9, 1.0) == 4.0
+
+
+def test_observed_order_of_three_changes():
+    """The line through all of them, unless the last two say that convergence has slowed down."""
+    assert observed_order(1.5**4, 1.5**2, 1.0) == pytest.approx(2.0)
+    # the last change is small by chance: two points would make it order 3.5 and the error small
+    assert observed_order(1.5**4, 1.5**3.5, 1.0) == pytest.approx(2.0)
+    assert observed_order(1.5**6, 1.5, 1.0) == pytest.approx(1.0)
+    assert observed_order(1.0, 1.5**4, 1.0) == 0.5
+    assert observed_order(0.0, 1.5**2, 1.0) == pytest.approx(2.0)  # no coarser mesh
+    assert observed_order(0.0, 0.0, 1.0) == 0.5
+    assert observed_order(0.0, 0.0, 0.0) == 4.0
 
 
 def test_verify_from_the_command_line(tmp_path, capsys):

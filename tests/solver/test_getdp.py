@@ -285,7 +285,7 @@ def fake(tmp_path: Path, body: str) -> GetDP:
 @pytest.mark.parametrize(("body", "said"), [
     ("kill -SEGV $$", r"crashed \(SIGSEGV\)"),
     ("kill -KILL $$", r"crashed \(SIGKILL; out of memory\?\)"),
-    ("echo 'Error   : PETSc: No space left on device'; exit 1", "the disk is full"),
+    ("echo 'Error   : std::bad_alloc'; exit 1", "memory ran out"),
     ("echo 'Warning : MUMPS: INFOG(1)=-9'; exit 0", "MUMPS could not factorize"),
     ("echo 'Warning : something new'; exit 0", "GetDP warned: 'something new'"),
     ("exit 0", "no unknowns"),

@@ -27,6 +27,7 @@ from halbach_fe.solver.getdp_cache import (
     FOLDER_VARIABLE,
     LIMIT_VARIABLE,
     MANIFEST,
+    TRUST_VARIABLE,
     Cache,
     default_cache,
 )
@@ -374,3 +375,34 @@ def test_the_verb(coarse, shared, monkeypatch, capsys):
     monkeypatch.setenv(LIMIT_VARIABLE, "0")
     assert main(["cache", "ls"]) == 0
     assert "its limit is 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("mode", "refused"), [(0o700, False), (0o755, False), (0o757, True),
+                                               (0o1777, True)])
+def test_a_cache_that_others_may_write_to(tmp_path, monkeypatch, mode, refused):
+    """Its answers may be made up, hashes included."""
+    monkeypatch.setenv(LIMIT_VARIABLE, "1")
+    monkeypatch.delenv(TRUST_VARIABLE, raising=False)
+    folder = tmp_path / "cache"
+    assert default_cache(folder).folder == folder  # it does not exist yet
+    folder.mkdir()
+    folder.chmod(mode)
+    if refused:
+        with pytest.raises(OutputError, match=f"Other users may write.*{TRUST_VARIABLE}=1"):
+            default_cache(folder)
+        monkeypatch.setenv(TRUST_VARIABLE, "1")
+    assert default_cache(folder).folder == folder
+
+
+@pytest.mark.parametrize(("owner", "group", "members", "refused"), [
+    (1000, "anna", [], False), (1000, "anna", ["anna"], False), (1000, "anna", ["ben"], True),
+    (1000, "lab", [], True), (1001, "anna", [], True), (0, "anna", [], False)])
+def test_whose_cache(monkeypatch, owner, group, members, refused):
+    """A group of one's own name is one's own; so is what root has made."""
+    folder = SimpleNamespace(stat=lambda: SimpleNamespace(
+        st_uid=owner, st_gid=50, st_mode=0o40775))
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(module.pwd, "getpwuid", lambda _: SimpleNamespace(pw_name="anna"))
+    monkeypatch.setattr(module.grp, "getgrgid", lambda _: SimpleNamespace(
+        gr_name=group, gr_mem=members))
+    assert module._others_may_write(folder) is refused

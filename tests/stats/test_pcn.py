@@ -176,7 +176,8 @@ def test_rank_statistics_tell_a_posterior_that_is_too_sure(generator):
         return draw
 
     for spread, good in ((1.0, True), (0.5, False), (2.0, False)):
-        found, draws = ranks(prior, lambda p: matrix @ p, noise, sampler(spread), 200, generator)
+        found, draws = ranks(prior, lambda p, generator: matrix @ p + noise.sample(generator),
+                             sampler(spread), 200, generator)
         assert found.shape == (200, SIZE)
         values, together = uniformity(found, draws)
         assert (together > 1e-3) == good

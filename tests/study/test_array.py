@@ -124,7 +124,7 @@ def test_refusals(rings, common, said):
     ({"rings": 0}, "at least one ring, or free_blocks"),
     ({"free_blocks": FREE | {"name": ["r01s07"]}}, "a free block is called r01s07"),
     ({"free_blocks": FREE, "block": None}, "array.block"),
-    ({"exceptions": [{"ring": 2}]}, "an exception names ring 2, slot None of an array of 1 rings"),
+    ({"exceptions": [{"ring": 2}]}, "an exception names ring 2 of an array of 1 rings"),
     ({"exceptions": [{"slot": 17}]}, "slot 17 of an array of 1 rings of 16 blocks"),
     ({"exceptions": [{"slot": 1, "mounted_from": [1, 17]}]}, "was meant for ring 1, slot 17"),
     ({"free_blocks": FREE, "exceptions": [{"ring": 2, "slot": 2}]},

@@ -104,7 +104,7 @@ def test_hdf5_of_other_programs(tmp_path):
     ("1.0,3,", "1.5,3,", "`ring` in line 7 of .* a whole number"),
     (";0 1E-2", ";0 1E-2;0", "`outline_m` in line 7 of .* corners as `x y; x y; x y`"),
     (";0 1E-2", ";0 1e999", "`outline_m` in line 7"),
-    (";0 1E-2", "", "`outline_m` in line 7 of .* at least 3"),
+    (";0 1E-2", "", "`outline_m` in line 7 of .* 3 or more"),
     ("b,cylinder", "a,cylinder", "line 6 of .* name must be unique to a block, but a occurs"),
     ("b,cylinder", "b,sphere", "`shape` in line 6 of .* 'cuboid'"),
     ("b,cylinder", ",cylinder", "`name` in line 6 of .* given"),

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
 
 from halbach_fe.core.errors import HalbachError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.study.iron import TableCurve
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import curve_of
 from halbach_fe.study.reader import parse_study, read_study
+from halbach_fe.study.types import StudyModel
 from tests.conftest import DIPOLE, ROOT, changed
 
 STUDIES = sorted((ROOT / "studies").rglob("*.toml"))
@@ -43,7 +47,7 @@ def test_studies_are_frozen(dipole):
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
     ({"array__inner_radius_m": 0.2}, "must be larger than inner_radius_m"),
     ({"array__inner_radius_m": math.nan}, "`array.inner_radius_m`"),
-    ({"array__block": {"shape": "hexagon"}}, "`array.block`"),
+    ({"array__block": {"shape": "hexagon"}}, "`array.block.shape`"),
     ({"array__blocks_per_ring": 16.5}, "`array.blocks_per_ring`"),
     ({"array__block_moment_A_m2": 330}, "exactly one of remanence_T and block_moment_A_m2"),
     ({"dimension": 3}, "ring_length_m"),
@@ -322,3 +326,51 @@ def test_words_are_no_numbers(dipole, key, value, said):
     data.setdefault(table, {})[name] = value
     with pytest.raises(StudyError, match=said):
         parse_study(data)
+
+
+@pytest.mark.parametrize(("positions", "said"), [
+    ({"kind": "circles", "radius_m": 0.05, "angles": 10_000, "count": 100_000, "z_max_m": 0.1},
+     "circles may have 1000000 points together, not 1000000000"),
+    ({"kind": "circles", "radius_m": [0.05, 0.06], "angles": 1000, "count": 501, "z_max_m": 0.1},
+     "not 1002000"),
+    ({"kind": "grid", "start_m": [0, 0, 0], "end_m": [0.1, 0.1, 0.1], "count": [101, 100, 100]},
+     "not 1010000"),
+    ({"kind": "line", "start_m": [0, 0, 0], "end_m": [0, 0, 1], "count": 1_000_001}, "1000001"),
+])
+def test_positions_have_a_limit(positions, said):
+    """A wrong count would otherwise take all memory; so of a plan's candidates."""
+    for changes in ({"observation__positions": positions}, {"plan__candidates": [positions]}):
+        with pytest.raises(StudyError, match=said):
+            parse_study(changed(DIPOLE, **changes))
+
+
+def test_candidates_have_a_limit_together():
+    line = {"kind": "line", "start_m": [0, 0, 0], "end_m": [0, 0, 1], "count": 400_000}
+    assert len(parse_study(changed(DIPOLE, plan__candidates=[line] * 2)).plan.candidates) == 2
+    with pytest.raises(StudyError, match="1000000 points together, not 1200000"):
+        parse_study(changed(DIPOLE, plan__candidates=[line] * 3))
+
+
+def test_no_number_is_nan_or_infinite():
+    """Limits do not hold for nan by themselves: every key of every table is tried."""
+    def tables(kind):
+        for one in kind.__subclasses__():
+            yield one
+            yield from tables(one)
+
+    accepted = set()
+    for table in tables(StudyModel):
+        for name, field in table.model_fields.items():
+            adapter = TypeAdapter(field.rebuild_annotation())
+            for value in (math.nan, math.inf, -math.inf):
+                for tried in (value, [value], [value] * 3, [[value] * 3] * 3):
+                    with contextlib.suppress(ValidationError):
+                        adapter.validate_python(tried)
+                        accepted.add(f"{table.__name__}.{name}")
+    # which are checked together
+    assert accepted == {"TableCurve.H_A_per_m", "TableCurve.B_T"}
+    for value in (math.nan, math.inf):
+        with pytest.raises(ValidationError):
+            TableCurve(kind="table", H_A_per_m=(1.0, 2.0, value), B_T=(0.1, 0.2, 0.3))
+        with pytest.raises(ValidationError):
+            TableCurve(kind="table", H_A_per_m=(1.0, 2.0, 3.0), B_T=(0.1, 0.2, value))

@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import xarray as xr
 
+from halbach_fe.core.result_folder import RECORD
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 
 ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}
@@ -72,7 +73,7 @@ def kill_and_run_again(
     hit = process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
-    _, surviving = psutil.wait_procs(children, timeout=5)
+    _, surviving = psutil.wait_procs(children, timeout=30)
     broken = [f"{one.name()} survives" for one in surviving if one.status() != "zombie"]
     broken += unreadable(output)
     resumed = undisturbed(arguments, environment)
@@ -96,7 +97,10 @@ def unreadable(folder: Path) -> list[str]:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """What differs in two folders of results: files, tables, arrays. Pages name their folder."""
+    """What differs in two folders of results: files, tables, arrays.
+
+    Pages name their folder, and run.json has their hashes.
+    """
     names = [{str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
              for folder in (one, other)]
     found = [f"only in one: {name}" for name in sorted(names[0] ^ names[1])]
@@ -105,7 +109,7 @@ def differences(one: Path, other: Path) -> list[str]:
             with (xr.open_dataset(one / name, engine="h5netcdf") as a,
                   xr.open_dataset(other / name, engine="h5netcdf") as b):
                 same = a.equals(b)
-        elif name.endswith((".json", ".csv", ".toml", ".msh", ".pro", ".txt")):
+        elif name != RECORD and name.endswith((".json", ".csv", ".toml", ".msh", ".pro", ".txt")):
             same = filecmp.cmp(one / name, other / name, shallow=False)
         else:
             continue

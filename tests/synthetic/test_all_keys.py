@@ -391,9 +391,9 @@ def test_fields_of_random_magnets(array):
         assert np.abs(other - theirs).max() > 10 * ROUNDING
 
 
-PEER_ERROR = 6e-3
-"""Of the reaction: twice what Gauss points of `separate_reaction` were measured to be off by, at
-most."""
+PEER_ERROR = 9e-3
+"""Of the reaction: 1.5 times what Gauss points of `separate_reaction` were found to be off by, at
+most, for blocks of 6 x 20 x 20 mm."""
 
 
 @settings(max_examples=4)

@@ -175,7 +175,7 @@ def test_block_table_of_a_magnet_of_all_kinds():
                                     {"ring": 1, "slot": 3, "magnetization_factor": 0.0}]}
     study = study_of(array)
     nominal = magnet_of(study)
-    table, _ = coil_table(study, nominal, nominal, 1e-9, np.random.default_rng(1))
+    table, _ = coil_table(study, nominal, nominal, 1e-8, np.random.default_rng(1))
     assert table.places == [(1, 2), (1, 1), (1, 4), (2, 1)]
     assert table.serial == ("B0001", "B0002", "B0004", "B0005")
     assert table.type == ("2", "1", "4", "shim")

@@ -154,7 +154,7 @@ def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert [str(path) for path in files] == [
         "blocks.csv", "campaign.html", "campaign_field.png", "campaign_geometry.png",
-        "held-out.csv", "map.csv", "truth/truth.json"]
+        "held-out.csv", "map.csv", "run.json", "truth/truth.json"]
     for path in files:
         assert (tmp_path / path).read_bytes() == (folder / path).read_bytes()
         assert path.name == "campaign_geometry.png" or (
@@ -181,7 +181,7 @@ def test_output_that_cannot_be_written(tmp_path, capsys):
     study = tmp_path / "vacuum.toml"
     study.write_text(STUDY.replace("1.05", "1.0"))
     assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "file")]) == 8
-    assert "Cannot write" in capsys.readouterr().err
+    assert "Cannot make folder" in capsys.readouterr().err
 
 
 # --- what is drawn -----------------------------------------------------------------------------

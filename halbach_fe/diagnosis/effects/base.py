@@ -65,6 +65,11 @@ class Place:
         Description of a place that is no position; empty for others.
     labels : tuple of str
         Names of these blocks, of which free blocks have their own; empty to number them.
+    instrument : str
+        Whose instrument an effect changes, of a campaign: ``map fringe``, ``probe hall`` or
+        ``stage table``; empty for effects of the magnet, and for the only instrument.
+    maps : tuple of str
+        Names of the maps that have this instrument.
     """
 
     ring: int = 0
@@ -73,10 +78,17 @@ class Place:
     other: tuple[int, int] = (0, 0)
     words: str = ""
     labels: tuple[str, ...] = field(default=(), compare=False)
+    instrument: str = ""
+    maps: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def name(self) -> str:
         """The label of the place in reports; empty if the effect has a single place."""
+        return ", ".join(filter(None, [self.instrument, self._within]))
+
+    @property
+    def _within(self) -> str:
+        """The label of the place in the magnet, or in an instrument."""
         ring, slot = (f"{letter}{number:02d}" if number else ""
                       for letter, number in (("r", self.ring), ("s", self.slot)))
         if self.words:

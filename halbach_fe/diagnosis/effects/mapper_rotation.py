@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place, added, along
+from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place, along
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.study.measurement import Instrument
 
@@ -31,7 +32,10 @@ class MapperRotationEffect(InstrumentEffect):
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""
-        return {"rotation_rad": added(instrument.rotation_rad, along(self.axis, values[0]))}
+        turn = Rotation.from_rotvec(along(self.axis, float(values[0])))
+        total = turn * Rotation.from_rotvec(instrument.rotation_rad)
+        return {"rotation_rad": tuple(total.as_rotvec().tolist()),
+                "translation_m": tuple(turn.apply(instrument.translation_m).tolist())}
 
 
 EFFECTS = (MapperRotationEffect("mapper_tilt_x", "x"), MapperRotationEffect("mapper_tilt_y", "y"),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+FORMATS = ("columns", "opera", "comsol", "openpmd")
+"""Names of the formats of other programs that can be read."""
+
 
 @dataclass(frozen=True)
 class DeclaredFormat:

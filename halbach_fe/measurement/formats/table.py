@@ -242,7 +242,11 @@ def _units(
               "angle": declared.angle_unit, "time": ""}[kind]
     common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
     columns = _columns(table, declared)
-    for name in (name for name in used if _kind(name) == kind):
+    own = [name for name in used if _kind(name) == kind]
+    if option and not own and not missing:
+        raise _contradiction(table, "header", f"no column of this kind ({kind})",
+                             f"--{kind}-unit {option}")
+    for name in own:
         text = columns[used[name]].unit
         if units.states_no_unit(text):
             text = common

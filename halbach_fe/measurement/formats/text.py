@@ -88,6 +88,8 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
     """Return the number in a cell, NaN if the cell is empty or ``nan``; else raise ValueError."""
     if decimal_comma:
+        if "." in cell:  # 1.234 could be 1234, or a number with a decimal point
+            raise ValueError(cell)
         cell = cell.replace(",", ".")
     elif THOUSANDS.fullmatch(cell):
         cell = cell.replace(",", "")

@@ -6,12 +6,13 @@ numbers.
 
 from __future__ import annotations
 
+import math
 import re
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from halbach_fe.core.arrays import Floats
+if TYPE_CHECKING:  # the help of the command line lists the units, and does without numpy
+    from halbach_fe.core.arrays import Floats
 
 LENGTHS = {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000),
            "um": Fraction(1, 1_000_000), "inch": Fraction(254, 10_000)}
@@ -58,6 +59,6 @@ def in_si(values: Floats, unit: str) -> Floats:
     If the factor is a power of ten, the result is rounded only once.
     """
     if unit in ANGLES:
-        return np.deg2rad(values) if unit == "deg" else values
+        return values * (math.pi / 180) if unit == "deg" else values
     factor = (LENGTHS | FIELDS | TIMES)[unit]
-    return np.asarray(values * float(factor.numerator) / float(factor.denominator))
+    return values * float(factor.numerator) / float(factor.denominator)

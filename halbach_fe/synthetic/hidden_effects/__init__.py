@@ -88,7 +88,84 @@ def choose_effects(
               for effect, values in [*effects, *((others[n], None) for n in picked)]]
     for effect_with_values in hidden:
         _check_place(site, effect_with_values)
+        _check_size(site, effect_with_values)
+    names = [effect.name for effect, _ in effects
+             if "ring" not in {parameter.name for parameter in effect.parameters}]
+    if twice := next((name for name in names if names.count(name) > 1), ""):
+        raise StudyError(must_be(f"--hide {twice}", "the command line", "given once",
+                                 "two of them", "Leave one out."))
     return tuple(hidden)
+
+
+LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.0, "1/T^2": 10.0,
+           "A/m": 1e8, "m^3": 1.0}
+"""Largest absolute value of a parameter by its unit: what is beyond was meant in another unit."""
+
+NEAREST_M = 1e-3
+"""Smallest distance of a neighbouring magnet."""
+
+RANGES = {
+    "length.fraction": (-0.5, 0.5), "z_scale.fraction": (-0.5, 1.0),
+    "radius_scale.fraction": (-0.5, 1.0), "gain_x.fraction": (-0.9, 10.0),
+    "gain_y.fraction": (-0.9, 10.0), "gain_z.fraction": (-0.9, 10.0),
+    "block_demagnetized.fraction": (0.0, 1.0), "corners_demagnetized.fraction": (0.0, 1.0),
+    "magnetization_gradient.fraction": (-1.0, 1.0), "outliers.fraction": (0.0, 1.0),
+    "vibration.distance": (0.0, 0.1), "neighbour_magnet.distance": (-100.0, 100.0),
+    "ferromagnetic_object.volume": (1e-12, 1.0), "iron_ring.inner_radius": (1e-4, 100.0),
+    "iron_ring.outer_radius": (1e-4, 100.0), "iron_ring.relative_permeability": (1.0, 1e6),
+    "iron_ring.saturation_polarization": (0.0, 3.0), "knee.coercivity": (1.0, 1e8),
+    "knee.squareness": (0.01, 1.0), "recoil_permeability.change": (-0.5, 10.0),
+    "recoil_permeability_across.change": (-0.5, 10.0)}
+"""Smallest and largest value of parameters that have no unit, or cannot have any sign."""
+
+
+def _check_size(site: Site, hidden: ChosenEffect) -> None:
+    """Raise a StudyError if a value of an effect cannot belong to any magnet or instrument."""
+    def refuse(what: str, expected: str, received: float, hint: str = "") -> None:
+        raise StudyError(must_be(f"{what} of --hide {hidden.effect.name}", "the study", expected,
+                                 f"{received:g}", hint))
+
+    values = {}
+    for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        most = LARGEST.get(parameter.unit, 1e3)
+        low, high = RANGES.get(f"{hidden.effect.name}.{parameter.name}", (-most, most))
+        if not low <= value <= high:
+            refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value)
+        values[parameter.name] = value
+    if hidden.effect.name == "iron_ring":
+        if values["inner_radius"] < site.outer:
+            refuse("inner_radius", f"at least the outer radius of the magnet, {site.outer:g} m",
+                   values["inner_radius"])
+        if values["outer_radius"] <= values["inner_radius"]:
+            refuse("outer_radius", f"above inner_radius, {values['inner_radius']:g} m",
+                   values["outer_radius"])
+    if hidden.effect.name == "inner_radius":
+        thickness = site.outer - site.inner
+        if abs(values["change"]) >= min(site.inner, thickness):
+            refuse("change", f"smaller than the inner radius ({site.inner:g} m) and the thickness "
+                   f"of the blocks ({thickness:g} m)", values["change"])
+    for name in ("blocks", "more"):
+        if values.get(name, 0.0) != int(values.get(name, 0.0)):
+            refuse(name, "a whole number", values[name])
+    if hidden.effect.name == "neighbour_magnet" and abs(values["distance"]) < NEAREST_M:
+        refuse("distance", f"at least {NEAREST_M:g} m on either side", values["distance"])
+    if hidden.effect.name.startswith("temperature") and (
+            abs(values["change"] * values["coefficient"]) >= 1):
+        refuse("coefficient", "a fraction per kelvin that does not reverse the magnetization",
+               values["coefficient"])
+    if hidden.effect.name == "ferromagnetic_object":
+        radius = (3 * values["volume"] / (4 * np.pi))**(1 / 3)
+        from_axis = float(np.hypot(values["x"], values["y"]))
+        away = max(from_axis - site.outer, site.inner - from_axis,
+                   abs(values["z"]) - site.half_length)
+        if away < radius:
+            refuse("position", f"more than {radius:.3g} m away from the blocks, the radius of a "
+                   "sphere of this volume", away)
+    if hidden.effect.name == "blocks_swapped" and hidden.values[:2] == hidden.values[2:]:
+        refuse("other_slot", "that of another block", values["other_slot"])
+    if hidden.effect.name == "swapped_axes" and values["first"] == values["second"]:
+        refuse("second", "another axis than the first", values["second"])
 
 
 def _check_place(site: Site, hidden: ChosenEffect) -> None:

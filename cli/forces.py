@@ -1,0 +1,49 @@
+"""Compute forces and torques on every block, in place and while the magnet is assembled.
+
+Each block is looked at twice: with all others in place, and as the next one to be inserted, with
+the blocks before it in place (by default ring by ring, slot by slot). Writes forces.csv,
+forces.json, forces.html and its figure, with the mass of the magnet.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--order", type=InputFile, metavar="CSV",
+                        help="table whose column block names the blocks in the order in which they "
+                        "are inserted (default: ring by ring, slot by slot)")
+    parser.add_argument("--density-kg-per-m3", type=common.positive_number, metavar="D",
+                        help="density of the blocks (default: that of their grade, or 7500)")
+    parser.add_argument("--price-per-kg", type=common.positive_number, metavar="P",
+                        help="price of the blocks per kg, in any currency")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compute the forces, write the results, print the answer and the largest forces."""
+    from halbach_fe.api import forces
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.measurement.assembly_order import read_order
+    from halbach_fe.report.forces import force_rows, forces_summary, verdict, write_forces
+    from halbach_fe.study.reader import read_study
+
+    magnet = build_magnet(read_study(arguments.study))
+    order = read_order(arguments.order) if arguments.order else None
+    with common.session(arguments, magnet.study) as session:
+        found = forces(magnet, session, order, arguments.density_kg_per_m3,
+                       arguments.price_per_kg)
+    write_forces(found, arguments.output, common.digests(
+        {"study file": arguments.study, "order of assembly": arguments.order}))
+    if arguments.json:
+        common.print_json(forces_summary(found))
+    else:
+        common.say(" ".join(verdict(found)))
+        common.print_table(force_rows(found), "Largest forces in place")
+        common.say(f"Report: {arguments.output / 'forces.html'}")
+    return 0

@@ -1,0 +1,81 @@
+"""Options that say what the columns of a map are that is not in halbach-fe's own."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
+from halbach_fe.measurement.formats.units import ANGLES, FIELDS, LENGTHS
+
+AXES = ("x", "y", "z")
+
+
+def add_format_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add the options that describe a file, to a parser or a group of its options."""
+    parser.add_argument("--format", choices=FORMATS, default="",
+                        help="format of FILE (default: recognized from its beginning)")
+    parser.add_argument("--length-unit", choices=LENGTHS, default="", help="unit of the positions")
+    parser.add_argument("--field-unit", choices=FIELDS, default="", help="unit of B")
+    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
+    parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
+                        help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
+                        "dx, dy, dz (moves of a stage from reading to reading), t (time), or - "
+                        "for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
+    parser.add_argument("--component", choices=AXES, default="",
+                        help="component of the field in a column B")
+    parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",
+                        help="constant coordinates in m that the file does not contain, for "
+                        "example x=0,y=0")
+    parser.add_argument("--origin-m", type=point, metavar="X,Y,Z",
+                        help="position in m of the file's origin, along the magnet's axes")
+    parser.add_argument("--decimal-comma", action="store_true",
+                        help="numbers have a decimal comma, as in 0,5")
+    parser.add_argument("--encoding", default=DeclaredFormat.encoding,
+                        help="encoding of a text file (default: UTF-8)")
+
+
+def declared_format(arguments: argparse.Namespace) -> DeclaredFormat:
+    """Return what the options say."""
+    return DeclaredFormat(
+        length_unit=arguments.length_unit, field_unit=arguments.field_unit,
+        angle_unit=arguments.angle_unit, columns=arguments.columns,
+        component=arguments.component, at=arguments.at, origin_m=arguments.origin_m,
+        decimal_comma=arguments.decimal_comma, encoding=arguments.encoding)
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Parse a comma-separated list of names of columns."""
+    return tuple(name.strip() for name in text.split(","))
+
+
+def coordinates(text: str) -> dict[str, float]:
+    """Parse coordinates such as ``x=0,y=0``."""
+    values: dict[str, float] = {}
+    for part in text.split(","):
+        axis, _, value = part.partition("=")
+        if axis.strip() not in AXES:
+            raise argparse.ArgumentTypeError(f"must be like x=0,y=0, not {text}")
+        if axis.strip() in values:
+            raise argparse.ArgumentTypeError(f"must give {axis.strip()} once, not {text}")
+        values[axis.strip()] = coordinate(value)
+    return values
+
+
+def point(text: str) -> tuple[float, float, float]:
+    """Parse a point ``X,Y,Z``."""
+    values = [coordinate(part) for part in text.split(",")]
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"must be three numbers, not {text}")
+    return values[0], values[1], values[2]
+
+
+def coordinate(text: str) -> float:
+    """Parse a finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a finite number, not {text!r}")
+    return value

@@ -1,0 +1,154 @@
+"""What is around every command: exit codes, signals, want of memory, the streams."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import re
+import resource
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+from halbach_fe.cli import streams
+from halbach_fe.cli.streams import say
+from halbach_fe.core.errors import (
+    MAX_QUOTED,
+    OUT_OF_MEMORY,
+    READER_LEFT,
+    HalbachError,
+    HalbachWarning,
+    OutputError,
+    printable,
+)
+
+BLAS_BUFFER_BYTES = 128 * 2**20
+"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
+and library, on two threads."""
+
+AT_THE_LIMIT_BYTES = 256 * 2**20
+"""An import that fails so near to the limit of memory fails for want of it: the largest library,
+numba's LLVM, takes half of this."""
+
+NO_MEMORY = re.compile(
+    r"bad_alloc|allocat|out of memory|failed to map segment|can't start new thread")
+"""Texts of libraries whose errors are not MemoryError: they could not be loaded, start a thread, or
+allocate memory."""
+
+OF_THE_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ESTALE,
+               errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENAMETOOLONG}
+"""Errors of the system for which halbach-fe is not to blame, wherever they come from."""
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """Call a function and return its exit code; print errors as a single sentence on stderr.
+
+    SIGTERM and the closing of the terminal act like Ctrl-C: GetDP is stopped, and no result is left
+    half-written. Signals that are ignored (by nohup, or as a shell's background job) stay ignored.
+    """
+    streams.prepare()
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's, which may not exist here, would be imported
+    received: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt)
+                for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+                if signal.getsignal(number) is not signal.SIG_IGN}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("once", HalbachWarning)
+            warnings.showwarning = lambda message, *_: say(f"warning: {message}")
+            claim_buffers()
+            return run()
+    except (Exception, KeyboardInterrupt) as error:
+        if received:  # libraries that are interrupted may raise errors of their own
+            say("interrupted")
+            return 130
+        return _exit_code(error)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _exit_code(error: BaseException) -> int:
+    """Say what is wrong, and return the exit code for it."""
+    if isinstance(error, HalbachError):
+        say(f"error: {error}")
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        say("interrupted")
+        return 130
+    if isinstance(error, streams.ReaderLeftError):
+        return READER_LEFT
+    if any(map(_is_out_of_memory, _with_causes(error))):
+        reason = printable(str(error) or "it ran out", MAX_QUOTED)
+        say(f"error: There is not enough memory ({reason}). --dry-run estimates what solve, infer "
+            "and verify need; use a coarser mesh, fewer readings or --jobs 1.")
+        return OUT_OF_MEMORY
+    if isinstance(error, OSError) and error.errno in OF_THE_DISK:
+        what = f" ({printable(error.filename, MAX_QUOTED)})" if error.filename else ""
+        say(f"error: A file cannot be used: {error.strerror}{what}.")
+        return OutputError.exit_code
+    if isinstance(error, UnicodeEncodeError) and error.encoding == sys.getfilesystemencoding():
+        say(f"error: The file name {printable(error.object, MAX_QUOTED)!a} cannot be written in "
+            f"the encoding {error.encoding} of this locale; set LC_ALL=C.UTF-8.")
+        return OutputError.exit_code
+    say("".join(traceback.format_exception(error)).rstrip())
+    say("error: this is a bug in halbach-fe; please report it with the above.")
+    return 1
+
+
+def _with_causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, and those during which it was raised."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Tell whether an error means that memory ran out, which not only MemoryError does."""
+    return (isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+            or NO_MEMORY.search(str(error)) is not None
+            or type(error).__name__ == "BrokenProcessPool"  # the system ended one of its processes
+            or (isinstance(error, SystemError | ImportError) and _at_the_limit()))
+
+
+def _at_the_limit() -> bool:
+    """Tell whether this process has come near to the limit of its memory, if it has one."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return False
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    peak = re.search(r"VmPeak:\s*(\d+) kB", status)
+    return peak is None or limit - int(peak[1]) * 1024 < AT_THE_LIMIT_BYTES
+
+
+def claim_buffers() -> None:
+    """If the memory of this process is limited, have OpenBLAS allocate its buffers now.
+
+    OpenBLAS keeps its buffers. If it cannot allocate them, it retries forever; so the memory for
+    them is asked for here first.
+
+    Raises
+    ------
+    MemoryError
+        If there is not enough for the buffers.
+    """
+    if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        import numpy as np
+        import scipy.linalg as linalg
+
+        try:
+            mmap.mmap(-1, BLAS_BUFFER_BYTES).close()
+        except OSError:
+            raise MemoryError("the limit leaves too little for the linear algebra") from None
+        matrix = np.eye(200)
+        linalg.cholesky(matrix @ matrix)  # numpy and scipy each have their own OpenBLAS

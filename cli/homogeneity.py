@@ -1,0 +1,88 @@
+"""Compute how homogeneous the field of a magnet is in a region, in ppm and with error bars.
+
+The region is a sphere about the centre of the magnet (default: of half the radius of the bore), an
+ellipsoid or a cylinder. With --posterior the magnet is the measured one, otherwise those that the
+study's prior allows. Writes homogeneity.json, harmonics.csv if the region is a sphere,
+homogeneity.html and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from halbach_fe.cli import common
+from halbach_fe.core.files import InputFile
+
+if TYPE_CHECKING:
+    from halbach_fe.response.homogeneity import Region
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--posterior", type=InputFile, metavar="H5",
+                        help="posterior.h5 that halbach-fe infer wrote for this study")
+    shape = parser.add_mutually_exclusive_group()
+    shape.add_argument("--sphere-m", type=common.positive_number, metavar="R",
+                       help="radius of the sphere in m (default: half the radius of the bore)")
+    shape.add_argument("--ellipsoid-m", type=common.positive_number, nargs=3,
+                       metavar=("A", "B", "C"), help="half axes along x, y and z in m")
+    shape.add_argument("--cylinder-m", type=common.positive_number, nargs=2,
+                       metavar=("R", "LENGTH"), help="radius and length along z in m")
+    parser.add_argument("--centre-m", type=common.finite_number, nargs=3, metavar=("X", "Y", "Z"),
+                        default=(0.0, 0.0, 0.0), help="centre of the region in m (default: 0 0 0)")
+    parser.add_argument("--degrees", type=int, choices=range(1, 21), metavar="L",
+                        help="largest degree of the spherical harmonics, 1 to 20 (default: 6)")
+
+
+def region_of(arguments: argparse.Namespace) -> Region | None:
+    """Return the region that the options describe; None for the default one."""
+    from halbach_fe.response.homogeneity import Region
+
+    x, y, z = arguments.centre_m
+    if arguments.ellipsoid_m:
+        a, b, c = arguments.ellipsoid_m
+        return Region("ellipsoid", (a, b, c), (x, y, z))
+    if arguments.cylinder_m:
+        radius, length = arguments.cylinder_m
+        return Region("cylinder", (radius, radius, length / 2), (x, y, z))
+    return Region.sphere(arguments.sphere_m, (x, y, z)) if arguments.sphere_m else None
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compute the homogeneity, write the results, print the answer and the tables."""
+    from halbach_fe.api import homogeneity
+    from halbach_fe.core.errors import StudyError, must_be
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.report.homogeneity import (
+        harmonic_rows,
+        homogeneity_rows,
+        homogeneity_summary,
+        verdict,
+        write_homogeneity,
+    )
+    from halbach_fe.response.homogeneity import SHOWN_DEGREES
+    from halbach_fe.study.reader import read_study
+
+    study = read_study(arguments.study)
+    magnet, region = build_magnet(study), region_of(arguments)
+    if region is None and any(arguments.centre_m):
+        raise StudyError(must_be("--centre-m", "the command line", "beside a region",
+                                 "given alone", "Add --sphere-m R."))
+    posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
+    with common.session(arguments, study) as session:
+        found = homogeneity(magnet, session, region, posterior,
+                            arguments.degrees or SHOWN_DEGREES)
+    write_homogeneity(found, arguments.output, {
+        "GetDP": session.getdp.version, **common.digests(
+            {"study file": arguments.study, "posterior": arguments.posterior})})
+    if arguments.json:
+        common.print_json(homogeneity_summary(found))
+    else:
+        common.say(verdict(found))
+        common.print_table(homogeneity_rows(found), f"The field in {found.model.region.text}")
+        common.print_table(harmonic_rows(found), "Spherical harmonics in ppm of the mean field")
+        common.say(f"Report: {arguments.output / 'homogeneity.html'}")
+    return 0

@@ -1,0 +1,460 @@
+"""Forces and torques on the blocks of a magnet, in place and as they are inserted one by one.
+
+A block of polarization J in the field B of all others feels the force and torque on its surface
+charge,
+
+    ``F = 1/mu_0 int (J.n) B dS``,  ``T = 1/mu_0 int (J.n) (r - m) x B dS``,
+
+with n the outward normal and m the middle of the block (J. D. Jackson, Classical Electrodynamics,
+3rd ed., problem 5.20). B is the exact field of the others' surface charge, and the integrals are
+sums over Gauss points of the faces, of high order where the other block is near. The order grows
+until the forces of two successive orders differ by at most `TOLERANCE`; that difference is the
+error bar.
+
+Blocks of another permeability than vacuum, or with irreversible losses, have the polarization that
+the method of moments finds in the finished magnet, as its mean over the block. How it varies inside
+a block is left out. The force of coaxial iron is that of its reaction to all blocks. A block that
+is inserted feels the blocks before it and external fields; iron is not there yet.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.geometry.blocks import MagnetBlock, vector
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
+from halbach_fe.solver.session import Session
+from halbach_fe.study.grades import grade
+from halbach_fe.study.materials import MU_0
+
+TOLERANCE = 0.01
+"""Largest difference of forces of successive orders, relative to the force on the block."""
+
+SMALL = 0.1
+"""Forces smaller than this share of the largest one have the error that it would have: symmetry
+makes some of them zero."""
+
+LEAST_N = 1e-9
+"""Error in N that matters to nobody: symmetry, or a uniform field, makes all forces zero."""
+
+NEAR_ORDERS = (6, 9, 14, 21, 32)
+"""Gauss points along a side of a face, for the field of near blocks."""
+
+FAR_ORDERS = (1, 2, 3, 4, 5)
+"""The same for the field of other blocks."""
+
+NEAR = 2.5
+"""Distance of the middles of two blocks, relative to the sum of the radii of the spheres around
+them, up to which they are near."""
+
+INWARDS = 1e-6
+"""Distance of the points from the face, relative to the size of the block: the field of blocks that
+touch is that just outside of them."""
+
+LONGEST = 1.5
+"""Largest side of a part of a face, relative to the cube root of the block's volume."""
+
+MOST_TURN = 0.5
+"""Largest angle in rad of a part of a curved face."""
+
+ROUNDING = 1e-9
+"""Charge of a face relative to that of one across the polarization, below which it has none."""
+
+Field = Callable[[Floats], Floats]
+"""Takes points (n, 3) in m and returns B (n, 3) in T."""
+
+STANDARD_GRAVITY = 9.80665
+"""Acceleration in m/s^2 that turns newtons into a weight."""
+
+DENSITY_KG_PER_M3 = 7500.0
+"""Density of sintered NdFeB, for blocks whose grade is not known."""
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Forces and torques on the blocks of a magnet.
+
+    Attributes
+    ----------
+    force_N, torque_Nm : ndarray, shape (blocks, 3)
+        Along x, y and z of the magnet; torques about the middles of the blocks.
+    error_N, error_Nm : ndarray, shape (blocks,)
+        Error bars of the quadrature.
+    """
+
+    force_N: Floats
+    torque_Nm: Floats
+    error_N: Floats
+    error_Nm: Floats
+
+    @property
+    def magnitude(self) -> Floats:
+        """Magnitudes of the forces, (blocks,)."""
+        return np.asarray(np.linalg.norm(self.force_N, axis=1))
+
+
+@dataclass(frozen=True)
+class Forces(ShownInNotebook):
+    """Forces and torques on every block, in place and as the next one to be inserted.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    blocks : tuple of MagnetBlock
+        The blocks that are there: missing ones feel no force.
+    in_place : Loads
+        With all other blocks, iron and external fields.
+    inserted : Loads
+        With the blocks before it in ``order`` and external fields.
+    order : ndarray of int, shape (blocks,)
+        Numbers of ``blocks`` in the order in which they are inserted.
+    imbalance_N : float
+        Magnitude of the sum of the forces of blocks on blocks, which Newton's third law makes zero.
+    mass_kg : ndarray, shape (blocks,)
+    price_per_kg : float or None
+    """
+
+    magnet: Magnet
+    blocks: tuple[MagnetBlock, ...]
+    in_place: Loads
+    inserted: Loads
+    order: Ints
+    imbalance_N: float
+    mass_kg: Floats
+    price_per_kg: float | None = None
+
+    @property
+    def cost(self) -> float | None:
+        """Price of all blocks, or None if their price per kg is not known."""
+        return None if self.price_per_kg is None else float(
+            self.price_per_kg * self.mass_kg.sum())
+
+    @cached_property
+    def step(self) -> Ints:
+        """Place of every block in the order of insertion, (blocks,), from 1."""
+        found = np.empty(len(self.order), int)
+        found[self.order] = np.arange(1, len(self.order) + 1)
+        return found
+
+
+def block_forces(
+    magnet: Magnet, session: Session, order: Sequence[str] | None = None,
+    density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
+) -> Forces:
+    """Compute the forces and torques on every block of a magnet.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+        Its folder receives the runs of GetDP, if the magnet has iron.
+    order : sequence of str, optional
+        Names of all blocks in the order in which they are inserted; by default ring by ring, slot
+        by slot.
+    density_kg_per_m3 : float, optional
+        Density of all blocks; by default that of their grade, or of NdFeB.
+    price_per_kg : float, optional
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section, the iron is not coaxial, or the order is not one of all
+        blocks.
+    """
+    if magnet.dimension == 2:
+        raise StudyError(must_be("`dimension`", f"study {magnet.name}",
+                                 "3, for the forces on blocks", "2"))
+    if not magnet.iron_is_axisymmetric:
+        raise StudyError(must_be(
+            "`iron`", f"study {magnet.name}", "coaxial tubes or discs, for the forces on blocks",
+            "a prism", "Leave the prism out: the forces of the blocks on each other remain."))
+    names = {block.name: block for block in present_blocks(magnet.blocks)}
+    sequence = _sequence(list(names), order, magnet.name)
+    blocks, iron = _polarized(magnet, session)
+    rank = np.empty(len(blocks), int)
+    rank[sequence] = np.arange(len(blocks))
+    mutual, in_place, inserted = _converged(
+        blocks, rank, lambda points: external_field(magnet, points), iron)
+    density = _densities(magnet, density_kg_per_m3)
+    return Forces(
+        magnet, tuple(names.values()), in_place, inserted, sequence,
+        float(np.linalg.norm(mutual.sum(axis=0))),
+        density * np.array([block.volume for block in blocks]), price_per_kg)
+
+
+def _sequence(names: Sequence[str], order: Sequence[str] | None, study: str) -> Ints:
+    """Return the numbers of blocks in the order in which they are inserted, (blocks,)."""
+    if order is None:
+        return np.arange(len(names))
+    known = {name: number for number, name in enumerate(names)}
+    for name in order:
+        if name not in known:
+            raise StudyError(must_be("order", f"study {study}", "one of the blocks of the magnet",
+                                     f"'{name}'", f"Their names are like {names[0]}."))
+    if len(set(order)) != len(order) or len(order) != len(names):
+        wrong = next((name for name in names if list(order).count(name) != 1), names[0])
+        raise StudyError(must_be(
+            "order", f"study {study}", f"each of the {len(names)} blocks once",
+            f"{len(order)} names, {wrong} {list(order).count(wrong)} times among them"))
+    return np.array([known[name] for name in order])
+
+
+def _polarized(magnet: Magnet, session: Session) -> tuple[tuple[MagnetBlock, ...], Field | None]:
+    """Return the blocks that are there with their mean polarization, and the field of the iron."""
+    blocks = present_blocks(magnet.blocks)
+    if magnet.is_vacuum:
+        return blocks, None
+    reaction = solve_separate(magnet, session, estimate=False)
+    if reaction.blocks:
+        induced = reaction.blocks[0].block_moments()
+        found = []
+        for block, moment in zip(blocks, induced, strict=True):
+            mean = np.array(block.easy_axis) * block.remanence + moment / block.volume
+            size = float(np.linalg.norm(mean))
+            found.append(replace(block, remanence=size, easy_axis=vector(mean / size)))
+        blocks = tuple(found)
+    return blocks, None if reaction.iron is None else reaction.iron.field
+
+
+def _densities(magnet: Magnet, given: float | None) -> Floats:
+    """Return the density of every block that is there, in kg/m^3."""
+    array, table = magnet.array, magnet.array.free_blocks
+    first = len(magnet.blocks) - (len(table) if table else 0)
+    of_ring = {ring: array.ring[ring - 1].material if array.ring else None
+               for ring in range(1, array.rings + 1)}
+    found = []
+    for number, block in enumerate(magnet.blocks):
+        if not present_blocks((block,)):
+            continue
+        name = (table.value("material", number - first) if table and number >= first
+                else of_ring[block.ring]) or array.material
+        found.append(given or (np.mean(grade(str(name)).density_kg_per_m3) if name
+                               else DENSITY_KG_PER_M3))
+    return np.array(found)
+
+
+def _converged(
+    blocks: Sequence[MagnetBlock], rank: Ints, external: Field, iron: Field | None
+) -> tuple[Floats, Loads, Loads]:
+    """Return the mutual forces (blocks, 3) in N, and the loads in place and at insertion.
+
+    Warns
+    -----
+    HalbachWarning
+        If the forces on some blocks do not reach the tolerance.
+    """
+    todo = np.arange(len(blocks))
+    loads = np.zeros((len(blocks), 3, 6))  # mutual, in place, inserted; force and torque
+    errors = np.zeros((len(blocks), 3, 2))
+    for level, orders in enumerate(zip(NEAR_ORDERS, FAR_ORDERS, strict=True)):
+        now = _loads(blocks, rank, todo, *orders, external, iron)
+        change = (now - loads[todo]).reshape(-1, 3, 2, 3)
+        loads[todo], errors[todo] = now, np.linalg.norm(change, axis=3)
+        if not level:
+            continue
+        size = np.linalg.norm(loads[:, 1:, :3], axis=2)
+        least = np.maximum(TOLERANCE * np.maximum(size, SMALL * size.max(axis=0)), LEAST_N)
+        todo = np.flatnonzero((errors[:, 1:, 0] > least).any(axis=1))
+        if not len(todo):
+            break
+    if len(todo):
+        warnings.warn(
+            f"The forces on {len(todo)} of {len(blocks)} blocks, {blocks[todo[0]].name} among "
+            f"them, are less certain than {100 * TOLERANCE:g} %: see their error bars.",
+            HalbachWarning, stacklevel=3)
+    in_place, inserted = (
+        Loads(loads[:, case, :3], loads[:, case, 3:], errors[:, case, 0], errors[:, case, 1])
+        for case in (1, 2))
+    return loads[:, 0, :3], in_place, inserted
+
+
+def _loads(
+    blocks: Sequence[MagnetBlock], rank: Ints, targets: Ints, near_order: int, far_order: int,
+    external: Field, iron: Field | None,
+) -> Floats:
+    """Return force in N and torque in N m of target blocks, (targets, 3, 6).
+
+    The cases are those of other blocks only, of everything in place, and of the blocks of lower
+    rank and external fields.
+    """
+    near, far = (Charges.of([blocks[number] for number in targets], order)
+                 for order in (near_order, far_order))
+    middles = np.array([_middle(block) for block in blocks])
+    reach = np.array([_reach(block) for block in blocks])
+    tree = KDTree(middles[targets])
+    near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
+    for number, block in enumerate(blocks):
+        around = np.array(tree.query_ball_point(
+            middles[number], NEAR * (reach[number] + reach[targets].max())), int)
+        distance = np.linalg.norm(middles[targets[around]] - middles[number], axis=1)
+        is_near = np.zeros(len(targets), bool)
+        is_near[around[distance <= NEAR * (reach[number] + reach[targets[around]])]] = True
+        later = rank[targets] > rank[number]
+        for charges, field, chosen in ((near, near_field, is_near), (far, far_field, ~is_near)):
+            here = np.flatnonzero((chosen & (targets != number))[charges.owner])
+            found = field_of([block], charges.points[here])
+            if charges is near:
+                found += _jump(block, charges.points[here], charges.normals[here])
+            field[0, here] += found
+            after = later[charges.owner[here]]
+            field[1, here[after]] += found[after]
+    outer = external(near.points)
+    own_middles = middles[targets]
+    mutual, before = (near.loads(one, own_middles, len(targets))
+                      + far.loads(other, own_middles, len(targets))
+                      for one, other in zip(near_field, far_field, strict=True))
+    of_external = near.loads(outer, own_middles, len(targets))
+    of_iron = 0.0 if iron is None else near.loads(iron(near.points), own_middles, len(targets))
+    return np.stack([mutual, mutual + of_external + of_iron, before + of_external], axis=1)
+
+
+def _jump(block: MagnetBlock, points: Floats, normals: Floats) -> Floats:
+    """Return what turns mu_0 H inside a block into the field just outside of it, (n, 3) in T.
+
+    Blocks that touch may overlap by rounding, or by what an exception moved them. On a face with
+    these normals the component of B across it and those of H along it are continuous.
+    """
+    inside = block.contains(points)
+    jump = np.zeros_like(points)
+    polarization = np.array(block.easy_axis) * block.remanence
+    jump[inside] = (normals[inside] @ polarization)[:, None] * normals[inside]
+    return jump
+
+
+def _middle(block: MagnetBlock) -> Floats:
+    """Return the middle of a block where it is mounted, (3,) in m."""
+    return np.asarray(block.middle + np.array(block.displacement_m))
+
+
+def _reach(block: MagnetBlock) -> float:
+    """Return the radius in m of a sphere about the middle that contains the block."""
+    t = np.linspace(0.0, 1.0, 5)
+    outline = np.vstack([edge.at(t)[0] for edge in block.outline])
+    points = block.from_frame(np.vstack([
+        np.column_stack([outline, np.full(len(outline), z)]) for z in (block.z_min, block.z_max)]))
+    return float(np.linalg.norm(points - _middle(block), axis=1).max())
+
+
+@dataclass(frozen=True)
+class Charges:
+    """Gauss points on the faces of blocks, and the magnetic charges that they stand for.
+
+    Attributes
+    ----------
+    points, normals : ndarray, shape (n, 3)
+        Along the axes of the magnet; points in m, normals outward.
+    charge : ndarray, shape (n,), in A m
+        (J . n) dS / mu_0.
+    owner : ndarray of int, shape (n,)
+        Number of the block.
+    """
+
+    points: Floats
+    normals: Floats
+    charge: Floats
+    owner: Ints
+
+    @classmethod
+    def of(cls, blocks: Sequence[MagnetBlock], order: int) -> Charges:
+        """Put ``order`` points along every side of a face; faces without charge have none."""
+        parts: list[tuple[Floats, Floats, Floats, Ints]] = []
+        for number, block in enumerate(blocks):
+            size = block.volume ** (1 / 3)
+            polarization = np.array(block.easy_axis) * block.remanence
+            for factor, part in block.parts:
+                points, vectors = (np.vstack(each) for each in zip(
+                    *_faces(part, order, size), strict=True))
+                areas = np.linalg.norm(vectors, axis=1)
+                normals = vectors / areas[:, None] @ block.axes.T
+                charge = factor / MU_0 * areas * (normals @ polarization)
+                kept = np.abs(charge) > ROUNDING * areas * abs(block.remanence) / MU_0
+                points = block.from_frame(points) - INWARDS * size * normals
+                parts.append((points[kept], normals[kept], charge[kept],
+                              np.full(int(kept.sum()), number)))
+        points, normals, charge, owner = (np.concatenate(each)
+                                          for each in zip(*parts, strict=True))
+        return cls(points, normals, charge, owner)
+
+    def loads(self, field: Floats, middles: Floats, count: int) -> Floats:
+        """Return force and torque (count, 6) of the blocks in B (n, 3) in T at the points."""
+        force = self.charge[:, None] * field
+        torque = np.cross(self.points - middles[self.owner], force)
+        both = np.hstack([force, torque])
+        return np.column_stack([np.bincount(self.owner, column, count) for column in both.T])
+
+
+def _faces(block: MagnetBlock, order: int, size: float) -> Iterator[tuple[Floats, Floats]]:
+    """Yield points (n, 3) in m of a block's faces and their area vectors (n, 3) in m^2.
+
+    Both are along the axes of its frame. Faces longer than ``size`` in m are divided. The points
+    are concentrated at the edges of the faces, where the field of blocks that touch is singular.
+    """
+    t, weight = _graded(order)
+    height = block.z_max - block.z_min
+    z, z_weight = _panels(t, weight, height, size)
+    z, z_weight = block.z_min + height * z, height * z_weight
+    corners = np.array([edge.start for edge in block.outline])
+    four = len(corners) == 4 and not any(block.outline[k].arc for k in (0, 2))
+    for edge in block.outline:
+        s, s_weight = _panels(t, weight, edge.length, min(
+            size, MOST_TURN * edge.radius if edge.arc else np.inf))
+        place, normal = edge.at(s)
+        area = np.column_stack([normal * s_weight[:, None], np.zeros(len(s))])
+        yield (np.column_stack([np.repeat(place, len(z), axis=0), np.tile(z, len(s))]),
+               (area[:, None] * z_weight[None, :, None]).reshape(-1, 3))
+        if not four:  # triangles from the middle to the edge
+            middle = corners.mean(axis=0)
+            r, r_weight = (t, weight * t)
+            flat = middle + r[:, None, None] * (place - middle)
+            share = np.outer(r_weight, s_weight * np.sum((place - middle) * normal, axis=1))
+            yield from _ends(block, flat.reshape(-1, 2), share.ravel())
+    if four:
+        near, far = block.outline[3], block.outline[1]
+        length = max(far.length, near.length)
+        s, s_weight = _panels(t, weight, length, size)
+        depth = max(block.outline[k].length for k in (0, 2))
+        r, r_weight = _panels(t, weight, depth, size)
+        (outer, outer_normal), (inner, inner_normal) = far.at(s), near.at(1 - s)
+        flat = inner + r[:, None, None] * (outer - inner)
+        normal = -inner_normal + r[:, None, None] * (outer_normal + inner_normal)
+        share = np.einsum("ti,sti->st", outer - inner, normal) * np.outer(r_weight, s_weight)
+        yield from _ends(block, flat.reshape(-1, 2), share.ravel())
+
+
+def _ends(block: MagnetBlock, flat: Floats, area: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Yield points and area vectors of both ends of a block, see `_faces`."""
+    zero = np.zeros(len(flat))
+    for z, sign in ((block.z_min, -1), (block.z_max, 1)):
+        yield (np.column_stack([flat, np.full(len(flat), z)]),
+               np.column_stack([zero, zero, sign * area]))
+
+
+def _graded(order: int) -> tuple[Floats, Floats]:
+    """Return points and weights (order,) of a quadrature from 0 to 1, by ``t = 3 x^2 - 2 x^3``.
+
+    A few points, which smooth fields have, are those of Gauss and Legendre.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    x, weights = (nodes + 1) / 2, weights / 2
+    if order < NEAR_ORDERS[0]:
+        return x, weights
+    return x * x * (3 - 2 * x), weights * 6 * x * (1 - x)
+
+
+def _panels(t: Floats, weight: Floats, length: float, size: float) -> tuple[Floats, Floats]:
+    """Repeat a quadrature from 0 to 1 on equal parts of a length that are not longer than size."""
+    count = max(1, int(np.ceil(length / size * (1 - 1e-9) / LONGEST)))
+    starts = np.arange(count)[:, None]
+    return ((starts + t) / count).ravel(), np.tile(weight / count, count)

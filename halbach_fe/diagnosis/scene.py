@@ -1,0 +1,322 @@
+"""The maps of a campaign as effects see them: where, when and by which instrument they were read.
+
+An effect of the magnet is seen by all maps. An effect of the instrument is seen by one map, or by
+all maps that share the probe or the stage to which it belongs. A study of a single map is a
+campaign of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.inference.infer import with_instruments
+from halbach_fe.inference.instrument_fit import OpenTerms
+from halbach_fe.inference.result import InstrumentTerms
+from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    map_time,
+    nonlinear_part,
+    probe_points,
+    sensor_matrix,
+    sensor_positions,
+)
+from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+
+STEP = 1e-3
+"""Step of the differences by an instrument, in prior standard deviations of an effect: small
+enough for all laws of an instrument to be linear to 1e-6, and far above rounding."""
+
+FieldAt = Callable[[Study, Floats], Floats]
+"""Function of a study and points (n, 3) in m that returns B (n, 3) in T of its nominal magnet."""
+
+
+@dataclass(frozen=True)
+class ScannedMap:
+    """Where and when the probe was for a map.
+
+    Attributes
+    ----------
+    name, probe, pose : str
+        See `halbach_fe.measurement.campaign.Map`.
+    number : int or None
+        Its number among the maps that the study lists; None if it has the study's own instrument.
+    is_validation : bool
+    points : ndarray, shape (n, 3), in m
+        As the map states them, along the magnet's axes.
+    time : ndarray, shape (n,)
+        From 0 to 1.
+    rows : slice
+        Of its points among those of all maps.
+    """
+
+    name: str
+    probe: str
+    pose: str
+    number: int | None
+    is_validation: bool
+    points: Floats
+    time: Floats
+    rows: slice
+
+    def study_of(self, study: Study) -> Study:
+        """Return what a study says about this map alone."""
+        if self.number is not None:
+            return study.of_map(self.number)
+        return study.with_(maps=()) if study.maps else study
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """All maps of a diagnosis, and effects seen in them.
+
+    Attributes
+    ----------
+    maps : tuple of ScannedMap
+        Those that the study lists, or the only one; and the validation map, if there is one.
+    data : Dataset or dict of str to Dataset
+        The maps themselves, without a validation map.
+    """
+
+    maps: tuple[ScannedMap, ...]
+    data: xr.Dataset | Mapping[str, xr.Dataset]
+
+    @classmethod
+    def of(
+        cls, study: Study, data: xr.Dataset | Mapping[str, xr.Dataset],
+        validation_map: xr.Dataset | None = None,
+    ) -> Campaign:
+        """Return the maps of a study, see `halbach_fe.measurement.campaign.maps_of`."""
+        found, first = [], 0
+        for number, one in enumerate(maps_of(study, data, validation_map)):
+            points = points_of(in_si_and_magnet_axes(one.study.instrument, one.data))
+            listed = bool(study.maps) and not one.is_validation
+            found.append(ScannedMap(
+                one.name, one.probe, one.pose, number if listed else None, one.is_validation,
+                points, map_time(one.data), slice(first, first + len(points))))
+            first += len(points)
+        return cls(tuple(found), data)
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether the study lists the maps, so that effects of instruments name theirs."""
+        return self.maps[0].number is not None
+
+    @cached_property
+    def times(self) -> Floats:
+        """Time (n,) of all points."""
+        return np.concatenate([one.time for one in self.maps])
+
+    @cached_property
+    def stated_points(self) -> Floats:
+        """All points (n, 3) in m as the maps state them."""
+        return np.vstack([one.points for one in self.maps])
+
+    def points_of(self, study: Study) -> Floats:
+        """Return all points (n, 3) in m in the magnet, by the instruments of a study."""
+        return np.vstack([probe_points(one.study_of(study).instrument, one.points)
+                          for one in self.maps])
+
+    def with_terms(self, study: Study, terms: InstrumentTerms | None) -> Study:
+        """Return a study whose instruments have the terms that an inference has found."""
+        if terms is None:
+            return study
+        maps = maps_of(study, self.data)
+        open_terms, found = OpenTerms.of(maps), dict(zip(terms.names, terms.change, strict=True))
+        return with_instruments(study, open_terms.applied(
+            maps, np.array([found[name] for name in open_terms.names])))
+
+    def seen(self, study: Study, fields: Floats) -> Floats:
+        """Return what the maps show (k, n, 3) in T of fields (k, n, 3) in T in the magnet's axes,
+        by the instruments of a study.
+        """
+        return np.concatenate([fields[:, one.rows] @ sensor_matrix(
+            one.study_of(study).instrument).T for one in self.maps], axis=1)
+
+    def places(self, effect: Effect, study: Study) -> list[Place]:
+        """Return the places of an effect: of one of an instrument, in every map, probe or stage."""
+        if effect.kind == "field" or not self.is_listed:
+            return list(effect.places(study))
+        found: dict[Place, list[str]] = {}
+        for one in self.maps:
+            if one.number is None:
+                continue
+            own = one.study_of(study)
+            for place in effect.places(own):
+                for owner in _owners(one, keys_of(effect, place, own)):
+                    found.setdefault(replace(place, instrument=owner), []).append(one.name)
+        return [replace(place, maps=tuple(names)) for place, names in found.items()]
+
+    def scene(
+        self, study: Study, field: FieldAt | None = None,
+        iron: Callable[[Study, Floats], Floats | None] | None = None,
+        magnetizations: Floats | None = None,
+    ) -> Scene:
+        """Return the nominal magnet of a study at the points of all maps.
+
+        Parameters
+        ----------
+        study : Study
+        field : callable, optional
+            Field of the nominal magnet of a study, see `FieldAt`, for effects that need it solved.
+        iron : callable, optional
+            Change that iron makes to the field, see `NominalFields.solve_iron`.
+        magnetizations : ndarray, optional
+            See `NominalFields.measured_magnetizations`.
+        """
+        points = self.points_of(study)  # solved at all of them at once
+
+        def solve(rows: slice) -> Callable[[Study], Floats]:
+            def at_rows(changed: Study) -> Floats:
+                if field is None:
+                    raise AssertionError(f"study {study.name} was not to be solved")
+                return field(changed, points)[rows]
+            return at_rows
+
+        def solve_iron(rows: slice) -> Callable[[Study], Floats | None]:
+            def at_rows(changed: Study) -> Floats | None:
+                found = None if iron is None else iron(changed, points)
+                return None if found is None else found[rows]
+            return at_rows
+
+        return Scene(self.maps, tuple(NominalFields(
+            one.study_of(study), points[one.rows], one.time, solve(one.rows),
+            solve_iron=solve_iron(one.rows), measured_magnetizations=magnetizations)
+            for one in self.maps))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The nominal magnet of a study, and its field at the points of all maps.
+
+    Attributes
+    ----------
+    maps : tuple of ScannedMap
+    fields : tuple of NominalFields
+        One for each map, with the part of the study that holds for it.
+    """
+
+    maps: tuple[ScannedMap, ...]
+    fields: tuple[NominalFields, ...]
+
+    @cached_property
+    def points(self) -> Floats:
+        """Positions of the probe (n, 3) in m along the magnet's axes."""
+        return np.vstack([one.points for one in self.fields])
+
+    @cached_property
+    def field(self) -> Floats:
+        """Values (n, 3) in T that the maps show of the nominal magnet, without offsets."""
+        return np.concatenate([one.field @ _sensors(one).T for one in self.fields])
+
+    @cached_property
+    def gradient(self) -> Floats:
+        """Change of these values (n, 3, 3) in T/m as the probe moves along the magnet's axes."""
+        return np.concatenate([_sensors(one) @ one.gradient for one in self.fields])
+
+    def signature(self, hypothesis: Hypothesis) -> Floats:
+        """Return the change of all values (k, n, 3) in T per unit of each parameter."""
+        effect, place = hypothesis.effect, hypothesis.place
+        if effect.kind == "instrument" and not effect.applied_in_full:
+            return self._by_map(place, partial(_signature_of_instrument, effect, place))
+        return self.seen(hypothesis, lambda nominal: effect.signature(nominal, place))
+
+    def derivative(self, hypothesis: Hypothesis, amounts: Floats) -> Floats:
+        """Return the change (k + r, n, 3) in T per unit of all amplitudes, see
+        `Effect.derivative`.
+        """
+        effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
+        if effect.kind == "instrument":
+            return np.concatenate([self.signature(hypothesis), self.seen(
+                hypothesis, lambda nominal: effect.refine(nominal, place, values))])
+        return self.seen(hypothesis, lambda nominal: effect.derivative(nominal, place, values))
+
+    def seen(self, hypothesis: Hypothesis, of: Callable[[NominalFields], Floats]) -> Floats:
+        """Return what the maps show of changes (k, n, 3) in T of the field of an effect."""
+        if hypothesis.effect.kind == "instrument":  # changes of the values themselves
+            return self._by_map(hypothesis.place, lambda nominal, _: of(nominal))
+        return self._by_map(hypothesis.place, lambda nominal, _: of(nominal) @ _sensors(nominal).T)
+
+    def _by_map(self, place: Place, of: Callable[[NominalFields, Floats], Floats]) -> Floats:
+        """Return changes (k, n, 3) of the values of all maps; 0 where a place does not act.
+
+        ``of`` takes the fields of a map, and its points (n, 3) in m as it states them.
+        """
+        found = [of(nominal, one.points) if not place.maps or one.name in place.maps else None
+                 for nominal, one in zip(self.fields, self.maps, strict=True)]
+        count = next(len(part) for part in found if part is not None)
+        return np.concatenate([np.zeros((count, *nominal.points.shape)) if part is None else part
+                               for part, nominal in zip(found, self.fields, strict=True)], axis=1)
+
+
+def _sensors(nominal: NominalFields) -> Floats:
+    """Return the matrix (3, 3) from B in the magnet's axes to the values of a map."""
+    return sensor_matrix(nominal.study.instrument)
+
+
+def keys_of(effect: Effect, place: Place, study: Study) -> set[str]:
+    """Return the keys of the instrument of a study that an effect changes."""
+    changed = effect.apply(study, place, [parameter.sd for parameter in effect.parameters])
+    return {key for key, value in changed.instrument if value != getattr(study.instrument, key)}
+
+
+def _owners(one: ScannedMap, keys: set[str]) -> list[str]:
+    """Return what may have an effect that changes such keys of the instrument of a map.
+
+    That is the probe or the map. What lies on a stage is moved with the stage, or by itself.
+    """
+    if keys & set(PROBE_KEYS) and one.probe != one.name:
+        return [f"probe {one.probe}"]
+    if keys <= set(POSE_KEYS) and one.pose != one.name:
+        return [f"stage {one.pose}", f"map {one.name}"]
+    return [f"map {one.name}"]
+
+
+def _signature_of_instrument(
+    effect: Effect, place: Place, nominal: NominalFields, stated: Floats
+) -> Floats:
+    """Return the change of a map's values (k, n, 3) in T per unit of each parameter.
+
+    It is the derivative of the law of the instrument, by differences, at the pose that the map
+    has. (`Effect.signature` holds for a mapper along the magnet's axes.)
+
+    Parameters
+    ----------
+    effect, place
+        An effect of the instrument.
+    nominal : NominalFields
+        Of this map.
+    stated : ndarray, shape (n, 3), in m
+        Its points as the map states them.
+    """
+    found = []
+    for number, parameter in enumerate(effect.parameters):
+        step = STEP * parameter.sd
+        values = step * np.eye(len(effect.parameters))[number]
+        more, less = (_shown(effect.apply(nominal.study, place, amounts.tolist()).instrument,
+                             nominal, stated) for amounts in (values, -values))
+        found.append((more - less) / (2 * step))
+    return np.array(found)
+
+
+def _shown(instrument: Instrument, nominal: NominalFields, stated: Floats) -> Floats:
+    """Return the values (n, 3) in T of a map by an instrument, near where the probe was.
+
+    The field is linear about the points of ``nominal``.
+    """
+    away = sensor_positions(instrument, stated) - nominal.points[:, None]
+    field = nominal.field[:, None] + np.einsum("ncj,nsj->nsc", nominal.gradient, away)
+    linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
+    return np.asarray(linear + nonlinear_part(instrument, linear, nominal.time))

@@ -1,0 +1,117 @@
+"""Import of field maps in foreign formats, and export to the formats of other programs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import xarray as xr
+
+from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
+from halbach_fe.core.files import atomic, file_bytes
+from halbach_fe.measurement.field_map import check_readings, write_map
+from halbach_fe.measurement.formats import bdsim, columns, comsol, geant4, openpmd, opera
+from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
+from halbach_fe.measurement.formats.grid import Grid, grid_of
+from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
+from halbach_fe.measurement.formats.text import lines_of
+
+READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
+    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read), strict=True))
+"""Readers of foreign formats by name; each gets the file's content, the user's declarations and the
+file's name for messages."""
+GRIDS: dict[str, Callable[[Grid], bytes]] = {
+    "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim.lines(grid)),
+    "geant4": lambda grid: _joined(geant4.lines(grid))}
+"""Writers of the formats that need a regular grid."""
+SUFFIXES = {"csv": (".csv",), "vtu": (".vtu",), "openpmd": (".h5", ".hdf5")}
+"""Suffixes of the formats that have a usual one."""
+WRITERS = (*GRIDS, "csv", "vtu")
+"""Names of the formats to which a map can be exported."""
+MAX_NAME = 255
+"""Largest number of characters of a file name in the attributes of an imported map."""
+
+
+@dataclass(frozen=True)
+class ImportedFile:
+    """An imported map and the name of the format of its file."""
+
+    imported: ImportedMap
+    format: str
+
+    @property
+    def data(self) -> xr.Dataset:
+        """The map, in m and T along the magnet's axes."""
+        return self.imported.data
+
+
+def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> ImportedFile:
+    """Read a map in a foreign format.
+
+    Parameters
+    ----------
+    path : Path
+    declared : DeclaredFormat
+        Statements of the user about the file.
+    name : str
+        Name of the format, one of `READERS`; by default it is recognized from the content.
+
+    Raises
+    ------
+    MeasurementError
+        If the file cannot be read as a map. The message names the file, and says how to correct it
+        or which options to add.
+    """
+    where = f"map {path}"
+    raw = file_bytes(path, where)
+    name = name or format_of(raw, declared, where)
+    if declared.decimal_comma and name in ("opera", "openpmd"):
+        raise MeasurementError(must_be("format", where, "one in which numbers may have a decimal "
+                                       "comma (--decimal-comma)", name, "Remove the option."))
+    found = to_map(READERS[name](raw, declared, where), declared)
+    data = found.data
+    check_readings(data, path)
+    data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
+                   "imported_sha256": hashlib.sha256(raw).hexdigest()}
+    return ImportedFile(found, name)
+
+
+def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
+    """Return the name in `READERS` of the format of a file, recognized by its first lines."""
+    if raw.startswith(openpmd.SIGNATURE):
+        return "openpmd"
+    lines = lines_of(raw, declared, where)
+    if comsol.is_comsol(lines):
+        return "comsol"
+    return "opera" if opera.is_opera(lines) else "columns"
+
+
+def export_map(data: xr.Dataset, name: str, path: Path) -> None:
+    """Write a map in one of the formats `WRITERS`.
+
+    The file is written atomically: it is either complete, or not there.
+
+    Raises
+    ------
+    MeasurementError
+        If the format needs a regular grid and the map's points do not form one.
+    OutputError
+        If the file cannot be written, or has the suffix of another format.
+    """
+    if path.suffix not in SUFFIXES.get(name, (path.suffix,)):
+        raise OutputError(must_be("suffix", f"output {path}", " or ".join(SUFFIXES[name]),
+                                  f"'{path.suffix}'"))
+    if name not in GRIDS:
+        write_map(data, path)
+        return
+    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+    content = GRIDS[name](grid_of(data, where))
+    with atomic(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _joined(lines: Iterable[str]) -> bytes:
+    """Return lines of text as the content of a file."""
+    return "\n".join([*lines, ""]).encode()

@@ -1,0 +1,340 @@
+"""A three-axis probe in a field without sources, fitted together with that field.
+
+The readings are linear in the amplitudes of the field's charges (`halbach_fe.measurement.
+harmonic_field`), and nearly so in the parameters of the probe: the places of its sensors, the
+matrix between the axes of probe and stage, turns and changes of gain and offset during the scan,
+and the lag of the readings behind the stage. Gauss-Newton steps of the probe's parameters are
+taken with the amplitudes eliminated.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_readings
+
+ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
+"""Largest number of steps of the fit of field and instrument, while orientations are tried, and
+from a fit of nearly the same readings."""
+
+ROUNDING = 1e-13
+"""Added to the information of the amplitudes, relative to its mean, so that maps without noise have
+positive definite matrices too."""
+
+HALVINGS = 8
+"""Number of times that a step is halved until it improves the fit."""
+
+AT_REST = 1.0
+"""Decrease of chi-squared below which the fit is at rest, of thousands of readings."""
+
+STEEPER = 100.0
+"""Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
+of positions is told from that of readings."""
+
+WAVES = 4
+"""Number of Legendre polynomials of the time by which the probe turns and its gain drifts."""
+
+SENSORS, MIXING = slice(0, 9), slice(9, 18)
+TURNS = slice(18, 18 + 3 * WAVES)
+OFFSETS = slice(TURNS.stop, TURNS.stop + 3)
+GAINS = slice(OFFSETS.stop, OFFSETS.stop + WAVES)
+LAG = GAINS.stop
+"""Places of the parameters: coordinates of the sensors, elements of the matrix between the axes of
+probe and stage, turns, changes of offsets, changes of the gain, and the lag."""
+
+PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 9, *(0.01,) * (3 * WAVES), *(2e-3,) * 3, *(0.01,) * WAVES,
+            1e-3)
+"""Prior standard deviations: in m, 1, rad, of the largest field, 1, and m."""
+
+
+@dataclass(frozen=True)
+class ProbeFit:
+    """A field together with an instrument.
+
+    Attributes
+    ----------
+    amplitudes : ndarray, shape (k,)
+    instrument : ndarray, shape (p,)
+        In units of `PRIOR_SD`.
+    covariance : ndarray, shape (p, p)
+    sigma : float, in T
+    used : float
+        Number of parameters that the readings determine.
+    prior_sd : ndarray, shape (p,)
+        Prior standard deviations in SI.
+    lag : bool
+        Whether the stage moved in more than one direction along the lines.
+    """
+
+    amplitudes: Floats
+    instrument: Floats
+    covariance: Floats
+    sigma: float
+    used: float
+    prior_sd: Floats
+    lag: bool
+
+    @property
+    def sensors_m(self) -> Floats:
+        """Places (3, 3) of the sensors relative to their mean."""
+        places = (self.instrument * self.prior_sd)[SENSORS].reshape(3, 3)
+        return np.asarray(places - places.mean(axis=0))
+
+    @property
+    def mixing(self) -> Floats:
+        """Matrix (3, 3) that is added to 1: reading c is row c times B.
+
+        Its trace is 0, because a common gain is no error that a map can show.
+        """
+        matrix = (self.instrument * self.prior_sd)[MIXING].reshape(3, 3)
+        return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
+
+
+class ProbeModel:
+    """Readings of a three-axis probe in a harmonic field."""
+
+    def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
+                 directions: Floats) -> None:
+        self.charges, self.points, self.field = charges, points, field
+        self.time, self.directions = time, directions
+        self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
+        sd = np.array(PRIOR_SD)
+        sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
+        self.prior_sd = sd
+
+    def without(self, group: slice) -> ProbeModel:
+        """Return a model whose instrument has none of a group of parameters."""
+        other = copy(self)
+        other.prior_sd = self.prior_sd.copy()
+        other.prior_sd[group] = 0.0
+        return other
+
+    def allowed(self, at: ProbeFit) -> ProbeFit:
+        """Return a fit to start from, with 0 for the parameters that this model leaves out."""
+        return replace(at, instrument=np.where(self.prior_sd > 0, at.instrument, 0.0),
+                       prior_sd=self.prior_sd)
+
+    def lag_shows(self, rows: NDArray[np.bool_]) -> bool:
+        """Tell whether the stage moved both ways, without which a lag is a shift of the map."""
+        return bool(np.ptp(self.directions[rows], axis=0).max() > 1.5)
+
+    def start(self, fit: HarmonicFit) -> ProbeFit:
+        """Return the fit of a perfect instrument."""
+        count = len(PRIOR_SD)
+        return ProbeFit(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
+                       self.prior_sd, False)
+
+    def fit(self, at: ProbeFit, rows: NDArray[np.bool_]) -> HarmonicFit:
+        """Return the fit of the field alone, read by an instrument that is known."""
+        design = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
+        readings = self.field[rows] - self.offsets(at, rows)
+        return fit_readings(design, [readings.ravel()])[0]
+
+    def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
+        """Return the change (n, 3) in T of the sensors' offsets."""
+        return np.asarray(self.time[rows, None] * (at.instrument * self.prior_sd)[OFFSETS])
+
+    def _sensor(
+        self, at: ProbeFit, rows: NDArray[np.bool_], sensor: int
+    ) -> tuple[Floats, Floats]:
+        """Return the places (n, 3) in m of a sensor and the directions (n, 3) that it reads."""
+        value, waves, own = at.instrument * self.prior_sd, self.waves[rows], np.eye(3)[sensor]
+        turn, gain = waves @ value[TURNS].reshape(WAVES, 3), waves @ value[GAINS]
+        reads = own + at.mixing[sensor] + np.cross(turn, own) + gain[:, None] * own
+        return (self.points[rows] + at.sensors_m[sensor] - value[LAG] * self.directions[rows],
+                reads)
+
+    def by_amplitude(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
+        """Return the readings (n, 3, k) per amplitude."""
+        found = np.empty((int(rows.sum()), 3, len(self.charges)))
+        for sensor in range(3):
+            places, reads = self._sensor(at, rows, sensor)
+            found[:, sensor] = self.charges.fields_along(places, reads)
+        return found
+
+    def by_parameter(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
+        """Return the derivatives (n, 3, p) in T of the readings by the parameters / `PRIOR_SD`."""
+        found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
+        for sensor in range(3):
+            places, reads = self._sensor(at, rows, sensor)
+            field = self.charges.field(places, at.amplitudes)
+            gradient = np.einsum("nc,ncj->nj", reads,
+                                 self.charges.gradient(places, at.amplitudes))
+            for other in range(3):  # of the mean of the sensors, which stays where it is
+                found[:, sensor, 3 * other:3 * other + 3] = gradient * (
+                    (sensor == other) - 1 / 3)
+            found[:, sensor, 9 + 3 * sensor:12 + 3 * sensor] = field
+            for other in range(3):
+                found[:, sensor, 9 + 4 * other] -= field[:, sensor] / 3
+            found[:, sensor, TURNS] = np.einsum(
+                "nw,na->nwa", self.waves[rows], np.cross(np.eye(3)[sensor], field)
+            ).reshape(len(found), -1)
+            found[:, sensor, OFFSETS.start + sensor] = self.time[rows]
+            found[:, sensor, GAINS] = self.waves[rows] * field[:, sensor, None]
+            if at.lag:
+                found[:, sensor, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
+        return found * self.prior_sd
+
+    def readings(self, at: ProbeFit, rows: NDArray[np.bool_] | None = None) -> Floats:
+        """Return what the instrument reads (n, 3) in T at some rows, by default at all."""
+        chosen = np.flatnonzero(np.ones(len(self.points), bool) if rows is None else rows)
+        found = np.empty((len(chosen), 3))
+        some = np.zeros(len(self.points), bool)
+        some[chosen] = True
+        for sensor in range(3):
+            places, reads = self._sensor(at, some, sensor)
+            found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
+        return np.asarray(found + self.offsets(at, some))
+
+    def expected(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
+        """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
+
+        Residuals are larger where the field is steep. Those of lines that are not fitted are no
+        measure of a single reading: at the edge of the map the field there is extrapolated.
+        """
+        gradient = self.charges.gradient(self.points, at.amplitudes)
+        noise, displaced = noise_of(gradient[rows], (self.field - self.readings(at))[rows])
+        return np.sqrt(noise**2 + displaced**2 * np.sum(gradient**2, axis=2))
+
+    def ideal(self, at: ProbeFit) -> Floats:
+        """Return what a probe without errors would have read (n, 3) in T.
+
+        What the fit leaves stays in it, along the axes that the sensors read.
+        """
+        every = np.ones(len(self.points), bool)
+        reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
+        left = self.field - self.readings(at)
+        return self.charges.field(self.points, at.amplitudes) + np.linalg.solve(
+            reads, left[..., None])[..., 0]
+
+
+def fit_probe(
+    model: ProbeModel, rows: NDArray[np.bool_], fit: HarmonicFit, start: ProbeFit | None = None,
+    iterations: int = ITERATIONS
+) -> ProbeFit:
+    """Fit field and instrument together by Gauss-Newton steps, each of which improves the fit.
+
+    ``fit`` is that of a perfect instrument, and has the prior width of the amplitudes.
+    """
+    at = replace(start or model.start(fit), lag=model.lag_shows(rows))
+    width2 = fit.sigma**2 / fit.penalty
+    state = _State.of(model, at, rows, width2)
+    for _ in range(iterations):
+        step, covariance, used = state.step()
+        for halving in range(HALVINGS):
+            after = _State.of(model, replace(
+                state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
+            if after.chi2 <= state.chi2:
+                break
+        else:
+            return state.at
+        sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
+        at_rest = state.chi2 - after.chi2 < AT_REST
+        state = after.with_noise(sigma, replace(
+            after.at, covariance=sigma**2 * covariance, used=used))
+        if at_rest:
+            break
+    return state.at
+
+
+@dataclass(frozen=True)
+class _State:
+    """The field of largest probability for an instrument and a noise.
+
+    Attributes
+    ----------
+    at : ProbeFit
+    chi2 : float
+        With the prior of amplitudes and instrument.
+    left : ndarray, shape (m,), in T
+    by_amplitude : ndarray, shape (m, k)
+    information : ndarray, shape (k, k)
+        Of the amplitudes, without their prior and in units of 1 / sigma^2.
+    projected : ndarray, shape (k,)
+        Product of ``by_amplitude`` with the readings.
+    factor : tuple
+        Cholesky factor of the information with the prior.
+    """
+
+    model: ProbeModel
+    rows: NDArray[np.bool_]
+    width2: float
+    at: ProbeFit
+    chi2: float
+    left: Floats
+    by_amplitude: Floats
+    information: Floats
+    projected: Floats
+    factor: tuple[Floats, bool]
+
+    @classmethod
+    def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> _State:
+        """Fit the field for the instrument and the noise of ``at``."""
+        by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
+        target = (model.field[rows] - model.offsets(at, rows)).ravel()
+        return cls._solved(model, rows, width2, at, target, by_amplitude,
+                           by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
+
+    @classmethod
+    def _solved(
+        cls, model: ProbeModel, rows: NDArray[np.bool_], width2: float, at: ProbeFit,
+        target: Floats, by_amplitude: Floats, information: Floats, projected: Floats,
+    ) -> _State:
+        """Solve for the amplitudes."""
+        with_prior = information.copy()
+        with_prior[np.diag_indices(len(with_prior))] += (
+            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
+        factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
+        amplitudes = linalg.cho_solve(factor, projected)
+        left = target - by_amplitude @ amplitudes
+        chi2 = (float(left @ left) / at.sigma**2 + float(amplitudes @ amplitudes) / width2
+                + float(at.instrument @ at.instrument))
+        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left,
+                   by_amplitude, information, projected, factor)
+
+    def with_noise(self, sigma: float, at: ProbeFit) -> _State:
+        """Return the state of the same instrument for another noise in T."""
+        target = self.left + self.by_amplitude @ self.at.amplitudes
+        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma), target,
+                            self.by_amplitude, self.information, self.projected)
+
+    def step(self) -> tuple[Floats, Floats, float]:
+        """Return the step (p,) of the instrument, its covariance / sigma^2, and `ProbeFit.used`.
+
+        The amplitudes, which are the best for the present instrument, are eliminated from the
+        normal equations.
+        """
+        noise2, count = self.at.sigma**2, len(PRIOR_SD)
+        design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
+        mixed = self.by_amplitude.T @ design
+        solved = linalg.cho_solve(self.factor, mixed)
+        inverse = np.linalg.inv(design.T @ design - mixed.T @ solved + noise2 * np.eye(count))
+        step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
+        # traces of the blocks of the inverse of all normal equations
+        amplitudes, info = linalg.lapack.dpotri(self.factor[0], lower=1)
+        assert info == 0  # the factor is that of a Cholesky decomposition
+        by_amplitude = float(np.trace(amplitudes)) + float(np.sum((solved @ inverse) * solved))
+        used = (len(mixed) - noise2 / self.width2 * by_amplitude
+                + count - noise2 * float(np.trace(inverse)))
+        return step, inverse, used
+
+
+def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
+    """Return the noise in T of readings and in m of positions that residuals (n, 3) show.
+
+    A position noise s makes an error of s |grad B_c| in component c, for a gradient (n, 3, 3). It
+    is 0 if the gradient is about the same everywhere, so that nothing tells the two noises apart.
+    """
+    steepness = np.sum(gradient**2, axis=2).ravel()
+    flat, steep = np.quantile(steepness, [0.1, 0.9])
+    squares = residual.ravel()**2
+    if steep < STEEPER * flat:
+        return float(np.sqrt(squares.mean())), 0.0
+    constant = float(squares[steepness <= flat].mean())
+    return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())

@@ -1,0 +1,90 @@
+"""Rows of a map that cannot be readings of a field without sources: zeros, repetitions, spikes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.measurement.scan_lines import point_spacing
+
+SPIKE = 12.0
+"""A reading is a spike if its residual is larger than this multiple of the standard deviation of
+the residuals around it and of all, both from their medians."""
+
+NEIGHBOURS = 26
+"""Number of neighbours of a reading, as many as a point of a grid has."""
+
+ROUGH = 1.8
+"""Multiple of the largest residual around a row that is far off a function through its neighbours.
+A single spike is 2 to 4 times as far off its own as off theirs."""
+
+ROUGH_ROUNDS = 10
+"""Number of times that spikes are looked for among the rows that are left."""
+
+
+def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
+    """Return the rows that are zero, or repeat the row before them at another position."""
+    zero = (field == 0).all(axis=1)
+    repeated = np.zeros(len(field), bool)
+    repeated[1:] = (field[1:] == field[:-1]).all(axis=1) & (
+        points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
+    return {name: (1 + np.flatnonzero(rows)).tolist()
+            for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
+
+
+def rough_rows(
+    points: Floats, field: Floats, usable: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the rows that are far off a quadratic function through their neighbours.
+
+    A row that is far off spoils the functions of its neighbours, but less than its own. A field
+    that is steeper than a quadratic function spoils those of neighbours alike.
+    """
+    found = np.zeros(len(points), bool)
+    for _ in range(ROUGH_ROUNDS):
+        rows = np.flatnonzero(usable & ~found)
+        near = neighbours(points[rows])
+        residual = np.full_like(field, np.nan)
+        for part in np.array_split(np.arange(len(rows)), max(1, len(rows) // 1000)):
+            away = points[rows[near[part]]] - points[rows[part], None]
+            away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
+            x, y, z = np.moveaxis(away, 2, 0)
+            terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x],
+                             axis=2)
+            weights = np.linalg.pinv(terms, rcond=1e-6)[:, 0]  # of the value at the row itself
+            residual[rows[part]] = field[rows[part]] - np.einsum(
+                "nk,nkc->nc", weights, field[rows[near[part]]])
+        size = np.linalg.norm(residual[rows], axis=1)
+        worst = spikes(points, residual, usable & ~found, 1.0)
+        worst[rows] &= size > ROUGH * size[near].max(axis=1)
+        if not worst.any():
+            break
+        found |= worst
+    return found
+
+
+def spikes(
+    points: Floats, residual: Floats, usable: NDArray[np.bool_], over_neighbours: float = SPIKE
+) -> NDArray[np.bool_]:
+    """Return the usable rows whose residual (n, 3) is far larger than all, and those around."""
+    rows = np.flatnonzero(usable)
+    size = np.abs(residual[rows])
+    near = neighbours(points[rows])
+    least = 1.4826 * np.maximum(over_neighbours * np.median(size[near], axis=1),
+                                SPIKE * np.median(size, axis=0))
+    found = np.zeros(len(points), bool)
+    found[rows] = (size > least).any(axis=1)
+    return found
+
+
+def neighbours(points: Floats) -> Ints:
+    """Return the numbers (n, k) of the nearest neighbours of points (n, 3).
+
+    Coordinates are rounded, so that which of equally distant points count does not depend on the
+    last digits of the file.
+    """
+    places = np.round(points / point_spacing(points), 6)
+    count = min(NEIGHBOURS + 1, len(points))
+    return np.asarray(KDTree(places).query(places, np.arange(2, count + 1))[1])

@@ -1,0 +1,217 @@
+"""Table, figure and page of the forces on the blocks of a magnet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.forces import STANDARD_GRAVITY, Forces, Loads
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    own_style,
+    save,
+    write_page,
+)
+from halbach_fe.study.types import COMPONENTS
+
+LISTED = 12
+"""Number of the blocks on page and terminal: those with the largest forces."""
+
+MAIN = 0.9
+"""Component of a direction beyond which a direction in words has no other part."""
+
+NEGLIGIBLE = 1e-9
+"""Forces in N below which there is none."""
+
+
+def verdict(found: Forces) -> list[str]:
+    """Return the answer in sentences: the largest forces, the mass and the price."""
+    worst = int(np.argmax(found.in_place.magnitude))
+    size = found.in_place.magnitude[worst]
+    if size < NEGLIGIBLE:
+        return ["No block feels a force.", _mass(found)]
+    block = found.blocks[worst]
+    text = [f"The largest force is {_newton(size)} (as heavy as {_heavy(size)}), on "
+            f"{place_in_words(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."]
+    if len(found.blocks) > 1:
+        next_one = int(np.argmax(found.inserted.magnitude))
+        size, block = found.inserted.magnitude[next_one], found.blocks[next_one]
+        text.append(
+            f"While the blocks are inserted the largest is {_newton(size)} ({_heavy(size)}), on "
+            f"{place_in_words(block)}, the {_ordinal(int(found.step[next_one]))} of "
+            f"{len(found.blocks)}, "
+            f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
+    return [*text, _mass(found)]
+
+
+def _mass(found: Forces) -> str:
+    """Return mass and price of all blocks in words."""
+    words = f"The blocks weigh {found.mass_kg.sum():.4g} kg"
+    return words + ("." if found.cost is None else f" and cost {found.cost:.4g}.")
+
+
+def _newton(size: float) -> str:
+    """Return a force as text, without an exponent."""
+    return f"{size:.0f} N" if size >= 100 else f"{size:.3g} N"
+
+
+def _heavy(size: float) -> str:
+    """Return the mass whose weight a force in N is."""
+    mass = size / STANDARD_GRAVITY
+    value, unit = (mass, "kg") if mass >= 1 else (1e3 * mass, "g")
+    return f"{value:.0f} {unit}" if value >= 10 else f"{value:.2g} {unit}"
+
+
+def _ordinal(number: int) -> str:
+    """Return 1st, 2nd, 3rd and so on."""
+    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(
+        number % 10, "th")
+    return f"{number}{ending}"
+
+
+def place_in_words(block: MagnetBlock) -> str:
+    """Return the place of a block: its name if it is a free block, else ring and slot."""
+    return f"block {block.label}" if block.label else f"ring {block.ring}, slot {block.slot}"
+
+
+def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
+    """Return the direction of a vector (3,) seen from the magnet's axis, and its unit vector."""
+    unit = vector / np.linalg.norm(vector)
+    x, y, _ = block.middle
+    radius = float(np.hypot(x, y))
+    radial = np.array([x, y, 0.0]) / radius if radius else np.array([1.0, 0.0, 0.0])
+    azimuthal = np.array([-radial[1], radial[0], 0.0])
+    parts = sorted([(float(unit @ radial), "away from the axis", "towards the axis"),
+                    (float(unit @ azimuthal), "counter-clockwise", "clockwise"),
+                    (float(unit[2]), "along +z", "along -z")], key=lambda part: -abs(part[0]))
+    if not radius:
+        parts = sorted(((float(unit[k]), f"along +{name}", f"along -{name}")
+                        for k, name in enumerate(COMPONENTS)), key=lambda part: -abs(part[0]))
+    words = [plus if size > 0 else minus for size, plus, minus in parts]
+    text = words[0] if abs(parts[0][0]) > MAIN else f"{words[0]} and {words[1]}"
+    return f"{text} ({', '.join(f'{value:+.2f}' for value in unit.round(2) + 0.0)})"
+
+
+def force_rows(found: Forces) -> list[dict[str, str]]:
+    """Return a row of text for each of the largest forces in place."""
+    rows = []
+    for number in np.argsort(-found.in_place.magnitude, kind="stable")[:LISTED]:
+        block, size = found.blocks[number], found.in_place.magnitude[number]
+        rows.append({
+            "block": block.name, "force": f"{size:.3g} ± {found.in_place.error_N[number]:.1g} N",
+            "direction": (direction_in_words(block, found.in_place.force_N[number])
+                          if size > NEGLIGIBLE else "none"),
+            "torque": f"{np.linalg.norm(found.in_place.torque_Nm[number]):.3g} Nm",
+            "inserted": f"{found.inserted.magnitude[number]:.3g} N",
+            "inserted as": _ordinal(int(found.step[number]))})
+    return rows
+
+
+def forces_summary(found: Forces) -> dict[str, object]:
+    """Return the content of forces.json."""
+    def largest(loads: Loads) -> dict[str, object]:
+        number = int(np.argmax(loads.magnitude))
+        return {"block": found.blocks[number].name, "size_N": float(loads.magnitude[number]),
+                "error_N": float(loads.error_N[number]),
+                "force_N": loads.force_N[number].tolist(),
+                "torque_Nm": loads.torque_Nm[number].tolist(),
+                "error_Nm": float(loads.error_Nm[number])}
+
+    return {
+        "study": found.magnet.name, "blocks": len(found.blocks),
+        "largest_in_place": largest(found.in_place), "largest_inserted": largest(found.inserted),
+        "imbalance_N": found.imbalance_N, "mass_kg": float(found.mass_kg.sum()),
+        "price_per_kg": found.price_per_kg, "cost": found.cost}
+
+
+def force_columns(found: Forces) -> dict[str, Iterable[object]]:
+    """Return the columns of forces.csv."""
+    columns: dict[str, Iterable[object]] = {
+        "block": [block.name for block in found.blocks],
+        "ring": [block.ring for block in found.blocks],
+        "slot": [block.slot for block in found.blocks], "step": found.step,
+        "mass_kg": found.mass_kg}
+    for prefix, loads in (("", found.in_place), ("inserted_", found.inserted)):
+        for number, name in enumerate(COMPONENTS):
+            columns[f"{prefix}F{name}_N"] = loads.force_N[:, number]
+        columns[f"{prefix}error_N"] = loads.error_N
+        for number, name in enumerate(COMPONENTS):
+            columns[f"{prefix}T{name}_Nm"] = loads.torque_Nm[:, number]
+        columns[f"{prefix}error_Nm"] = loads.error_Nm
+    return columns
+
+
+def forces_figure(found: Forces) -> Figure:
+    """Draw the ring with the largest force, and the forces by the order of insertion."""
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.1))
+    _draw_ring(left, found)
+    order = found.order
+    step = np.arange(1, len(order) + 1)
+    right.plot(step, found.in_place.magnitude[order], ".", ms=4, color=PUBLISHED,
+               label="with all others in place")
+    right.plot(step, found.inserted.magnitude[order], "-", lw=1, color=POSTERIOR,
+               label="as the next one to be inserted")
+    right.set(xlabel="step of the assembly", ylabel="force in N", ylim=(0, None))
+    right.grid(alpha=0.3)
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return figure
+
+
+def _draw_ring(axis: Axes, found: Forces) -> None:
+    """Draw the blocks of the ring with the largest force, coloured, with arrows of their forces."""
+    size = found.in_place.magnitude
+    ring = found.blocks[int(np.argmax(size))].ring
+    chosen = [number for number, block in enumerate(found.blocks) if block.ring == ring]
+    t = np.linspace(0, 1, 9)
+    corners = []
+    for number in chosen:
+        block = found.blocks[number]
+        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
+        height = (block.z_min + block.z_max) / 2
+        corners.append(1e3 * block.from_frame(
+            np.column_stack([outline, np.full(len(outline), height)]))[:, :2])
+    colours = Normalize(0, float(size[chosen].max()) or 1.0)
+    axis.add_collection(PolyCollection(
+        corners, array=size[chosen], cmap="Blues", norm=colours, edgecolor="#777777", lw=0.6))
+    middles = np.array([corner.mean(axis=0) for corner in corners])
+    flat = found.in_place.force_N[chosen, :2]
+    longest = float(np.linalg.norm(flat, axis=1).max())
+    if longest > NEGLIGIBLE:
+        arrows = 0.35 * float(np.abs(middles).max() or 1.0) * flat / longest
+        axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=PRIOR,
+                    width=0.005, edgecolor=MEASURED, lw=0.3)
+    axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N", shrink=0.8)
+    reach = 1.3 * float(np.abs(np.vstack(corners)).max())
+    axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", xlim=(-reach, reach),
+             ylim=(-reach, reach), title=f"ring {ring}")
+
+
+@own_style
+def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> None:
+    """Write forces.csv, forces.json, forces.html and its figure."""
+    write_text(folder / "forces.json",
+               json.dumps(forces_summary(found), indent=1, allow_nan=False) + "\n")
+    with atomic(folder / "forces.csv") as temporary:
+        write_csv(force_columns(found), {"study": found.magnet.name}, temporary)
+    pictures = save({"forces.png": (
+        forces_figure(found), "Left: forces in place in the ring of the largest one; arrows show "
+        "their part in the plane. Right: forces in the order of the assembly")}, folder)
+    write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
+               provenance=provenance, verdict=verdict(found), rows=force_rows(found), found=found,
+               permeable=not found.magnet.is_vacuum)

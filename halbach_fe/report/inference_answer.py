@@ -1,0 +1,68 @@
+"""The answer of an inference in a few sentences, for its page and the terminal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.summary import block_in_words
+from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
+from halbach_fe.report.words import flux_density, fraction
+
+
+def answer(result: InferenceResult) -> list[str]:
+    """Say how well the updated magnet predicts, what its blocks are like, and what to do next."""
+    return [_prediction(result), _blocks(result), _next(result)]
+
+
+def _prediction(result: InferenceResult) -> str:
+    """Say how far the predictions are from readings, if possible from ones that it has not seen."""
+    parts = np.array(result.parts)
+    part = next((name for name in (HELD_OUT_MAP, HELD_OUT) if (parts == name).any()), None)
+    chosen = parts == part if part else np.ones(len(parts), bool)
+    before, after = (_rms((result.readings - each.mean)[chosen])
+                     for each in (result.prediction_prior, result.prediction_posterior))
+    if part is None:
+        return (f"The updated magnet differs from the readings by {flux_density(after)} rms, the "
+                f"magnet as ordered by {flux_density(before)}. No reading was held out, so that "
+                "this is no test: hold some out by [inference.held_out] or --held-out.")
+    expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
+    bands = [(score.readings, score.coverage95_posterior) for score in result.scores
+             if score.part == part and score.coverage95_posterior is not None]
+    held = sum(count * share for count, share in bands) / sum(count for count, _ in bands)
+    of = ("readings of the held-out map" if part == HELD_OUT_MAP
+          else "readings that were held out")
+    return (f"The updated magnet predicts {chosen.sum()} {of} to "
+            f"{flux_density(after)} rms, where its error bars and the noise allow "
+            f"{flux_density(_rms(expected))}; the magnet as ordered is {flux_density(before)} off. "
+            f"The 95 % band holds {fraction(held)} of them.")
+
+
+def _blocks(result: InferenceResult) -> str:
+    """Say how the magnetizations along the easy axes deviate from the nominal ones."""
+    nominal = result.by_block(result.response.nominal)
+    size = np.linalg.norm(nominal, axis=1)
+    there = np.flatnonzero(size)  # without the places of missing blocks
+    axes = nominal[there] / size[there, None]
+    mean = np.einsum("ij,ij->i", result.by_block(result.posterior.mean)[there] - nominal[there],
+                     axes) / size[there]
+    worst = int(np.argmax(np.abs(mean)))
+    row = np.zeros((1, len(result.posterior.mean)))
+    result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
+    sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
+    return (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
+            f"rms, the most {block_in_words(block.ring, block.slot, block.label or '')} by "
+            f"{100 * mean[worst]:+.1f}\u00a0±\u00a0{100 * sd:.1f}\u00a0%.")
+
+
+def _next(result: InferenceResult) -> str:
+    """Say what to do next."""
+    if result.disagreement:
+        return "Run halbach-fe diagnose with the same files: it looks for what the study lacks."
+    return ("Model and readings agree. halbach-fe multipoles --posterior posterior.h5 gives the "
+            "multipoles of the updated magnet, halbach-fe homogeneity its homogeneity, and "
+            "halbach-fe shim the blocks to swap or turn.")
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,70 @@
+"""The field of the deviations of magnetizations from the nominal ones.
+
+It is exact in vacuum. What permeable blocks and iron answer to deviations is neglected: that is a
+few per cent of a field that is small itself, and serves where small shifts of readings are
+computed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.blocks import MagnetBlock, vector
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.response.block_variation import Variations
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.materials import MU_0
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    variations : Variations or None
+    """
+
+    magnet: Magnet
+    variations: Variations | None
+
+    @classmethod
+    def of(cls, magnet: Magnet) -> Deviations:
+        """Return those of the study's parameters."""
+        return cls(magnet, Variations.of(magnet))
+
+    @property
+    def count(self) -> int:
+        """The number of parameters."""
+        varying = 0 if self.variations is None else len(self.variations.names)
+        return len(self.magnet.parameter_names) + varying
+
+    def field(self, deviations: Floats, points: Floats) -> Floats:
+        """Return B (n, 3) in T at points (n, 3) in m outside of the blocks.
+
+        ``deviations`` (parameters,) are those of the magnetizations in A/m, followed by the
+        amplitudes of variations.
+        """
+        uniform, amplitudes = np.split(deviations, [len(self.magnet.parameter_names)])
+        found = field_of(with_magnetizations(self.magnet, uniform), points)
+        if self.variations is not None:
+            found = found + self.variations.field(amplitudes, points)
+        return found
+
+
+def with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of a magnet with magnetizations (parameters,) in A/m.
+
+    The axes of an anisotropic permeability turn with them, by fractions of a degree.
+    """
+    blocks, size = [], magnet.dimension
+    for block, magnetization in zip(magnet.blocks, values.reshape(-1, size), strict=True):
+        remanence = MU_0 * block.recoil_tensor[:, :size] @ magnetization
+        strength = float(np.linalg.norm(remanence))
+        axis = vector(remanence / strength) if strength else block.easy_axis
+        blocks.append(replace(block, remanence=strength, easy_axis=axis))
+    return tuple(blocks)

@@ -1,0 +1,440 @@
+"""Homogeneity of the field in a region, with error bars: ppm and spherical harmonics.
+
+Deviations are those of |B| from its mean over the region's volume, relative to that mean. The rms
+is over the volume; the peak-to-peak value is that of all points, of which most are on the surface,
+where a harmonic function has its extremes.
+
+In a sphere of radius R the component of B along the mean field is expanded as ``B_n = sum_lm
+(r/R)^l P_lm(cos theta) (a_lm cos(m phi) + b_lm sin(m phi))`` about its centre. The polar axis is
+the magnet's z axis, and P_lm are the associated Legendre functions without the phase (-1)^m of
+Condon and Shortley, in the semi-normalization of A. Schmidt: the mean square over the sphere of a
+term of amplitude 1 is 1/(2l + 1). Multiply by ``sqrt(2 (l - m)!/(l + m)!)`` for m > 0 to get the
+functions of F. Romeo and D. I. Hoult (Magn. Reson. Med. 1 (1984) 44) that shim coils are named
+after.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import factorial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import lpmv, roots_jacobi
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.observation import observe
+from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.measurement import FluxDensity, Instrument, PointPositions
+from halbach_fe.study.types import COMPONENTS
+
+PPM = 1e6
+
+INSIDE = 0.5
+"""Radius of the default sphere, relative to that of the bore."""
+
+INTEGRATION_DEGREE = 10
+"""Degree of the functions whose means over the volume are exact."""
+
+SURFACE_DEGREE = 36
+"""Least degree of the functions that the points of the surface resolve. They are 10° from each
+other, so that the extremes of a function of degree 2 between them are 1 % larger at most."""
+
+HIGHER_DEGREES = 1e-4
+"""Size up to which harmonics of a degree that the surface does not resolve are left out, relative
+to the field of a block at the wall of the bore: they fall as (R / r)^l from there inwards."""
+
+SLICE = 25
+"""Number of points along the sides of the slices that are drawn."""
+
+MOST_DEGREES = 40
+"""Largest degree that the surface resolves, which limits memory and time."""
+
+SHOWN_DEGREES = 6
+"""Degrees of the harmonics that are listed by default."""
+
+DRAWS = 400
+"""Number of magnets drawn from a distribution of magnetizations."""
+
+NAMES = {(1, 0, "a"): "Z", (1, 1, "a"): "X", (1, 1, "b"): "Y", (2, 0, "a"): "Z2",
+         (2, 1, "a"): "ZX", (2, 1, "b"): "ZY", (2, 2, "a"): "X2-Y2", (2, 2, "b"): "XY",
+         (3, 0, "a"): "Z3", (4, 0, "a"): "Z4"}
+"""Names of shim coils for some harmonics, by degree, order, and letter."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A sphere, an ellipsoid, or a cylinder along z.
+
+    Attributes
+    ----------
+    shape : str
+        ``sphere``, ``ellipsoid`` or ``cylinder``.
+    half_axes_m : tuple of float
+        Half axes along x, y and z in m: of a cylinder its radius twice, and half its length.
+    centre_m : tuple of float
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.Region.sphere(0.01).half_axes_m
+    (0.01, 0.01, 0.01)
+    """
+
+    shape: Literal["sphere", "ellipsoid", "cylinder"]
+    half_axes_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def sphere(
+        cls, radius_m: float, centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> Region:
+        """Return the sphere of a radius in m."""
+        return cls("sphere", (radius_m, radius_m, radius_m), centre_m)
+
+    @property
+    def text(self) -> str:
+        """The region in words, in mm."""
+        x, y, z = (1e3 * value for value in self.half_axes_m)
+        where = "" if not any(self.centre_m) else " about ({}) mm".format(
+            ", ".join(f"{1e3 * value:g}" for value in self.centre_m))
+        return {"sphere": f"a sphere of {2 * x:g} mm diameter",
+                "ellipsoid": f"an ellipsoid of {2 * x:g} x {2 * y:g} x {2 * z:g} mm",
+                "cylinder": f"a cylinder of {2 * x:g} mm diameter and {2 * z:g} mm length",
+                }[self.shape] + where
+
+    def contains(self, points: Floats) -> NDArray[np.bool_]:
+        """Return which of the points (n, 3) in m are in the region."""
+        x, y, z = ((points - self.centre_m) / self.half_axes_m).T
+        if self.shape == "cylinder":
+            return np.asarray((np.hypot(x, y) <= 1) & (np.abs(z) <= 1))
+        return np.asarray(x**2 + y**2 + z**2 <= 1)
+
+    def points(self, surface_degree: int) -> tuple[Floats, Floats]:
+        """Return points (n, 3) in m, those of the surface first, and weights (n,).
+
+        The weights, 0 on the surface, are those of means over the volume.
+
+        Parameters
+        ----------
+        surface_degree : int
+            Degree of the functions whose means over the unit sphere, to which an ellipsoid's
+            surface is scaled, are exact.
+        """
+        size = INTEGRATION_DEGREE // 2 + 1
+        if self.shape == "cylinder":
+            surface = _cylinder_surface(surface_degree)
+            radii, radial = _on_radius(size, 1)
+            angles = 2 * np.pi * np.arange(INTEGRATION_DEGREE + 1) / (INTEGRATION_DEGREE + 1)
+            heights, along = np.polynomial.legendre.leggauss(size)
+            r, phi, z = (part.ravel() for part in np.meshgrid(radii, angles, heights,
+                                                              indexing="ij"))
+            inner = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
+            weights = np.einsum("r,p,z->rpz", radial, np.ones(len(angles)), along).ravel()
+        else:
+            surface, _ = sphere_points(surface_degree)
+            directions, angular = sphere_points(INTEGRATION_DEGREE)
+            radii, radial = _on_radius(size, 2)
+            inner = (radii[:, None, None] * directions).reshape(-1, 3)
+            weights = np.outer(radial, angular).ravel()
+        unit = np.vstack([surface, inner])
+        return (np.array(self.centre_m) + unit * self.half_axes_m,
+                np.append(np.zeros(len(surface)), weights / weights.sum()))
+
+
+def sphere_points(degree: int) -> tuple[Floats, Floats]:
+    """Return points (n, 3) of the unit sphere and weights (n,) of sum 1.
+
+    Means of functions up to a degree are exact: Gauss's points along z, equal angles about it.
+    """
+    heights, along = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    angles = 2 * np.pi * np.arange(degree + 1) / (degree + 1)
+    z, phi = (part.ravel() for part in np.meshgrid(heights, angles, indexing="ij"))
+    aside = np.sqrt(1 - z**2)
+    return (np.column_stack([aside * np.cos(phi), aside * np.sin(phi), z]),
+            np.repeat(along, degree + 1) / (2 * (degree + 1)))
+
+
+def _on_radius(size: int, power: int) -> tuple[Floats, Floats]:
+    """Return points (size,) from 0 to 1 and weights of integrals with the weight r^power."""
+    nodes, weights = roots_jacobi(size, 0, power)
+    return np.asarray((1 + nodes) / 2), np.asarray(weights)
+
+
+def _cylinder_surface(degree: int) -> Floats:
+    """Return points (n, 3) of the surface of a cylinder of radius 1 from z = -1 to 1."""
+    count = degree // 2 + 1
+    angles = 2 * np.pi * np.arange(degree + 1) / (degree + 1)
+    phi, z = (part.ravel() for part in np.meshgrid(angles, np.linspace(-1, 1, count)))
+    wall = np.column_stack([np.cos(phi), np.sin(phi), z])
+    r, phi = (part.ravel() for part in np.meshgrid(np.linspace(0, 1, count)[:-1], angles))
+    disc = np.column_stack([r * np.cos(phi), r * np.sin(phi), np.ones_like(r)])
+    return np.vstack([wall, disc, disc * [1, 1, -1]])
+
+
+SMALLEST_M = 1e-6
+"""Smallest half axis of a region: in smaller ones the field differs by its rounding errors."""
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A spherical harmonic of the component along the mean field.
+
+    Attributes
+    ----------
+    degree, order : int
+    letter : str
+        ``a`` for cos(m phi), ``b`` for sin(m phi).
+    ppm, sd_ppm : float
+        Amplitude on the surface of the sphere relative to the mean field, and its standard
+        deviation.
+    """
+
+    degree: int
+    order: int
+    letter: str
+    ppm: float
+    sd_ppm: float
+
+    @property
+    def name(self) -> str:
+        """Name of the shim coil for it, or its degree and order."""
+        return NAMES.get((self.degree, self.order, self.letter),
+                         f"{self.letter}({self.degree},{self.order})")
+
+
+@dataclass(frozen=True)
+class Homogeneity:
+    """The field in a region for one distribution of magnetizations.
+
+    Attributes
+    ----------
+    mean_T, mean_sd_T : float
+        Mean of |B| over the volume, for the mean magnetizations, and its standard deviation.
+    direction : ndarray, shape (3,)
+        Direction of the mean of B.
+    direction_sd_rad : float
+        Standard deviation of its angle, rms over the two directions across it.
+    rms_ppm, peak_to_peak_ppm : float
+        Of the field of the mean magnetizations.
+    rms_range_ppm, peak_to_peak_range_ppm : tuple of float
+        Quantiles 2.5, 50 and 97.5 % of magnets that are drawn from the distribution. They are
+        larger than those of the mean field if the distribution is wide, as that of magnets whose
+        blocks were not measured.
+    harmonics : tuple of Harmonic
+        Empty unless the region is a sphere.
+    """
+
+    mean_T: float
+    mean_sd_T: float
+    direction: Floats
+    direction_sd_rad: float
+    rms_ppm: float
+    peak_to_peak_ppm: float
+    rms_range_ppm: tuple[float, float, float]
+    peak_to_peak_range_ppm: tuple[float, float, float]
+    harmonics: tuple[Harmonic, ...]
+
+
+@dataclass(frozen=True)
+class Slice:
+    """|B| in a plane through the centre of a region.
+
+    Attributes
+    ----------
+    across : str
+        The axis that is normal to the plane.
+    first_m, second_m : ndarray, shape (k,)
+        Coordinates along the other axes, in the order of x, y and z.
+    size_T : ndarray, shape (k, k)
+        |B|, with the second axis along the rows; NaN inside material.
+    """
+
+    across: str
+    first_m: Floats
+    second_m: Floats
+    size_T: Floats
+
+
+@dataclass(frozen=True)
+class HomogeneityModel:
+    """The linear model of B at the points of a region and of three slices through it.
+
+    Attributes
+    ----------
+    region : Region
+    weights : ndarray, shape (n,)
+        Of the region's points in means over the volume.
+    surface : int
+        Number of points on the surface, which come first.
+    in_air : ndarray of bool, shape (3 SLICE^2,)
+        Which points of the slices are among those of the response, after the region's.
+    response : Response
+        Of Bx, By and Bz at each point.
+    degrees : int
+        Largest degree of the harmonics.
+    surface_degree : int
+        See `Region.points`.
+    """
+
+    region: Region
+    weights: Floats
+    surface: int
+    in_air: NDArray[np.bool_]
+    response: Response
+    degrees: int
+    surface_degree: int
+
+    @property
+    def solver_error_ppm(self) -> float:
+        """Rms error bar of the solver for a component, relative to the nominal mean field."""
+        field = self._field(self.response.nominal[:, None])[..., 0]
+        mean = float(self.weights @ np.linalg.norm(field[:len(self.weights)], axis=1))
+        return PPM * float(np.sqrt(np.mean(self.response.error**2))) / mean
+
+    def of(self, parameters: Gaussian, seed: int = 0) -> Homogeneity:
+        """Return the homogeneity for a distribution of the magnetizations in A/m.
+
+        ``seed`` is that of the magnets that are drawn.
+        """
+        samples = parameters.sample(DRAWS, np.random.default_rng(seed))
+        every = self._field(np.vstack([parameters.mean, samples]).T)[:len(self.weights)]
+        field, drawn = every[..., 0], every[..., 1:]
+        mean = self.weights @ field
+        direction = mean / np.linalg.norm(mean)
+        along = np.einsum("n,ncd->cd", self.weights, drawn)
+        aside = along / np.linalg.norm(along, axis=0) - direction[:, None]
+        size, rms, whole = self._deviations(np.linalg.norm(field, axis=1)[:, None])
+        sizes, every_rms, every_whole = self._deviations(np.linalg.norm(drawn, axis=1))
+        return Homogeneity(
+            float(size[0]), float(np.std(sizes)), direction,
+            float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)), float(rms[0]), float(whole[0]),
+            _quantiles(every_rms), _quantiles(every_whole),
+            self._harmonics(field, drawn, direction, float(size[0])))
+
+    def slices(self, mean: Floats) -> list[Slice]:
+        """Return |B| in three planes for magnetizations (parameters,) in A/m."""
+        size = np.full(len(self.in_air), np.nan)
+        size[self.in_air] = np.linalg.norm(self._field(mean[:, None])[len(self.weights):, :, 0],
+                                           axis=1)
+        found = []
+        for axis, values in enumerate(size.reshape(3, SLICE, SLICE)):
+            first, second = (self.region.centre_m[other] + self.region.half_axes_m[other]
+                             * np.linspace(-1, 1, SLICE) for other in range(3) if other != axis)
+            found.append(Slice(COMPONENTS[axis], first, second, values))
+        return found
+
+    def _field(self, magnetizations: Floats) -> Floats:
+        """Return B (n, 3, d) in T at all points for magnetizations (parameters, d) in A/m."""
+        values = np.asarray(self.response.matrix @ magnetizations)
+        return (self.response.offset[:, None] + values).reshape(-1, 3, magnetizations.shape[1])
+
+    def _deviations(self, size: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return mean |B| (d,) in T, rms and peak-to-peak deviations (d,) in ppm of |B| (n, d)."""
+        mean = self.weights @ size
+        deviation = PPM * (size / mean - 1)
+        return (mean, np.sqrt(self.weights @ deviation**2),
+                np.asarray(deviation.max(axis=0) - deviation.min(axis=0)))
+
+    def _harmonics(
+        self, field: Floats, drawn: Floats, direction: Floats, size: float
+    ) -> tuple[Harmonic, ...]:
+        if self.region.shape != "sphere":
+            return ()
+        terms, functions = real_harmonics(self.degrees, self.surface_degree)
+        mean = PPM / size * functions @ (field[:self.surface] @ direction)
+        every = PPM / size * functions @ np.einsum("ncd,c->nd", drawn[:self.surface], direction)
+        return tuple(Harmonic(*term, float(value), float(sd)) for term, value, sd in zip(
+            terms, mean, np.std(every, axis=1), strict=True))
+
+
+def real_harmonics(
+    degrees: int, surface_degree: int
+) -> tuple[list[tuple[int, int, str]], Floats]:
+    """Return degree, order and letter of the harmonics, and the matrix to their amplitudes.
+
+    The matrix (harmonics, n) multiplies values at the `sphere_points` of ``surface_degree``.
+    """
+    points, weights = sphere_points(surface_degree)
+    phi = np.arctan2(points[:, 1], points[:, 0])
+    terms, rows = [], []
+    for degree in range(1, degrees + 1):
+        for order in range(degree + 1):
+            scale = 1.0 if not order else np.sqrt(
+                2 * factorial(degree - order) / factorial(degree + order))
+            legendre = scale * (-1) ** order * lpmv(order, degree, points[:, 2])
+            for letter, wave in (("a", np.cos(order * phi)), ("b", np.sin(order * phi))):
+                if order or letter == "a":
+                    terms.append((degree, order, letter))
+                    rows.append((2 * degree + 1) * weights * legendre * wave)
+    return terms, np.array(rows)
+
+
+def homogeneity_model(
+    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES
+) -> HomogeneityModel:
+    """Build the matrix from block magnetizations to the field in a region.
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section, or the region reaches into material.
+    """
+    if magnet.dimension == 2:
+        raise StudyError(must_be("`dimension`", f"study {magnet.name}",
+                                 "3, for the homogeneity in a volume", "2"))
+    if min(region.half_axes_m) < SMALLEST_M:
+        raise StudyError(must_be("the region", f"study {magnet.name}",
+                                 f"of at least {SMALLEST_M:g} m in all directions", region.text))
+    middles = np.array([block.middle for block in magnet.blocks])
+    if region.contains(middles).any():  # the points below may miss blocks in a large region
+        raise StudyError(must_be("the region", f"study {magnet.name}", "in air",
+                                 f"{region.text}, which contains blocks",
+                                 "Choose a smaller region. Was it meant in millimetres?"))
+    reach = max(region.half_axes_m) / magnet.bore_radius
+    resolved = MOST_DEGREES if reach >= 1 else min(
+        MOST_DEGREES, int(np.ceil(np.log(HIGHER_DEGREES) / np.log(reach))))
+    surface_degree = max(resolved + degrees, SURFACE_DEGREE)
+    points, weights = region.points(surface_degree)
+    inside = magnet.contains(points)
+    if inside.any():
+        x, y, z = 1e3 * points[int(np.argmax(inside))]
+        raise StudyError(must_be(
+            "the region", f"study {magnet.name}", "in air",
+            f"{region.text}, of which the point ({x:.4g}, {y:.4g}, {z:.4g}) mm is inside magnet or "
+            "iron", "Choose a smaller region, or check the study's radii."))
+    planes = _slice_points(region)
+    in_air = ~magnet.contains(planes)
+    bare = magnet.with_(instrument=Instrument(), observation=FluxDensity(
+        quantity="flux_density", positions=PointPositions(kind="points", points_m=(
+            region.centre_m,))))
+    every = np.vstack([points, planes[in_air]])
+    observation = observe(bare.study, every, np.ones(every.shape, bool))
+    return HomogeneityModel(region, weights, int((weights == 0).sum()), in_air,
+                            response_matrix(bare, observation, session), degrees, surface_degree)
+
+
+def _slice_points(region: Region) -> Floats:
+    """Return the points (3 SLICE^2, 3) in m of slices across x, y and z, see `Slice`."""
+    found = []
+    for axis in range(3):
+        unit = np.zeros((SLICE, SLICE, 3))
+        first, second = (other for other in range(3) if other != axis)
+        unit[..., first], unit[..., second] = np.meshgrid(*2 * [np.linspace(-1, 1, SLICE)])
+        found.append(unit.reshape(-1, 3))
+    return np.array(region.centre_m) + np.vstack(found) * region.half_axes_m
+
+
+def default_region(magnet: Magnet) -> Region:
+    """Return the sphere about the origin of half the radius of the bore."""
+    return Region.sphere(INSIDE * magnet.bore_radius)
+
+
+def _quantiles(values: Floats) -> tuple[float, float, float]:
+    low, middle, high = np.quantile(values, [0.025, 0.5, 0.975]).tolist()
+    return low, middle, high

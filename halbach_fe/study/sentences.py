@@ -1,0 +1,93 @@
+"""What pydantic finds wrong, in the words of a user: none of its own texts are shown.
+
+pydantic's errors have a kind, and what belongs to it by name: limits, patterns, names of tags.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+KEY = "[key]"
+"""Last part of pydantic's location of a key, in contrast to its value."""
+
+PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9._-]*$":
+        "a name of letters (a to z), digits, '.', '_' and '-' that begins with a letter or digit",
+    r"^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$":
+        "a name of at most 40 letters (a to z), digits, '_' and '-' that begins with a letter or "
+        "digit",
+}
+"""What a text must be like, by the regular expression that the models check."""
+
+EXPECTED = {
+    "missing": "given",
+    "extra_forbidden": "a known key",
+    "greater_than": "greater than {gt:g}",
+    "greater_than_equal": "greater than or equal to {ge:g}",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "less than or equal to {le:g}",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number of fewer digits",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "string_type": "a text in quotation marks",
+    "string_unicode": "a text in UTF-8",
+    "string_too_short": "a text of {min_length} or more characters",
+    "string_too_long": "a text of at most {max_length} characters",
+    "literal_error": "{expected}",
+    "union_tag_invalid": "one of {expected_tags}",
+    "union_tag_not_found": "given",
+    "model_type": "a table of keys",
+    "model_attributes_type": "a table of keys",
+    "dict_type": "a table of keys",
+    "tuple_type": "a list",
+    "too_short": "a list with {min_length} or more elements",
+    "too_long": "a list with at most {max_length} elements",
+}
+"""What is expected, by the kind of error; the models raise no others."""
+
+
+def expected(error: ErrorDetails) -> str:
+    """Return what a value must be."""
+    given = error.get("ctx", {})
+    if error["type"] == "string_pattern_mismatch":
+        return PATTERNS.get(given["pattern"], "a text of other characters")
+    kind = error["type"]
+    if kind.startswith("too_") and isinstance(error["input"], str):  # where a validator comes first
+        kind = f"string_{kind}"
+    return EXPECTED.get(kind, "of another kind").format(**given)
+
+
+def contradiction(error: ErrorDetails) -> str | None:
+    """Return the sentence of a validator of ours; None if pydantic itself found the error."""
+    if error["type"] not in ("value_error", "assertion_error"):
+        return None
+    return str(error["ctx"]["error"])
+
+
+def reason(error: ValidationError) -> str:
+    """Return what is wrong first, for a sentence that names the place itself."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"] if part != KEY)
+    return contradiction(first) or f"{key or 'it'} must be {expected(first)}"
+
+
+def received(value: Any) -> object:
+    """Return a value as a study file would write it, or what it is."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    if isinstance(value, str):
+        return repr(value)
+    return "nothing" if value is None else value

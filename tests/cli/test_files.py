@@ -1,0 +1,158 @@
+"""Files of the command line: each is read once, and results of two studies are never mixed."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from halbach_fe.cli import main
+from halbach_fe.core.files import InputFile
+from halbach_fe.core.result_folder import RECORD
+from halbach_fe.measurement.field_map import field_map, write_map
+from tests.conftest import circle
+from tests.support.pages import page
+
+STUDY = """
+name = "vacuum"
+dimension = 2
+[array]
+blocks_per_ring = 8
+inner_radius_m = 0.05
+outer_radius_m = 0.09
+remanence_T = 1.0
+recoil_permeability = 1.0
+[array.block]
+shape = "sector"
+[mesh]
+block_size_m = 0.02
+[observation]
+quantity = "flux_density"
+components = ["x", "y"]
+[observation.positions]
+kind = "circles"
+radius_m = 0.03
+angles = 10
+[[noise.regions]]
+name = "bore"
+sigma_T = 1e-2
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+@pytest.fixture
+def measured(tmp_path):
+    path = tmp_path / "map.csv"
+    write_map(field_map(circle(0.03, 10), np.tile([0.55, 0.0, np.nan], (10, 1))), path)
+    return path
+
+
+def test_a_folder_is_of_one_study(study, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["solve", str(study), "-o", str(out)]) == 0
+    assert (out / "multipoles.csv").exists()
+    # the study no longer has circles: its multipoles would be those of another study
+    study.write_text(STUDY.replace(
+        'kind = "circles"\nradius_m = 0.03\nangles = 10',
+        'kind = "line"\nstart_m = [0, 0, 0]\nend_m = [0.01, 0, 0]\ncount = 3'))
+    assert main(["solve", str(study), "-o", str(out)]) == 0
+    assert not (out / "multipoles.csv").exists()
+    assert (out / "field_map.csv").exists()
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    study.write_text(STUDY.replace('"vacuum"', '"another"'))
+    assert main(["solve", str(study), "-o", str(out)]) == 8
+    assert "results of `halbach-fe solve` of study vacuum" in capsys.readouterr().err
+    study.write_text(STUDY)
+    assert main(["tolerance", str(study), "-o", str(out)]) == 8
+    with (out / RECORD).open() as lock:  # as another run has it
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(["solve", str(study), "-o", str(out)]) == 8
+    said = capsys.readouterr().err
+    assert "in use by another run" in said
+    assert "GetDP" not in said
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_input_file_is_read_once(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"one\r\ntwo")
+    file = InputFile(path)
+    assert file.read_text("utf-8") == path.read_text("utf-8") == "one\ntwo"
+    path.write_bytes(b"changed")
+    assert file.read_bytes() == b"one\r\ntwo"
+    assert file == path
+    assert InputFile(path).read_bytes() == b"changed"
+
+
+def test_pipes(study, measured, tmp_path):
+    """Study and map come through pipes, and the page has the hashes of what came."""
+    named = {"study": (tmp_path / "study.pipe", study.read_bytes()),
+             "map": (tmp_path / "map.pipe", measured.read_bytes())}
+    for path, content in named.values():
+        os.mkfifo(path)
+        threading.Thread(target=path.write_bytes, args=(content,), daemon=True).start()
+    out = tmp_path / "out"
+    assert main(["infer", str(named["study"][0]), "--measurements", str(named["map"][0]), "-o",
+                 str(out)]) == 0
+    shown = page(out / "report.html")
+    for _, content in named.values():
+        assert hashlib.sha256(content).hexdigest() in shown
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".h5", ".vtu"])
+def test_provenance_of_what_was_read(study, measured, tmp_path, monkeypatch, suffix):
+    """The map and the study change during the run."""
+    path = measured.with_suffix(suffix)
+    write_map(field_map(circle(0.03, 10), np.tile([0.55, 0.0, 0.0], (10, 1))), path)
+    read = {one: hashlib.sha256(one.read_bytes()).hexdigest() for one in (study, path)}
+    from halbach_fe.cli import common
+
+    opened = common.session
+
+    def changing(*arguments):
+        for one in read:
+            one.write_text("changed")
+        return opened(*arguments)
+
+    monkeypatch.setattr(common, "session", changing)
+    out = tmp_path / "out"
+    assert main(["infer", str(study), "--measurements", str(path), "-o", str(out)]) == 0
+    shown = page(out / "report.html")
+    assert all(digest in shown for digest in read.values())
+    assert hashlib.sha256(b"changed").hexdigest() not in shown
+
+
+def test_stale_results_go_even_if_nobody_reads_what_is_printed(tmp_path):
+    """A closed pipe ends a run after its files were written."""
+    (tmp_path / "study.toml").write_text(STUDY)
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "halbach_fe", "solve", "study.toml", "-o", "out"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    record = json.loads((out / "run.json").read_text())
+    (out / "old.csv").write_text("of an earlier run")
+    record["files"]["old.csv"] = hashlib.sha256(b"of an earlier run").hexdigest()
+    (out / "run.json").write_text(json.dumps(record))
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run([*command, "--json"], cwd=tmp_path, stdout=writing, check=False,
+                              stderr=subprocess.PIPE)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (141, b"")
+    assert not (out / "old.csv").exists()
+    assert "old.csv" not in json.loads((out / "run.json").read_text())["files"]

@@ -1,0 +1,174 @@
+"""A folder of results has one owner: a command and a study, and one run at a time."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from halbach_fe.core.errors import OutputError
+from halbach_fe.core.files import write_text
+from halbach_fe.core.result_folder import RECORD, locked_folder, result_folder
+
+
+def run(folder, *names, command="solve", study="a"):
+    with result_folder(folder, command, study):
+        for name in names:
+            write_text(folder / name, name)
+
+
+def listed(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_is_stale_is_removed(tmp_path):
+    folder = tmp_path / "out"
+    run(folder, "report.html", "multipoles.csv", "map/page.html", "edited.toml", "response.h5")
+    (folder / "notes.txt").write_text("mine")
+    (folder / "edited.toml").write_text("edited by hand")
+    run(folder, "report.html")
+    # what a later run may use again stays, and so does what is not ours
+    assert listed(folder) == {RECORD, "report.html", "notes.txt", "edited.toml", "response.h5"}
+    assert list(json.loads((folder / RECORD).read_text())["files"]) == ["report.html"]
+    (folder / "edited.toml").write_text("theirs, although a run had written one of that name")
+    run(folder, "other.html")
+    assert listed(folder) == {RECORD, "other.html", "notes.txt", "edited.toml", "response.h5"}
+
+
+@pytest.mark.parametrize("owner", [{"command": "infer"}, {"study": "b"}])
+def test_a_mixture_is_refused(tmp_path, owner):
+    run(tmp_path, "report.html")
+    with pytest.raises(OutputError, match=r"results of `solve` of study a\. A folder belongs to"):
+        run(tmp_path, "prediction.csv", **owner)
+    assert listed(tmp_path) == {RECORD, "report.html"}
+    (tmp_path / "report.html").unlink()  # nothing is left that could be mixed up
+    run(tmp_path, "prediction.csv", **owner)
+    assert listed(tmp_path) == {RECORD, "prediction.csv"}
+
+
+def test_a_run_that_fails(tmp_path):
+    """Its files are known, and removed once they are stale; without files nothing is left."""
+    def failing(*names):
+        with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "out", "solve", "a"):
+            for name in names:
+                write_text(tmp_path / "out" / name, name)
+            raise ZeroDivisionError
+
+    failing()
+    assert not (tmp_path / "out").exists()
+    run(tmp_path / "out", "old.csv")
+    failing("half.csv")
+    assert listed(tmp_path / "out") == {RECORD, "old.csv", "half.csv"}
+    run(tmp_path / "out", "new.csv")
+    assert listed(tmp_path / "out") == {RECORD, "new.csv"}
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from halbach_fe.core.files import write_text
+from halbach_fe.core.result_folder import result_folder
+with result_folder(pathlib.Path(sys.argv[1]), "solve", "a"):
+    write_text(pathlib.Path(sys.argv[1], "half.csv"), "")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_run_that_is_killed(tmp_path):
+    """It leaves neither a lock nor a file that nobody knows."""
+    subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert listed(tmp_path) == {RECORD, "half.csv"}
+    with pytest.raises(OutputError, match="of study a"):
+        run(tmp_path, "x.csv", study="b")
+    run(tmp_path, "new.csv")
+    assert listed(tmp_path) == {RECORD, "new.csv"}
+
+
+def test_two_runs_at_once(tmp_path):
+    with (result_folder(tmp_path, "solve", "a"),
+          pytest.raises(OutputError, match="in use by another run")):
+        run(tmp_path, "report.html")
+    run(tmp_path, "report.html")
+
+
+def test_planted_link(tmp_path):
+    """The record is not written through a link into a file elsewhere."""
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "out").mkdir()
+    os.symlink(victim, tmp_path / "out" / RECORD)
+    with pytest.raises(OutputError, match="Cannot write"):
+        run(tmp_path / "out", "report.html")
+    assert victim.read_text() == "precious"
+
+
+@pytest.mark.parametrize("content", ["", "{"])
+def test_damaged_record(tmp_path, content):
+    (tmp_path / RECORD).write_text(content)
+    run(tmp_path, "report.html")
+    assert listed(tmp_path) == {RECORD, "report.html"}
+
+
+@pytest.mark.parametrize("content", [
+    "[]", '{"runs": 7}', '{"command": "solve", "study": "a", "files": {"../victim": "%s"}}',
+    '{"command": "solve", "study": "a", "files": {"%s": "%s"}}'])
+def test_a_foreign_record(tmp_path, content):
+    """A file of another program is not replaced, and a planted one names no file elsewhere."""
+    victim, folder = tmp_path / "victim", tmp_path / "out"
+    victim.write_text("precious")
+    digest = hashlib.sha256(b"precious").hexdigest()
+    content = content.replace("%s", str(victim), content.count("%s") - 1).replace("%s", digest)
+    folder.mkdir()
+    (folder / RECORD).write_text(content)
+    with pytest.raises(OutputError, match="not one of halbach-fe"):
+        run(folder, "report.html")
+    assert (folder / RECORD).read_text() == content
+    assert listed(folder) == {RECORD}
+    assert victim.read_text() == "precious"
+
+
+def test_a_lock_without_a_record(tmp_path):
+    """Functions of the Python interface exclude runs and threads, and each other from no folder."""
+    folder, refused = tmp_path / "out", []
+
+    def other():
+        try:
+            run(folder, "report.html")
+        except OutputError as error:
+            refused.append(str(error))
+
+    with locked_folder(folder), locked_folder(folder / "part"):
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        (folder / "part").mkdir()
+    (one,) = refused
+    assert "in use by another run" in one
+    assert listed(folder) == set()
+    run(folder, "report.html")
+    with locked_folder(folder):
+        pass
+    assert listed(folder) == {RECORD, "report.html"}  # the owner stays
+
+
+def test_a_lock_that_is_removed_meanwhile(tmp_path, monkeypatch):
+    """A run that opens the record just before another removes it does not lock a deleted file."""
+    flock, first = fcntl.flock, []
+
+    def late(number, how):
+        if not first:
+            first.append(number)
+            (tmp_path / RECORD).unlink()
+        flock(number, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with locked_folder(tmp_path):
+        assert (tmp_path / RECORD).exists()
+        monkeypatch.undo()
+        with pytest.raises(OutputError, match="in use"):
+            run(tmp_path, "report.html")

@@ -1,0 +1,63 @@
+"""A held-out map is of other readings than those that update the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.readings import check_validation_map, read_campaign
+from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.field_map import field_map, points_of
+from tests.conftest import circle
+
+TRAINING = field_map(circle(0.07, 12), np.column_stack([
+    np.linspace(0.1, 0.2, 12), np.zeros(12), np.full(12, np.nan)]))
+NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-4}]}
+COMPONENTS = {"observation__components": ["x", "y"]}
+
+
+def check(study, held_out):
+    magnet = build_magnet(study)
+    check_validation_map(read_campaign(magnet, maps_of(study, TRAINING, held_out)), study)
+
+
+def part(rows):
+    """Some rows of the training map."""
+    return field_map(points_of(TRAINING)[rows], TRAINING["B_T"].values[rows])
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(None, None, -1), [3, 7, 5]],
+                         ids=["the same", "in another order", "a part"])
+def test_the_training_map(dipole, rows):
+    with pytest.raises(MeasurementError, match=r"--held-out.*the same readings"):
+        check(dipole(noise=NOISE, **COMPONENTS), part(rows))
+
+
+def test_some_training_readings(dipole):
+    other = field_map(circle(0.06, 2), np.tile([0.15, 0.0, np.nan], (2, 1)))
+    both = field_map(np.vstack([points_of(part([1])), points_of(other)]),
+                     np.vstack([part([1])["B_T"].values, other["B_T"].values]))
+    with pytest.warns(HalbachWarning, match="2 of 6 readings of the held-out map"):
+        check(dipole(noise=NOISE, **COMPONENTS), both)
+    check(dipole(noise=NOISE, **COMPONENTS), other)  # no warning
+
+
+def test_readings_that_the_study_holds_out(short_dipole):
+    """They do not update the model, so that they may be given as a map too."""
+    points = np.column_stack([np.zeros((12, 2)), np.linspace(-0.1, 0.1, 12)])
+    data = field_map(points, np.column_stack([np.linspace(0.1, 0.2, 12), np.zeros((12, 2))]))
+    study = short_dipole(noise=NOISE, inference={"held_out": {"every": 3}})
+    magnet = build_magnet(study)
+    readings = read_campaign(magnet, maps_of(study, data))
+    rows = np.unique(np.flatnonzero(~readings.training) // 3)
+    assert 0 < len(rows) < 12
+    check_validation_map(read_campaign(
+        magnet, maps_of(study, data, data.isel(point=rows))), study)
+
+
+def test_read_again_at_the_same_points(dipole):
+    """Other readings at the points of the map are a test of the noise, at least."""
+    check(dipole(noise=NOISE, **COMPONENTS),
+          field_map(points_of(TRAINING), TRAINING["B_T"].values + 1e-9))

@@ -1,0 +1,117 @@
+"""Stored results are taken for those of the same magnet only, and only as they were written."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import mcmc
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.mcmc import _Run
+from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.response import matrix as matrix_module
+from halbach_fe.response.matrix import response_matrix
+from halbach_fe.solver.exact_block_field import field_of
+from tests.conftest import circle
+
+NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-4}]}
+
+
+@pytest.fixture
+def inferred(dipole, session):
+    """The update of a dipole in vacuum by its own field, which needs no solve."""
+    study = dipole(noise=NOISE, array__recoil_permeability=1.0, observation__components=["x", "y"])
+    magnet = build_magnet(study)
+    field = field_of(magnet.blocks, circle(0.07, 24))
+    field[:, 2] = np.nan
+    update = infer(magnet, field_map(circle(0.07, 24), field), session)
+    write_inference(update, session.folder)
+    return update, session.folder / "posterior.h5"
+
+
+def test_posterior_of_the_same_magnet(inferred):
+    """Whatever else differs, such as the mesh or what is measured."""
+    update, path = inferred
+    study = update.study.with_(
+        name="other", mesh__block_size_m=0.01, noise=None,
+        external={"background_T": [1e-5, 0, 0]})
+    found = read_posterior(build_magnet(study), path)
+    np.testing.assert_array_equal(found["posterior"].mean, update.posterior.mean)
+
+
+@pytest.mark.parametrize(("changes", "key"), [
+    ({"array__inner_radius_m": 0.1}, "array.inner_radius_m"),
+    ({"array__block": {"shape": "trapezoid"}}, "array.block.shape"),
+    ({"array__recoil_permeability": 1.05}, "array.recoil_permeability"),
+    ({"array__remanence_T": 1.07}, "array.remanence_T"),
+    ({"iron_ring": {"inner_radius_m": 0.19, "outer_radius_m": 0.2,
+                    "relative_permeability": 1000.0}}, "iron_ring"),
+], ids=["radius", "shape", "permeability", "remanence", "iron"])
+def test_posterior_of_another_magnet(inferred, dipole, changes, key):
+    """Even where its blocks are magnetized alike."""
+    _, path = inferred
+    other = dipole(**{"noise": NOISE, "array__recoil_permeability": 1.0} | changes)
+    with pytest.raises(MeasurementError, match=f"another magnet, with another `{key}`"):
+        read_posterior(build_magnet(other), path)
+
+
+def test_changed_posterior(inferred):
+    update, path = inferred
+    with h5py.File(path, "r+") as file:
+        file["posterior_mean"][3] += 1e-3
+    with pytest.raises(OutputError, match="differs from its checksum") as raised:
+        read_posterior(update.magnet, path)
+    assert raised.value.exit_code == 8
+
+
+def points_observed(update):
+    return update.magnet, update.observation
+
+
+def test_changed_response(inferred, session):
+    """It is computed again, with a sentence: whether the matrix is in the file or beside it."""
+    update, _ = inferred
+    path = session.folder / "response.h5"
+    assert response_matrix(*points_observed(update), session).reused
+    with h5py.File(path, "r+") as file:
+        file["H"][0, 0] *= 1 + 1e-15
+    with pytest.warns(HalbachWarning, match="response.h5 cannot be used"):
+        again = response_matrix(*points_observed(update), session)
+    assert not again.reused
+    np.testing.assert_array_equal(again.matrix, update.response.matrix)
+    assert response_matrix(*points_observed(update), session).reused
+
+
+def test_changed_matrix_beside(inferred, session, monkeypatch):
+    update, _ = inferred
+    monkeypatch.setattr(matrix_module, "LOADED_BYTES", 1000)
+    (session.folder / "response.h5").unlink()
+    parts = response_matrix(*points_observed(update), session)
+    assert response_matrix(*points_observed(update), session).reused
+    content = bytearray(parts.matrix.path.read_bytes())
+    content[-3] ^= 1
+    parts.matrix.path.write_bytes(content)
+    with pytest.warns(HalbachWarning, match="differs from its checksum"):
+        assert not response_matrix(*points_observed(update), session).reused
+
+
+@pytest.mark.parametrize(("group", "name"), [("posterior", "magnetization"), ("state", "last")])
+def test_changed_chains(tmp_path, group, name):
+    """Sampling starts anew, with a sentence."""
+    path = tmp_path / "chains.nc"
+
+    def runs():
+        return [_Run(np.random.default_rng(n), np.zeros(2), np.ones((5, 2)), 0.3)
+                for n in range(2)]
+
+    mcmc._store(path, "key", runs(), ("a", "b"), 7)
+    assert mcmc._resume(path, "key", runs()) == 7
+    assert mcmc._resume(path, "other key", runs()) == 0
+    with h5py.File(path, "r+") as file:
+        file[group][name][(0,) * file[group][name].ndim] += 1e-9
+    with pytest.warns(HalbachWarning, match="starts anew"):
+        assert mcmc._resume(path, "key", runs()) == 0

@@ -1,0 +1,193 @@
+"""The homogeneity in a region, beside magpylib's field at points of another choice."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from halbach_fe.api import homogeneity
+from halbach_fe.cli import main
+from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.result_files import write_report
+from halbach_fe.response.homogeneity import Region, real_harmonics, sphere_points
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.reader import parse_study
+from tests.inference.test_registration import TEXT, truth
+
+RADIUS_M = 0.008
+REGIONS = [Region.sphere(RADIUS_M), Region.sphere(0.006, (0.002, -0.001, 0.003)),
+           Region("ellipsoid", (0.008, 0.006, 0.012)), Region("cylinder", (0.007, 0.007, 0.01))]
+
+
+def known_magnet(generator, folder, region):
+    """The homogeneity of a magnet whose magnetizations are known exactly, and magpylib's magnet."""
+    magnet_of = truth(generator)
+    magnet = build_magnet(parse_study(tomllib.loads(TEXT)))
+    right = []
+    for block in magnet.blocks:
+        (source,) = [each for each in magnet_of.sources
+                     if np.isclose(each.position[2], (block.z_min + block.z_max) / 2)
+                     and np.isclose(each.dimension[3], 45 * (block.slot - 1) - 22.5)]
+        right.append(source.polarization / MU_0)
+    exact = Gaussian(np.ravel(right), np.zeros((3 * len(right), 1)))
+    return homogeneity(magnet, Session.open(folder), region, {"posterior": exact}), magnet_of
+
+
+def unit_fields(points):
+    """The field (n, 3, 48) of every block at points, for polarizations of 1 T along x, y, z."""
+    columns = []
+    for source in truth(np.random.default_rng(0)).sources:
+        for axis in np.eye(3):
+            source.polarization = axis
+            columns.append(source.getB(points))
+    return np.stack(columns, axis=-1)
+
+
+def random_points(region, generator, count):
+    """Points that fill a region evenly, and points of its surface."""
+    unit = generator.uniform(-1, 1, (8 * count, 3))
+    radius = np.hypot(*unit[:, :2].T) if region.shape == "cylinder" else np.linalg.norm(
+        unit, axis=1)
+    inner = unit[radius <= 1][:count]
+    if region.shape == "cylinder":
+        edge = inner / np.maximum(np.hypot(*inner[:, :2].T), 1e-12)[:, None]
+        edge[:, 2] = inner[:, 2]
+        edge = np.vstack([edge, inner * [1, 1, 0] + [0, 0, 1], inner * [1, 1, 0] - [0, 0, 1]])
+    else:
+        edge = inner / np.linalg.norm(inner, axis=1)[:, None]
+    return (np.array(region.centre_m) + part * region.half_axes_m for part in (inner, edge))
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=lambda region: region.text)
+def test_beside_random_points(generator, tmp_path, region):
+    found, magnet_of = known_magnet(generator, tmp_path, region)
+    known = found.by_name["posterior"]
+    inner, edge = random_points(region, generator, 3000)
+    field = magnet_of.getB(inner)
+    size = np.linalg.norm(field, axis=1)
+    deviation = 1e6 * (size / size.mean() - 1)
+    # the means over 3000 random points have errors of about 2 % of the rms deviation
+    assert known.mean_T == pytest.approx(size.mean(), rel=7e-8 * known.rms_ppm)
+    assert known.rms_ppm == pytest.approx(np.sqrt(np.mean(deviation**2)), rel=0.07)
+    assert known.direction == pytest.approx(field.mean(axis=0) / np.linalg.norm(
+        field.mean(axis=0)), abs=7e-8 * known.rms_ppm)
+    whole = np.linalg.norm(magnet_of.getB(edge), axis=1) / size.mean() * 1e6
+    assert known.peak_to_peak_ppm == pytest.approx(np.ptp(whole), rel=0.04)
+    assert known.mean_sd_T == pytest.approx(0, abs=1e-15)
+    assert known.rms_range_ppm == pytest.approx([known.rms_ppm] * 3)
+    assert bool(known.harmonics) == (region.shape == "sphere")
+
+
+def test_harmonics_are_the_derivatives_at_the_centre(generator, tmp_path):
+    found, magnet_of = known_magnet(generator, tmp_path, REGIONS[1])
+    known = found.by_name["posterior"]
+    step = 5e-4
+    values = {}
+    for place in np.ndindex(3, 3, 3):
+        away = step * (np.array(place) - 1)
+        values[tuple(np.array(place) - 1)] = float(
+            magnet_of.getB(REGIONS[1].centre_m + away) @ known.direction)
+
+    def derivative(*axes):
+        """Second-order differences of the component along the mean field."""
+        total = 0.0
+        for signs in np.ndindex(*[2] * len(axes)):
+            place = np.zeros(3, int)
+            for axis, sign in zip(axes, signs, strict=True):
+                place[axis] += 2 * sign - 1
+            if len(axes) == 2 and axes[0] == axes[1]:
+                continue
+            total += np.prod([2 * sign - 1 for sign in signs]) * values[tuple(place)] / (
+                2 * step)**len(axes)
+        if len(axes) == 2 and axes[0] == axes[1]:
+            unit = np.eye(3, dtype=int)[axes[0]]
+            return (values[tuple(unit)] + values[tuple(-unit)] - 2 * values[0, 0, 0]) / step**2
+        return total
+
+    radius = REGIONS[1].half_axes_m[0]
+    scale = 1e6 / known.mean_T
+    expected = {
+        "X": radius * derivative(0), "Y": radius * derivative(1), "Z": radius * derivative(2),
+        # B_n = (a/R^2) (2 z^2 - x^2 - y^2)/2, sqrt(3) (a/R^2) z x, sqrt(3)/2 (a/R^2) (x^2 - y^2)
+        "Z2": radius**2 * derivative(2, 2) / 2, "ZX": radius**2 * derivative(2, 0) / np.sqrt(3),
+        "ZY": radius**2 * derivative(2, 1) / np.sqrt(3),
+        "XY": radius**2 * derivative(0, 1) / np.sqrt(3),
+        "X2-Y2": radius**2 * (derivative(0, 0) - derivative(1, 1)) / (2 * np.sqrt(3))}
+    by_name = {each.name: each.ppm for each in known.harmonics}
+    largest = max(map(abs, by_name.values()))
+    for name, value in expected.items():
+        # differences over 0.5 mm have an error of (0.5/20)^2
+        assert by_name[name] == pytest.approx(scale * value, abs=1e-3 * largest)
+
+
+def test_mean_squares_of_harmonics():
+    """The stated normalization: a term of amplitude 1 has the mean square 1/(2l + 1)."""
+    terms, functions = real_harmonics(4, 12)
+    _, weights = sphere_points(12)
+    for (degree, _, _), row in zip(terms, functions, strict=True):
+        term = row / ((2 * degree + 1) * weights)
+        assert weights @ term**2 == pytest.approx(1 / (2 * degree + 1))
+
+
+def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path):
+    magnet = build_magnet(parse_study(tomllib.loads(TEXT)))
+    known = homogeneity(magnet, Session.open(tmp_path), Region.sphere(RADIUS_M)).by_name["prior"]
+    low, middle, high = known.rms_range_ppm
+    inner, _ = random_points(Region.sphere(RADIUS_M), generator, 1000)
+    units = unit_fields(inner)
+    rms, means = [], []
+    for _ in range(60):
+        drawn = np.ravel([source.polarization for source in truth(generator).sources])
+        size = np.linalg.norm(units @ drawn, axis=1)
+        rms.append(1e6 * np.std(size) / size.mean())
+        means.append(size.mean())
+    # the test's magnets have no common deviation of 1 %, which changes the mean only
+    assert np.mean((np.array(rms) > low) & (np.array(rms) < high)) > 0.85
+    assert middle == pytest.approx(np.median(rms), rel=0.1)
+    assert known.mean_sd_T == pytest.approx(np.hypot(np.std(means), 0.01 * np.mean(means)),
+                                            rel=0.2)
+
+
+@pytest.mark.parametrize(("options", "sentence"), [
+    (["--sphere-m", "0.025"], "must be in air"),
+    (["--centre-m", "0", "0", "1"], "must be beside a region"),
+])
+def test_bad_regions(tmp_path, capsys, options, sentence):
+    path = tmp_path / "study.toml"
+    path.write_text(TEXT)
+    assert main(["homogeneity", str(path), "-o", str(tmp_path / "out"), *options]) == 3
+    assert sentence in " ".join(capsys.readouterr().err.split())
+    flat = parse_study(tomllib.loads(TEXT.replace("rings = 2", "").replace(
+        "ring_length_m = 0.03", "")) | {"dimension": 2})
+    with pytest.raises(StudyError, match="3, for the homogeneity"):
+        homogeneity(build_magnet(flat), Session.open(tmp_path))
+
+
+def test_a_page_of_a_distribution_of_any_name(generator, tmp_path):
+    found, _ = known_magnet(generator, tmp_path / "run", Region.sphere(0.006))
+    named = replace(found, by_name={"guess": found.by_name["posterior"]},
+                    distributions={"guess": found.distributions["posterior"]})
+    page = write_report(named, tmp_path / "page").read_text()
+    assert "95 % of what the guess allows" in page
+    assert "as ordered" not in page
+
+
+def test_command(tmp_path, capsys):
+    path = tmp_path / "study.toml"
+    path.write_text(TEXT)
+    assert main(["homogeneity", str(path), "-o", str(tmp_path / "out"), "--sphere-m", "0.006",
+                 "--degrees", "3"]) == 0
+    assert "In a sphere of 12 mm diameter the field is" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "out" / "homogeneity.json").read_text())
+    assert len(summary["prior"]["harmonics"]) == 15
+    assert summary["prior"]["rms_ppm"] < summary["prior"]["peak_to_peak_ppm"]
+    page = (tmp_path / "out" / "homogeneity.html").read_text()
+    assert "ppm rms" in page
+    assert (tmp_path / "out" / "harmonics.csv").read_text().count("prior") == 15
