@@ -108,7 +108,8 @@ def check_validation_map(readings: Readings, study: Study) -> None:
     Raises
     ------
     MeasurementError
-        If all of its readings are in the map that updates the model.
+        If all of its readings are in the map that updates the model, unless the study holds
+        them all out.
 
     Warns
     -----
@@ -122,7 +123,7 @@ def check_validation_map(readings: Readings, study: Study) -> None:
     own = [row for row, part in zip(rows, readings.parts, strict=True) if part == HELD_OUT_MAP]
     others = {row for row, part in zip(rows, readings.parts, strict=True) if part != HELD_OUT_MAP}
     shared = sum(row in training for row in own)
-    if own and others.issuperset(own):
+    if shared and others.issuperset(own):
         raise MeasurementError(must_be(
             "--held-out", f"study {study.name}", "a map of other readings than those that update "
             "the model", "the same readings", "Hold back readings before the "

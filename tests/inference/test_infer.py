@@ -396,7 +396,8 @@ def test_readings_that_vanish_by_symmetry(short_dipole, session):
     """B_y on the axis is zero; neither the checks nor the report may stumble over it."""
     study = short_dipole(noise=NOISE, observation__components=["y"])
     points = np.column_stack([np.zeros((5, 2)), np.linspace(-0.1, 0.1, 5)])
-    update = infer(build_magnet(study), field_map(points, np.zeros((5, 3))), session)
+    fields = np.tile([0.1, 0.0, 0.0], (5, 1))
+    update = infer(build_magnet(study), field_map(points, fields), session)
     (score,) = update.scores
     assert score.median_relative_error_posterior is None
     write_inference(update, session.folder)

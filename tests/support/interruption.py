@@ -59,12 +59,12 @@ def undisturbed(arguments: Sequence[str], environment: dict[str, str]) -> float:
 
 def kill_and_run_again(
     arguments: Sequence[str], environment: dict[str, str], output: Path, alone: Path,
-    moment_s: float,
+    moment_s: float, patience_s: float = 30.0,
 ) -> Killed:
-    """Kill a command with SIGKILL after so many seconds, and run it again to its end.
+    """Kill a command with SIGKILL after ``moment_s``, and run it again to its end.
 
-    Nothing may be broken in between, no process may survive, and in the end ``output`` must hold
-    what ``alone`` does, and nothing else.
+    Nothing may be broken in between, no child may survive by more than ``patience_s``, and in the
+    end ``output`` must hold what ``alone`` does, and nothing else.
     """
     process = subprocess.Popen(arguments, env=environment, stdout=subprocess.DEVNULL,
                                stderr=subprocess.DEVNULL)
@@ -73,7 +73,7 @@ def kill_and_run_again(
     hit = process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
-    _, surviving = psutil.wait_procs(children, timeout=30)
+    _, surviving = psutil.wait_procs(children, timeout=patience_s)
     broken = [f"{one.name()} survives" for one in surviving if one.status() != "zombie"]
     broken += unreadable(output)
     resumed = undisturbed(arguments, environment)
