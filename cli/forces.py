@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute the forces, write the results, print the answer and the largest forces."""
-    from halbach_fe.api import forces
+    from halbach_fe.design.forces import forces
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.assembly_order import read_order
     from halbach_fe.report.forces import force_rows, forces_summary, verdict, write_forces

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from halbach_fe.api import MultipoleTables as MultipoleTables
     from halbach_fe.api import demagnetization as demagnetization
     from halbach_fe.api import diagnose as diagnose
-    from halbach_fe.api import forces as forces
     from halbach_fe.api import homogeneity as homogeneity
     from halbach_fe.api import multipoles as multipoles
     from halbach_fe.api import plan as plan
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from halbach_fe.core.errors import HalbachWarning as HalbachWarning
     from halbach_fe.design.demagnetization import DemagnetizationMap as DemagnetizationMap
     from halbach_fe.design.forces import Forces as Forces
+    from halbach_fe.design.forces import forces as forces
     from halbach_fe.design.measurement_plan import MeasurementPlan as MeasurementPlan
     from halbach_fe.design.shimming import Shim as Shim
     from halbach_fe.design.sorting import SortedBlocks as SortedBlocks
@@ -70,7 +70,7 @@ _HOME = {
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
-    "forces": "api",
+    "forces": "design.forces",
     "plan": "api", "shim": "api",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
     "write_report": "report.result_files",

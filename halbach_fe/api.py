@@ -18,7 +18,6 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
-from halbach_fe.design.forces import Forces, block_forces
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
 from halbach_fe.design.shimming import Kind, Shim
 from halbach_fe.design.shimming import shim as choose_moves
@@ -275,47 +274,6 @@ def homogeneity(
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
         distributions)
-
-
-@alone
-def forces(
-    magnet: Magnet, session: Session, order: Sequence[str] | None = None,
-    density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
-) -> Forces:
-    """Compute forces and torques on every block, in place and as it is inserted.
-
-    Parameters
-    ----------
-    magnet : Magnet
-    session : Session
-        Its folder receives the runs of GetDP, if the magnet has iron.
-    order : sequence of str, optional
-        Names of all blocks in the order in which they are inserted; by default ring by ring, slot
-        by slot.
-    density_kg_per_m3 : float, optional
-        Density of all blocks; by default that of their grade, or 7500 (NdFeB).
-    price_per_kg : float, optional
-        Price of the blocks, from which their total cost follows.
-
-    Returns
-    -------
-    Forces
-
-    Raises
-    ------
-    StudyError
-        If the study is a cross-section, the iron is not coaxial, or ``order`` does not name every
-        block once.
-
-    Examples
-    --------
-    >>> import halbach_fe as hf
-    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
-    >>> found = hf.forces(magnet, hf.Session.open("results"))
-    >>> found.in_place.force_N.shape, bool(found.mass_kg.sum() > 0)
-    ((36, 3), True)
-    """
-    return block_forces(magnet, session, order, density_kg_per_m3, price_per_kg)
 
 
 @alone

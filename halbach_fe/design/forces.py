@@ -35,7 +35,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
 
@@ -149,11 +149,12 @@ class Forces(ShownInNotebook):
         return found
 
 
-def block_forces(
+@alone
+def forces(
     magnet: Magnet, session: Session, order: Sequence[str] | None = None,
     density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
 ) -> Forces:
-    """Compute the forces and torques on every block of a magnet.
+    """Compute forces and torques on every block, in place and as it is inserted.
 
     Parameters
     ----------
@@ -164,14 +165,27 @@ def block_forces(
         Names of all blocks in the order in which they are inserted; by default ring by ring, slot
         by slot.
     density_kg_per_m3 : float, optional
-        Density of all blocks; by default that of their grade, or of NdFeB.
+        Density of all blocks; by default that of their grade, or 7500 (NdFeB).
     price_per_kg : float, optional
+        Price of the blocks, from which their total cost follows.
+
+    Returns
+    -------
+    Forces
 
     Raises
     ------
     StudyError
-        If the study is a cross-section, the iron is not coaxial, or the order is not one of all
-        blocks.
+        If the study is a cross-section, the iron is not coaxial, or ``order`` does not name every
+        block once.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> found = hf.forces(magnet, hf.Session.open("results"))
+    >>> found.in_place.force_N.shape, bool(found.mass_kg.sum() > 0)
+    ((36, 3), True)
     """
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}",

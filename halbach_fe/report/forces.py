@@ -27,6 +27,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import place_of
 from halbach_fe.study.types import COMPONENTS
 
 LISTED = 12
@@ -47,13 +48,13 @@ def verdict(found: Forces) -> list[str]:
         return ["No block feels a force.", _mass(found)]
     block = found.blocks[worst]
     text = [f"The largest force is {_newton(size)} (as heavy as {_heavy(size)}), on "
-            f"{place_in_words(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."]
+            f"{place_of(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."]
     if len(found.blocks) > 1:
         next_one = int(np.argmax(found.inserted.magnitude))
         size, block = found.inserted.magnitude[next_one], found.blocks[next_one]
         text.append(
             f"While the blocks are inserted the largest is {_newton(size)} ({_heavy(size)}), on "
-            f"{place_in_words(block)}, the {_ordinal(int(found.step[next_one]))} of "
+            f"{place_of(block)}, the {_ordinal(int(found.step[next_one]))} of "
             f"{len(found.blocks)}, "
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
     return [*text, _mass(found)]
@@ -84,11 +85,6 @@ def _ordinal(number: int) -> str:
     return f"{number}{ending}"
 
 
-def place_in_words(block: MagnetBlock) -> str:
-    """Return the place of a block: its name if it is a free block, else ring and slot."""
-    return f"block {block.label}" if block.label else f"ring {block.ring}, slot {block.slot}"
-
-
 def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
     """Return the direction of a vector (3,) seen from the magnet's axis, and its unit vector."""
     unit = vector / np.linalg.norm(vector)
@@ -113,7 +109,8 @@ def force_rows(found: Forces) -> list[dict[str, str]]:
     for number in np.argsort(-found.in_place.magnitude, kind="stable")[:LISTED]:
         block, size = found.blocks[number], found.in_place.magnitude[number]
         rows.append({
-            "block": block.name, "force": f"{size:.3g} ± {found.in_place.error_N[number]:.1g} N",
+            "block": place_of(block),
+            "force": f"{size:.3g} ± {found.in_place.error_N[number]:.1g} N",
             "direction": (direction_in_words(block, found.in_place.force_N[number])
                           if size > NEGLIGIBLE else "none"),
             "torque": f"{np.linalg.norm(found.in_place.torque_Nm[number]):.3g} Nm",
@@ -196,7 +193,8 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
         arrows = 0.35 * float(np.abs(middles).max() or 1.0) * flat / longest
         axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=PRIOR,
                     width=0.005, edgecolor=MEASURED, lw=0.3)
-    axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N", shrink=0.8)
+    axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N",
+                         location="bottom", shrink=0.6)
     reach = 1.3 * float(np.abs(np.vstack(corners)).max())
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", xlim=(-reach, reach),
              ylim=(-reach, reach), title=f"ring {ring}")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.summary import block_in_words
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
-from halbach_fe.report.words import flux_density, fraction
+from halbach_fe.report.words import flux_density, fraction, place_of
 
 
 def answer(result: InferenceResult) -> list[str]:
@@ -23,8 +22,8 @@ def _prediction(result: InferenceResult) -> str:
     before, after = (_rms((result.readings - each.mean)[chosen])
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
-        return (f"The updated magnet differs from the readings by {flux_density(after)} rms, the "
-                f"magnet as ordered by {flux_density(before)}. No reading was held out, so that "
+        return (f"The updated magnet differs from the readings by {flux_density(after)} rms, "
+                f"{_before(result)} by {flux_density(before)}. No reading was held out, so that "
                 "this is no test: hold some out by [inference.held_out] or --held-out.")
     expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
     bands = [(score.readings, score.coverage95_posterior) for score in result.scores
@@ -34,8 +33,14 @@ def _prediction(result: InferenceResult) -> str:
           else "readings that were held out")
     return (f"The updated magnet predicts {chosen.sum()} {of} to "
             f"{flux_density(after)} rms, where its error bars and the noise allow "
-            f"{flux_density(_rms(expected))}; the magnet as ordered is {flux_density(before)} off. "
+            f"{flux_density(_rms(expected))}; {_before(result)} is {flux_density(before)} off. "
             f"The 95 % band holds {fraction(held)} of them.")
+
+
+def _before(result: InferenceResult) -> str:
+    """Say which magnet the update starts from."""
+    return ("the magnet as ordered" if result.measured_blocks is None
+            else "the magnet of the measured blocks")
 
 
 def _blocks(result: InferenceResult) -> str:
@@ -51,7 +56,7 @@ def _blocks(result: InferenceResult) -> str:
     result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
     return (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
-            f"rms, the most {block_in_words(block.ring, block.slot, block.label or '')} by "
+            f"rms, the most {place_of(block)} by "
             f"{100 * mean[worst]:+.1f}\u00a0±\u00a0{100 * sd:.1f}\u00a0%.")
 
 
@@ -59,8 +64,10 @@ def _next(result: InferenceResult) -> str:
     """Say what to do next."""
     if result.disagreement:
         return "Run halbach-fe diagnose with the same files: it looks for what the study lacks."
+    homogeneity = ("" if result.magnet.dimension == 2
+                   else " halbach-fe homogeneity its homogeneity,")
     return ("Model and readings agree. halbach-fe multipoles --posterior posterior.h5 gives the "
-            "multipoles of the updated magnet, halbach-fe homogeneity its homogeneity, and "
+            f"multipoles of the updated magnet,{homogeneity} and "
             "halbach-fe shim the blocks to swap or turn.")
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
-from halbach_fe.design.forces import Charges, block_forces
+from halbach_fe.design.forces import Charges, forces
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.result_files import write_report
 from halbach_fe.solver.session import Session
@@ -41,7 +41,7 @@ def free_blocks(rows, **columns):
 
 
 def found_of(document, tmp_path, **options):
-    return block_forces(build_magnet(parse_study(document)), Session.open(tmp_path), **options)
+    return forces(build_magnet(parse_study(document)), Session.open(tmp_path), **options)
 
 
 def magpylib_cubes(places, remanences, turns=None):
@@ -333,4 +333,4 @@ def test_page(tmp_path):
         key: value for key, value in cuboids.DOCUMENT["array"].items()
         if key not in ("rings", "ring_length_m")}})
     with pytest.raises(StudyError, match="3, for the forces"):
-        block_forces(build_magnet(flat), Session.open(tmp_path))
+        forces(build_magnet(flat), Session.open(tmp_path))

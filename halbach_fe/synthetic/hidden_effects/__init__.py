@@ -97,26 +97,8 @@ def choose_effects(
     return tuple(hidden)
 
 
-LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.0, "1/T^2": 10.0,
-           "A/m": 1e8, "m^3": 1.0}
-"""Largest absolute value of a parameter by its unit: what is beyond was meant in another unit."""
-
 NEAREST_M = 1e-3
 """Smallest distance of a neighbouring magnet."""
-
-RANGES = {
-    "length.fraction": (-0.5, 0.5), "z_scale.fraction": (-0.5, 1.0),
-    "radius_scale.fraction": (-0.5, 1.0), "gain_x.fraction": (-0.9, 10.0),
-    "gain_y.fraction": (-0.9, 10.0), "gain_z.fraction": (-0.9, 10.0),
-    "block_demagnetized.fraction": (0.0, 1.0), "corners_demagnetized.fraction": (0.0, 1.0),
-    "magnetization_gradient.fraction": (-1.0, 1.0), "outliers.fraction": (0.0, 1.0),
-    "vibration.distance": (0.0, 0.1), "neighbour_magnet.distance": (-100.0, 100.0),
-    "ferromagnetic_object.volume": (1e-12, 1.0), "iron_ring.inner_radius": (1e-4, 100.0),
-    "iron_ring.outer_radius": (1e-4, 100.0), "iron_ring.relative_permeability": (1.0, 1e6),
-    "iron_ring.saturation_polarization": (0.0, 3.0), "knee.coercivity": (1.0, 1e8),
-    "knee.squareness": (0.01, 1.0), "recoil_permeability.change": (-0.5, 10.0),
-    "recoil_permeability_across.change": (-0.5, 10.0)}
-"""Smallest and largest value of parameters that have no unit, or cannot have any sign."""
 
 
 def _check_size(site: Site, hidden: ChosenEffect) -> None:
@@ -128,8 +110,7 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
     values = {}
     for parameter, value in zip(hidden.effect.parameters, hidden.values, strict=True):
         unit = f" {parameter.unit}" if parameter.unit else ""
-        most = LARGEST.get(parameter.unit, 1e3)
-        low, high = RANGES.get(f"{hidden.effect.name}.{parameter.name}", (-most, most))
+        low, high = parameter.limits
         if not low <= value <= high:
             refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value)
         values[parameter.name] = value

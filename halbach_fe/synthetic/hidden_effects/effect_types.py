@@ -120,12 +120,37 @@ def site_of(study: Study, magnet: TrueMagnet) -> Site:
         array.is_uniform, all(body.shape.has_four_edges for body in magnet.bodies))
 
 
+LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.0, "1/T^2": 10.0,
+           "A/m": 1e8, "m^3": 1.0}
+"""Largest absolute value of a parameter by its unit: what is beyond was meant in another unit."""
+
+NO_UNIT_LARGEST = 1e3
+"""The same of a count, a fraction or a factor."""
+
+
 @dataclass(frozen=True)
 class HiddenParameter:
-    """A parameter of an effect; without a unit it is a count, a fraction or a factor."""
+    """A parameter of an effect; without a unit it is a count, a fraction or a factor.
+
+    Attributes
+    ----------
+    name, unit : str
+    least, most : float, optional
+        Smallest and largest value that a magnet or an instrument can have; by default those of the
+        unit, of either sign.
+    """
 
     name: str
     unit: str = ""
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest value."""
+        largest = LARGEST.get(self.unit, NO_UNIT_LARGEST)
+        return (-largest if self.least is None else self.least,
+                largest if self.most is None else self.most)
 
 
 Draw = Callable[[Site, np.random.Generator], tuple[float, ...]]

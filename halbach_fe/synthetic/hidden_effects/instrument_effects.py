@@ -41,7 +41,8 @@ def _gain(sensor: int, name: Component) -> HiddenEffect:
     def apply(instrument: FaultyInstrument, site: Site, fraction: float) -> FaultyInstrument:
         return replace(instrument, gain=_with(instrument.gain, sensor, fraction))
 
-    return HiddenEffect(f"gain_{name}", "instrument", (HiddenParameter("fraction"),),
+    return HiddenEffect(f"gain_{name}", "instrument",
+                        (HiddenParameter("fraction", least=-0.9, most=10.0),),
                         draw_number(5e-4, 1e-2), instrument=apply, needs=(name,))
 
 
@@ -174,6 +175,7 @@ def _effects() -> Iterator[HiddenEffect]:
             if sensor != other:
                 yield _misalignment(sensor, other)
     angle = (HiddenParameter("angle", "rad"),)
+    stretch = (HiddenParameter("fraction", least=-0.5, most=1.0),)
     yield HiddenEffect("planar_hall", "instrument", (HiddenParameter("value", "1/T"),),
                        draw_number(1e-3, 1e-2), instrument=planar_hall, needs=("3d",))
     yield HiddenEffect("quadratic_nonlinearity", "instrument", (HiddenParameter("value", "1/T"),),
@@ -188,9 +190,9 @@ def _effects() -> Iterator[HiddenEffect]:
     for name, tilt in (("x", mapper_tilt_x), ("y", mapper_tilt_y)):
         yield HiddenEffect(f"mapper_tilt_{name}", "instrument", angle, draw_number(5e-4, 5e-3),
                            instrument=tilt, needs=("3d",))
-    yield HiddenEffect("z_scale", "instrument", (HiddenParameter("fraction"),),
+    yield HiddenEffect("z_scale", "instrument", stretch,
                        draw_number(2e-4, 3e-3), instrument=z_scale, needs=("3d",))
-    yield HiddenEffect("radius_scale", "instrument", (HiddenParameter("fraction"),),
+    yield HiddenEffect("radius_scale", "instrument", stretch,
                        draw_number(1e-3, 1e-2), instrument=radius_scale, needs=("circles",))
     yield HiddenEffect("arm_sag", "instrument", (HiddenParameter("distance", "m"),),
                        draw_length(3e-4, 3e-3, False), instrument=arm_sag, needs=("3d",))
@@ -201,10 +203,11 @@ def _effects() -> Iterator[HiddenEffect]:
                        instrument=eccentric_circle, needs=("circles",))
     yield HiddenEffect("drift", "instrument", (HiddenParameter("value", "T"),),
                        draw_number(1e-4, 1e-3), instrument=drift)
-    yield HiddenEffect("vibration", "instrument", (HiddenParameter("distance", "m"),),
+    yield HiddenEffect("vibration", "instrument", (HiddenParameter("distance", "m", 0.0, 0.1),),
                        draw_length(5e-5, 5e-4, False), instrument=vibration)
     yield HiddenEffect("outliers", "instrument",
-                       (HiddenParameter("fraction"), HiddenParameter("value", "T")),
+                       (HiddenParameter("fraction", least=0.0, most=1.0),
+                        HiddenParameter("value", "T")),
                        lambda site, generator: (log_uniform(generator, 3e-3, 2e-2),
                                                 log_uniform(generator, 1e-3, 1e-2)),
                        instrument=outliers)
