@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
@@ -426,7 +427,7 @@ def possible(study: Study, identified: Sequence[IdentifiedEffect], campaign: Cam
     try:
         changed = apply_effects(study, identified)
         inside = build_magnet(changed).contains(campaign.points_of(changed))
-    except HalbachError:
+    except (HalbachError, ValidationError):  # an amplitude beyond its key's limits is the latter
         return False
     return not inside.any()
 

@@ -78,12 +78,15 @@ def test_impossible_amplitudes_are_no_explanation(session, generator, name):
     assert diagnose(tight, wider, session, effects=[gap]).identified == ()
 
 
-def test_no_recoil_permeability_is_below_one():
-    effect = next(one for one in catalogue() if one.name == "recoil_permeability_across")
+@pytest.mark.parametrize("name", ["recoil_permeability_across", "corners_demagnetized"])
+def test_limits_of_keys_are_limits_of_amplitudes(name):
+    """No recoil permeability is below one, and no corner has more than its magnetization."""
+    effect = next(one for one in catalogue() if one.name == name)
+    study = with_array(recoil_permeability=1.05)
     for value, there in ((0.1, True), (-0.1, False)):
         named = IdentifiedEffect(Hypothesis(effect, Place()), np.array([value]), np.array([0.01]),
-                      SelectedEffect(Candidate(effect.name, "", (0,)), 9.0, 5.0, ()))
-        assert possible(with_array(recoil_permeability=1.05), [named],
+                                 SelectedEffect(Candidate(name, "", (0,)), 9.0, 5.0, ()))
+        assert possible(study, [named],
                         Campaign.of(STUDY, field_map(CIRCLES, 0 * CIRCLES))) == there
 
 
