@@ -12,6 +12,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
@@ -116,14 +117,17 @@ def infer(
     noises: Noises = {}
     solved: _Solved | None = None
     at = _Estimate.of(magnet, session) if len(open_terms) else None
-    for _ in range(ROUNDS):
-        readings = read_campaign(magnet, maps, noises)
+    uncertain = any(one.study.noise is not None and one.study.noise.position_sd_m is not None
+                    for one in maps)
+    estimated: tuple[MagnetBlock, ...] | None = None
+    for _ in range(ROUNDS + uncertain):
+        readings = read_campaign(magnet, maps, noises, estimated)
         if solved is None:
             check_validation_map(readings, magnet.study)
         training = readings.training
         here = None if at is None else open_terms.linearized(at.field, maps, readings)
-        if (solved is None or here is None or solved.here is None
-                or not here.is_near(solved.here, readings)):
+        if solved is None or (here is not None and (
+                solved.here is None or not here.is_near(solved.here, readings))):
             solved = _Solved(
                 _response(magnet, readings.observation, session), maps, here,
                 np.zeros(0) if at is None else readings_of_field(at.nominal, maps, readings))
@@ -152,8 +156,11 @@ def infer(
         if at is not None:
             maps = open_terms.applied(maps, change)
             at = replace(at, deviations=values - model.nominal)
-        if at_rest:
+        if at_rest and not uncertain:
             break
+        if at_rest:  # once more, with the noise that positions make in this magnet's gradient
+            uncertain, noises = False, {}
+            estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
         warnings.warn(
             f"The terms of the instruments of study {magnet.name} have not come to rest after "

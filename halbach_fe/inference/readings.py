@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import Map
@@ -66,7 +67,10 @@ class Readings:
         return np.array(self.parts) == TRAINING
 
 
-def read_campaign(magnet: Magnet, maps: Sequence[Map], known: Noises | None = None) -> Readings:
+def read_campaign(
+    magnet: Magnet, maps: Sequence[Map], known: Noises | None = None,
+    estimated: Sequence[MagnetBlock] | None = None,
+) -> Readings:
     """Return the readings of all maps, by the instrument of each.
 
     Parameters
@@ -76,6 +80,9 @@ def read_campaign(magnet: Magnet, maps: Sequence[Map], known: Noises | None = No
     known : dict, optional
         Noise of the same maps with little other poses, which is not computed again; what is
         computed is added.
+    estimated : sequence of MagnetBlock, optional
+        Blocks with the magnetizations as they are estimated, in whose gradient uncertain positions
+        make noise; by default the nominal ones.
 
     Raises
     ------
@@ -86,7 +93,8 @@ def read_campaign(magnet: Magnet, maps: Sequence[Map], known: Noises | None = No
     """
     several = sum(not one.is_validation for one in maps) > 1
     noises = {} if known is None else known
-    found = [_read(magnet, one, several, noises) for one in maps]
+    blocks = magnet.blocks if estimated is None else estimated
+    found = [_read(magnet, one, several, noises, blocks) for one in maps]
     if magnet.dimension == 2:
         heights = np.concatenate([each.observation.points[:, 2] for each in found])
         _check_plane(heights, "map")
@@ -134,7 +142,9 @@ def check_validation_map(readings: Readings, study: Study) -> None:
             "predictions are no test.", HalbachWarning, stacklevel=2)
 
 
-def _read(magnet: Magnet, one: Map, several: bool, noises: Noises) -> Readings:
+def _read(
+    magnet: Magnet, one: Map, several: bool, noises: Noises, blocks: Sequence[MagnetBlock]
+) -> Readings:
     """Return the readings of a map; ``several`` puts its name into error messages and regions."""
     study, where = one.study, one.name if one.is_validation or not several else f"map {one.name}"
     magnet = magnet.with_study(study)
@@ -175,7 +185,8 @@ def _read(magnet: Magnet, one: Map, several: bool, noises: Noises) -> Readings:
     values = observation.read(np.nan_to_num(remove_nonlinear_part(study.instrument, data)))
     points = noises[one.name][0] if one.name in noises else np.inf
     if np.abs(observation.points - points).max() > MOVED_M:
-        noises[one.name] = observation.points, reading_noise(magnet, observation, data)
+        noises[one.name] = observation.points, reading_noise(
+            replace(magnet, blocks=tuple(blocks)), observation, data)
     return Readings(observation, values, noises[one.name][1], parts, regions,
                     (one.name,) * len(observation))
 

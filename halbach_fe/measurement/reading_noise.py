@@ -99,14 +99,16 @@ def readings_per_displacement(
 ) -> sparse.csr_array:
     """Return the changes of the readings if each of n points is displaced along each axis.
 
-    The field gradient is that of the nominal blocks in vacuum. The reaction field of recoil
+    The field gradient is that of the magnet's blocks in vacuum. The reaction field of recoil
     permeability and iron, some per cent of the field in the bore, is neglected: the result only
-    sets the size of the noise.
+    sets the size of the noise. Deviations of the blocks have a gradient of their own, which is
+    the larger part where that of the nominal field is small, near the blocks of a dipole: an
+    update therefore estimates the noise again with the blocks as they are updated.
 
     Parameters
     ----------
     magnet : Magnet
-        With the instrument of the map in its study.
+        With the instrument of the map in its study, and nominal or estimated blocks.
     analysis : sparse array, shape (readings, 3 n)
         Maps the values of a field map to the readings, see `Observation`.
     points : ndarray, shape (n, 3), in m

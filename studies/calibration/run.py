@@ -19,7 +19,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.calibration import write_calibration
+from halbach_fe.response.deviation_field import with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
 from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field
@@ -53,9 +54,9 @@ DRAWS, THIN, WARM_UP = 19, 4, 24
 PCN_STEP, PCN_STEPS = 1 / 80, 300  # each repeat; the paper's one chain had 18 000
 
 RADIUS_M = 0.08
-"""Radius of the circle of readings. The stated position noise is that of the nominal gradient. The
-deviations of the blocks have a gradient of their own, so that the true noise is larger, here by a
-tenth. On the study's own circle, of 75 mm, the nominal gradient is 2.5 times smaller."""
+"""Radius of the circle of readings. The deviations of the blocks have a gradient of their own,
+which makes a tenth of the noise of positions here: the noise is estimated in the gradient of the
+updated magnet."""
 
 SIGMA_T, POSITION_SD_M = 5e-5, 3e-4
 """Standard deviations of a reading, and of the probe's position along each axis. The latter makes
@@ -159,21 +160,48 @@ def stated_noise(magnet: Magnet, observation: Observation) -> NoiseCovariance:
     return reading_noise(stated, observation, xr.Dataset())
 
 
-def linear_sampler(response: Response, noise: NoiseCovariance, prior: Gaussian) -> Sampler:
-    """Return draws of the linear posterior, in closed form."""
-    matrix = response.whole
+Noise = Callable[[Floats], NoiseCovariance]
+"""Noise of the readings, with the error of the model, if blocks have magnetizations (parameters,)
+in A/m; nominal ones if there are none."""
+
+
+def noise_of_positions(magnet: Magnet, observation: Observation, error: Floats) -> Noise:
+    """Return the noise that `halbach-fe infer` states, in the gradient of an estimated magnet."""
+    def noise(magnetizations: Floats) -> NoiseCovariance:
+        blocks = (with_magnetizations(magnet, magnetizations) if len(magnetizations)
+                  else magnet.blocks)
+        return stated_noise(replace(magnet, blocks=blocks),
+                            observation).with_independent_errors(error)
+
+    return noise
+
+
+def always(noise: NoiseCovariance) -> Noise:
+    """Return a noise that does not depend on the magnet."""
+    return lambda magnetizations: noise
+
+
+def linear_sampler(response: Response, noise: Noise, prior: Gaussian) -> Sampler:
+    """Return draws of the linear posterior, in closed form, as `halbach-fe infer` finds it."""
+    matrix, nominal = response.whole, noise(np.zeros(0))
 
     def draw(readings: Floats, generator: np.random.Generator) -> Floats:
-        return linear_gaussian.posterior(
-            matrix, readings - response.offset, noise, prior).sample(DRAWS, generator)
+        residual = readings - response.offset
+        mean = linear_gaussian.posterior(matrix, residual, nominal, prior).mean
+        return linear_gaussian.posterior(matrix, residual, noise(mean), prior).sample(
+            DRAWS, generator)
 
     return draw
 
 
-def chain_sampler(model: NonlinearModel, noise: NoiseCovariance, prior: Gaussian) -> Sampler:
+def chain_sampler(model: NonlinearModel, noise: Noise, prior: Gaussian) -> Sampler:
     """Return draws of the non-linear posterior, by the Markov chains of `halbach-fe infer`."""
+    nominal = noise(np.zeros(0))
+
     def draw(readings: Floats, generator: np.random.Generator) -> Floats:
-        posterior = Posterior(lambda p: model(p, TOLERANCE_T), readings, noise, prior)
+        posterior = Posterior(lambda p: model(p, TOLERANCE_T), readings, nominal, prior)
+        _, mode = laplace(posterior, model.jacobian)
+        posterior = replace(posterior, noise=noise(mode))
         reference, _ = laplace(posterior, model.jacobian)
         moves = [Proposal(reference, step) for step in LAPLACE_STEPS] + [
             Proposal(prior_reference(prior), PRIOR_STEP)]
@@ -233,10 +261,11 @@ def linear_cases(
         observation = observation_of(study)
         response = response_matrix(magnet, observation, session.within(f"linear-{size:g}"))
         stated = stated_noise(magnet, observation)
-        noise = independent_noise(np.full(len(observation), SIGMA_T)) if (
-            left_out == "positions") else stated
-        if left_out != "error":
-            noise = noise.with_independent_errors(response.error)
+        error = response.error * (left_out != "error")
+        noise = noise_of_positions(magnet, observation, error)
+        if left_out == "positions":
+            own = independent_noise(np.full(len(observation), SIGMA_T))
+            noise = always(own.with_independent_errors(error))
         cases[name] = Case(
             simulator(truth, observation), linear_sampler(response, noise, prior),
             repeats, not left_out, error_over_noise(response.error, stated))
@@ -254,14 +283,16 @@ def sampled_cases(
     observation = observation_of(study)
     model = nonlinear_model(build_magnet(study), observation, session.within("model"), generator)
     truth = fine_truth(study, session.within("truth"), generator)
-    stated = stated_noise(build_magnet(study), observation)
-    noise = stated.with_independent_errors(model.error)
+    magnet = build_magnet(study)
+    stated = stated_noise(magnet, observation)
+    noise = noise_of_positions(magnet, observation, model.error)
     simulate, ratio = simulator(truth, observation), error_over_noise(model.error, stated)
     return {
         "non-linear, chains": Case(simulate, chain_sampler(model, noise, prior), repeats, True,
                                    ratio),
         "control: the paper's chain, too short": Case(
-            simulate, short_sampler(model, noise, prior), max(40, repeats // 10), False, ratio)}
+            simulate, short_sampler(model, noise(np.zeros(0)), prior),
+            max(40, repeats // 10), False, ratio)}
 
 
 def observation_of(study: Study) -> Observation:
