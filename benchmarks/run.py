@@ -16,6 +16,7 @@ from pathlib import Path
 
 from benchmarks import (
     calibration,
+    campaign_kinds,
     diagnosis,
     inference,
     iron3d,
@@ -36,9 +37,10 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
          "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
-         "real": real.emphatic, "real_mri": real.mri, "faser": real.faser}
-ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion", "real",
-         "real_mri", "faser")
+         "campaign_kinds": campaign_kinds.run, "real": real.emphatic, "real_mri": real.mri,
+         "faser": real.faser}
+ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
+         "campaign_kinds", "real", "real_mri", "faser")
 """Parts that are measured only when they are named: they take long."""
 
 

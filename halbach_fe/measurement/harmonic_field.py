@@ -46,12 +46,10 @@ class Charges:
     def around(cls, points: Floats, gap: float) -> Charges:
         """Place charges on a box that is ``gap`` in m larger than points (n, 3) in m on all sides.
 
-        Their distance from each other is `CLOSENESS` of it, or larger if there were too many.
+        See `spacing_of` for their distance from each other.
         """
         low, high = points.min(axis=0) - gap, points.max(axis=0) + gap
-        sides = high - low
-        area = 2 * float(np.sum(sides * np.roll(sides, 1)))
-        step = max(CLOSENESS * gap, np.sqrt(area / MOST_CHARGES))
+        sides, step = high - low, spacing_of(points, gap)
         found = []
         for axis in range(3):
             first, second = (other for other in range(3) if other != axis)
@@ -111,6 +109,16 @@ class Charges:
             result[part] = np.sum(weights, axis=1)[:, None, None] * np.eye(3) - 3 * np.matmul(
                 (away * (weights / square)[..., None]).transpose(0, 2, 1), away)
         return result
+
+
+def spacing_of(points: Floats, gap: float) -> float:
+    """Return the distance in m from each other of charges at a distance in m around points (n, 3).
+
+    It is `CLOSENESS` of that distance, or larger if there were too many.
+    """
+    sides = np.ptp(points, axis=0) + 2 * gap
+    area = 2 * float(np.sum(sides * np.roll(sides, 1)))
+    return float(max(CLOSENESS * gap, np.sqrt(area / MOST_CHARGES)))
 
 
 def _parts(points: int, charges: int) -> list[slice]:

@@ -96,8 +96,16 @@ class ProbeFit:
         return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
 
 
+LEAST_ERROR = 0.03
+"""Smallest standard deviation by which a reading is weighted, relative to the rms residual: the
+flattest readings of a small map may be fitted by chance."""
+
+
 class ProbeModel:
-    """Readings of a three-axis probe in a harmonic field."""
+    """Readings of a three-axis probe in a harmonic field.
+
+    ``weights`` (n, 3) multiply the residuals; they are 1 until `weighted`.
+    """
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
                  directions: Floats) -> None:
@@ -107,12 +115,27 @@ class ProbeModel:
         sd = np.array(PRIOR_SD)
         sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
         self.prior_sd = sd
+        self.weights = np.ones_like(field)
 
     def without(self, group: slice) -> ProbeModel:
         """Return a model whose instrument has none of a group of parameters."""
         other = copy(self)
         other.prior_sd = self.prior_sd.copy()
         other.prior_sd[group] = 0.0
+        return other
+
+    def weighted(self, at: ProbeFit, rows: NDArray[np.bool_]) -> ProbeModel:
+        """Return a model that weights readings by their expected residuals, see `expected`.
+
+        Near edges of magnets charges follow the field less well than the probe reads it. There are
+        few such readings, but without weights they are what decides on the instrument: it is given
+        errors of many standard deviations that it does not have.
+        """
+        other, expected = copy(self), self.expected(at, rows)
+        rms = float(np.sqrt(np.mean((self.field - self.readings(at))[rows]**2)))
+        if rms:
+            expected = np.maximum(expected, LEAST_ERROR * rms)
+            other.weights = 1 / (expected * np.sqrt(np.mean(expected[rows]**-2)))
         return other
 
     def allowed(self, at: ProbeFit) -> ProbeFit:
@@ -133,8 +156,12 @@ class ProbeModel:
     def fit(self, at: ProbeFit, rows: NDArray[np.bool_]) -> HarmonicFit:
         """Return the fit of the field alone, read by an instrument that is known."""
         design = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        readings = self.field[rows] - self.offsets(at, rows)
-        return fit_readings(design, [readings.ravel()])[0]
+        return fit_readings(design, [self.target(at, rows)])[0]
+
+    def target(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
+        """Return the weighted readings (3 n,) in T without the change of the sensors' offsets."""
+        return np.asarray(((self.field[rows] - self.offsets(at, rows))
+                           * self.weights[rows]).ravel())
 
     def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the change (n, 3) in T of the sensors' offsets."""
@@ -151,15 +178,16 @@ class ProbeModel:
                 reads)
 
     def by_amplitude(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the readings (n, 3, k) per amplitude."""
+        """Return the weighted readings (n, 3, k) per amplitude."""
         found = np.empty((int(rows.sum()), 3, len(self.charges)))
         for sensor in range(3):
             places, reads = self._sensor(at, rows, sensor)
-            found[:, sensor] = self.charges.fields_along(places, reads)
+            found[:, sensor] = self.charges.fields_along(
+                places, self.weights[rows, sensor, None] * reads)
         return found
 
     def by_parameter(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the derivatives (n, 3, p) in T of the readings by the parameters / `PRIOR_SD`."""
+        """Return the weighted derivatives (n, 3, p) in T by the parameters / `PRIOR_SD`."""
         found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
         for sensor in range(3):
             places, reads = self._sensor(at, rows, sensor)
@@ -179,7 +207,7 @@ class ProbeModel:
             found[:, sensor, GAINS] = self.waves[rows] * field[:, sensor, None]
             if at.lag:
                 found[:, sensor, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
-        return found * self.prior_sd
+        return found * self.prior_sd * self.weights[rows, :, None]
 
     def readings(self, at: ProbeFit, rows: NDArray[np.bool_] | None = None) -> Floats:
         """Return what the instrument reads (n, 3) in T at some rows, by default at all."""
@@ -277,7 +305,7 @@ class _State:
     def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> _State:
         """Fit the field for the instrument and the noise of ``at``."""
         by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
-        target = (model.field[rows] - model.offsets(at, rows)).ravel()
+        target = model.target(at, rows)
         return cls._solved(model, rows, width2, at, target, by_amplitude,
                            by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
 

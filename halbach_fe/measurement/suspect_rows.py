@@ -20,6 +20,11 @@ ROUGH = 1.8
 """Multiple of the largest residual around a row that is far off a function through its neighbours.
 A single spike is 2 to 4 times as far off its own as off theirs."""
 
+OF_RANGE = 0.2
+"""Smallest residual of such a row, relative to the range of its neighbours' field. At the corner of
+a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it. Smaller
+spikes are left to the fit of a field without sources."""
+
 ROUGH_ROUNDS = 10
 """Number of times that spikes are looked for among the rows that are left."""
 
@@ -58,7 +63,8 @@ def rough_rows(
                 "nk,nkc->nc", weights, field[rows[near[part]]])
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
-        worst[rows] &= size > ROUGH * size[near].max(axis=1)
+        around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
+        worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > OF_RANGE * around)
         if not worst.any():
             break
         found |= worst
@@ -68,12 +74,17 @@ def rough_rows(
 def spikes(
     points: Floats, residual: Floats, usable: NDArray[np.bool_], over_neighbours: float = SPIKE
 ) -> NDArray[np.bool_]:
-    """Return the usable rows whose residual (n, 3) is far larger than all, and those around."""
+    """Return the usable rows whose residual (n, 3) is far larger than all, and those around.
+
+    What is nearly as large at three neighbours is no spike, but a field that was not fitted.
+    """
     rows = np.flatnonzero(usable)
     size = np.abs(residual[rows])
     near = neighbours(points[rows])
-    least = 1.4826 * np.maximum(over_neighbours * np.median(size[near], axis=1),
-                                SPIKE * np.median(size, axis=0))
+    around = np.sort(size[near], axis=1)
+    least = np.maximum(1.4826 * np.maximum(over_neighbours * np.median(around, axis=1),
+                                           SPIKE * np.median(size, axis=0)),
+                       ROUGH * around[:, -min(3, around.shape[1])])
     found = np.zeros(len(points), bool)
     found[rows] = (size > least).any(axis=1)
     return found

@@ -26,10 +26,10 @@ from halbach_fe.measurement.field_map import field_map, points_of, readings_sha2
 from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
 from halbach_fe.report.diagnosis import verdict
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
-from tests.inference.test_campaign import BODY, FRINGE, NOISE_T, campaign_study
 from tests.inference.test_campaign import two_maps as displaced_maps
-from tests.inference.test_registration import TEXT, session, truth
+from tests.support.short_dipole import BODY, FRINGE, NOISE_T, TEXT, campaign_study, truth
 
 POSES = {"body": (Rotation.from_rotvec([0.0, 0.0, 0.006]), np.array([3e-4, -2e-4, 5e-4])),
          "fringe": (Rotation.from_rotvec([np.pi, 0.0, 0.0]), np.array([-4e-4, 3e-4, 0.0503]))}
@@ -103,7 +103,8 @@ def test_a_weak_block_is_named_once_and_explains_both_maps(generator, tmp_path):
     magnet_of = truth(generator)
     weak = next(one for one in magnet_of.sources if one.position[2] > 0)  # ring 2, slot 1
     weak.polarization = np.array(weak.polarization) * (1 - WEAK)
-    found = diagnose(study_of(), two_maps(generator, magnet_of), session(tmp_path), effects=SOME)
+    found = diagnose(study_of(), two_maps(generator, magnet_of), Session.open(tmp_path),
+                     effects=SOME)
     assert named(found) == [("block_demagnetized", "r02s01")]
     (loss,), (sd,) = found.identified[0].values, found.identified[0].sd
     assert loss == pytest.approx(WEAK, abs=4 * np.hypot(sd, 0.01))  # 1 % is the block's own error
@@ -119,7 +120,7 @@ def test_a_weak_block_is_named_once_and_explains_both_maps(generator, tmp_path):
 @pytest.mark.parametrize("rolled", ["body", "fringe"])
 def test_a_stage_that_is_rolled_is_named_with_its_map(generator, tmp_path, rolled):
     maps = two_maps(generator, truth(generator), rolled)
-    found = diagnose(study_of(), maps, session(tmp_path), effects=SOME)
+    found = diagnose(study_of(), maps, Session.open(tmp_path), effects=SOME)
     assert named(found) == [("mapper_roll", f"map {rolled}")]
     assert found.identified[0].values == pytest.approx([ROLLED_RAD],
                                                        abs=4 * found.identified[0].sd[0])
@@ -134,7 +135,7 @@ def test_a_stage_that_is_rolled_is_named_with_its_map(generator, tmp_path, rolle
     rival = Candidate("misalignment_xy", f"map {rolled}", ())
     doubtful = replace(found, identified=(replace(roll, selection=replace(
         roll.selection, alternatives=((rival, 0.0),))),))
-    (pair,) = separations(doubtful, maps, session(tmp_path), SOME)
+    (pair,) = separations(doubtful, maps, Session.open(tmp_path), SOME)
     assert pair.rival.place.maps == (rolled,)
     assert pair.candidates[0].title == f"map {rolled} again, with the probe turned by 180° about z"
     assert {one.scan.map for one in pair.candidates if one.scan.mapped} == {rolled}
@@ -143,7 +144,7 @@ def test_a_stage_that_is_rolled_is_named_with_its_map(generator, tmp_path, rolle
 
 
 def test_nothing_is_named_of_maps_without_errors(generator, tmp_path):
-    found = diagnose(study_of(), two_maps(generator, truth(generator)), session(tmp_path),
+    found = diagnose(study_of(), two_maps(generator, truth(generator)), Session.open(tmp_path),
                      effects=SOME)
     assert not found.found_anything
     assert found.unknown is None
@@ -157,14 +158,14 @@ def test_poses_that_are_open_hide_no_effect_and_take_none(generator, tmp_path):
     weak.polarization = np.array(weak.polarization) * (1 - WEAK)
     maps = displaced_maps(generator, magnet_of)
     maps["fringe"] = with_offset(maps["fringe"], [4e-4, 0.0, 0.0])
-    found = diagnose(campaign_study(), maps, session(tmp_path), effects=SOME)
+    found = diagnose(campaign_study(), maps, Session.open(tmp_path), effects=SOME)
     assert sorted(named(found)) == [("block_demagnetized", "r02s01"), ("offset_x", "map fringe")]
     assert found.after.prior_conflict < found.after.conflict_limit
     # what is written states the poses as they were known, lest the readings count twice
     assert found.study.maps[0] == found.corrected_study.maps[0]
     assert found.study.of_map(1).instrument.translation_m == (0.0, 0.0, 0.05)
     assert found.after.study.of_map(1).instrument.translation_m[2] != 0.05
-    assert separations(found, maps, session(tmp_path), SOME) == []
+    assert separations(found, maps, Session.open(tmp_path), SOME) == []
 
 
 def test_what_nobody_listed_is_unknown_and_named_with_its_map(generator, tmp_path):
@@ -174,7 +175,7 @@ def test_what_nobody_listed_is_unknown_and_named_with_its_map(generator, tmp_pat
         return field + (5e-4 * wave[:, None] * [0.0, 0.0, 1.0] if name == "fringe" else 0.0)
 
     found = diagnose(study_of(), two_maps(generator, truth(generator), read=read),
-                     session(tmp_path), effects=SOME)
+                     Session.open(tmp_path), effects=SOME)
     assert named(found) == []
     assert found.unknown is not None
     assert found.unknown.kind == "instrument"

@@ -18,20 +18,15 @@ from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.campaign import maps_of, read_maps
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import write_map
 from halbach_fe.measurement.observation import concatenate, observe
 from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
-from tests.inference.test_registration import TEXT, session, truth
-
-NOISE_T = 2e-5
-BODY, FRINGE = (np.stack(np.meshgrid(
-    0.005 * np.arange(-2, 3), 0.005 * np.arange(-2, 3), z, indexing="ij"),
-    axis=-1).reshape(-1, 3) for z in (0.006 * np.arange(-6, 7), 0.006 * np.arange(4, 14)))
-"""Points in the magnet: through the bore of 60 mm, and from within it to 50 mm before it."""
+from tests.support.short_dipole import BODY, FRINGE, TEXT, campaign_study, reading, truth
 
 POSES = {"body": (Rotation.from_rotvec([0.004, -0.003, 0.006]), np.array([3e-4, -2e-4, 5e-4])),
          "fringe": (Rotation.from_rotvec([-0.005, 0.004, 0.002]), np.array([-4e-4, 3e-4, 0.0503]))}
@@ -41,30 +36,11 @@ MIXING = np.eye(3) + np.array([[0, 0.004, 0], [0, 0.003, -0.005], [0.002, 0, 0]]
 """Crosstalk, and 0.3 % more gain of By."""
 
 
-def reading(magnet_of, generator, name, mixing=None, noise=NOISE_T):
-    """A map of a magnet by magpylib, in the coordinates of its stage."""
-    points, (turn, shift) = {"body": BODY, "fringe": FRINGE}[name], POSES[name]
-    matrix = turn.as_matrix()
-    field = magnet_of.getB(points) @ matrix @ (np.eye(3) if mixing is None else mixing).T
-    return field_map((points - shift) @ matrix,
-                     field + noise * generator.standard_normal(field.shape))
-
-
 def two_maps(generator, magnet_of=None, other=None, mixing=None):
     """Maps of a magnet, the second one perhaps of another."""
     magnet_of = magnet_of or truth(generator)
-    return {"body": reading(magnet_of, generator, "body", mixing),
-            "fringe": reading(other or magnet_of, generator, "fringe", mixing)}
-
-
-def campaign_study(probe=None, **uncertain):
-    """The study of both maps: of their stages a millimetre is known."""
-    known = {"translation_m": 1e-3, "rotation_rad": 0.01}
-    maps = [{"name": "body", "file": "body.csv"},
-            {"name": "fringe", "file": "fringe.csv",
-             "instrument": {"translation_m": [0, 0, 0.05]}}]
-    return parse_study(tomllib.loads(TEXT) | {"instrument_sd": known | uncertain, "maps": [
-        one | ({"probe": probe} if probe else {}) for one in maps]})
+    return {"body": reading(magnet_of, generator, BODY, POSES["body"], mixing),
+            "fringe": reading(other or magnet_of, generator, FRINGE, POSES["fringe"], mixing)}
 
 
 def terms(result):
@@ -74,7 +50,7 @@ def terms(result):
 
 
 def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
-    result = infer(build_magnet(campaign_study()), two_maps(generator), session(tmp_path))
+    result = infer(build_magnet(campaign_study()), two_maps(generator), Session.open(tmp_path))
     assert result.terms.at_rest
     found = terms(result)
     for name, points, start in (("body", BODY, [0, 0, 0]), ("fringe", FRINGE, [0, 0, 0.05])):
@@ -128,12 +104,12 @@ def test_both_maps_say_more_than_one_and_cover_the_truth(generator, tmp_path):
     magnet_of = truth(generator)
     maps, study = two_maps(generator, magnet_of), campaign_study()
     magnet = build_magnet(study)
-    both = infer(magnet, maps, session(tmp_path / "both"))
+    both = infer(magnet, maps, Session.open(tmp_path / "both"))
     low, high = IN_PROPORTION
     assert low < distance_of_truth(both, magnet_of) < high
     for number, name in enumerate(maps):
         one = infer(magnet.with_study(study.of_map(number)), maps[name],
-                    session(tmp_path / name))
+                    Session.open(tmp_path / name))
         assert (both.posterior.sd <= one.posterior.sd * (1 + 1e-6)).all()
         assert both.posterior.sd.mean() < 0.95 * one.posterior.sd.mean()
         assert not one.is_campaign
@@ -147,12 +123,12 @@ def test_large_deviations_turn_the_gradient_too(generator, tmp_path, monkeypatch
     study = study.with_(prior=study.prior.with_(magnitude_sd=0.2, direction_sd_deg=3.0))
     maps, magnet = two_maps(generator, magnet_of), build_magnet(study)
     low, high = IN_PROPORTION
-    result = infer(magnet, maps, session(tmp_path / "updated"))
+    result = infer(magnet, maps, Session.open(tmp_path / "updated"))
     assert result.terms.at_rest
     assert low < distance_of_truth(result, magnet_of) < high
     # negative control: the gradient of the nominal magnet
     monkeypatch.setattr(Deviations, "field", lambda self, deviations, points: 0 * points)
-    nominal = infer(magnet, maps, session(tmp_path / "nominal"))
+    nominal = infer(magnet, maps, Session.open(tmp_path / "nominal"))
     assert distance_of_truth(nominal, magnet_of) > high
 
 
@@ -160,8 +136,9 @@ def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
     maps = two_maps(generator, mixing=MIXING)
     open_terms = {"crosstalk": 0.02, "gain": 0.003}
     shared = infer(build_magnet(campaign_study("hall", **open_terms)), maps,
-                   session(tmp_path / "shared"))
-    apart = infer(build_magnet(campaign_study(**open_terms)), maps, session(tmp_path / "apart"))
+                   Session.open(tmp_path / "shared"))
+    apart = infer(build_magnet(campaign_study(**open_terms)), maps,
+                  Session.open(tmp_path / "apart"))
     one, two = terms(shared), terms(apart)
     assert "fringe.crosstalk_yz" in two
     assert "fringe.crosstalk_yz" not in one
@@ -175,14 +152,14 @@ def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
     for each in (*shared.overlaps, *apart.overlaps):
         assert each.chi2 < each.limit
     # control: with a probe that is known for exact, the maps do not fit
-    closed = infer(build_magnet(campaign_study()), maps, session(tmp_path / "closed"))
+    closed = infer(build_magnet(campaign_study()), maps, Session.open(tmp_path / "closed"))
     assert closed.prior_conflict > closed.conflict_limit
 
 
 def test_a_map_of_another_magnet_is_told(generator, tmp_path):
     """Control: the second map is of a magnet whose blocks have other errors."""
     maps = two_maps(generator, truth(generator), truth(generator))
-    result = infer(build_magnet(campaign_study()), maps, session(tmp_path))
+    result = infer(build_magnet(campaign_study()), maps, Session.open(tmp_path))
     for each in result.overlaps:
         assert each.chi2 > 10 * each.limit
         assert "not of the same magnet" in each.disagreement
@@ -253,7 +230,7 @@ def test_maps_are_registered_and_update_the_magnet_together(generator, tmp_path,
         assert text in page
     updated = tmp_path / "inferred" / "study.updated.toml"
     again = infer(build_magnet(read_study(updated)), read_maps(read_study(updated), updated.parent),
-                  session(tmp_path / "again"))
+                  Session.open(tmp_path / "again"))
     assert (np.abs(again.terms.change) < 0.3 * again.terms.sd).all()
     assert main(["multipoles", str(path), "--posterior", str(tmp_path / "inferred/posterior.h5"),
                  "-o", str(tmp_path / "multipoles")]) == 0
@@ -299,7 +276,7 @@ def test_bad_campaigns_get_a_sentence(generator, tmp_path, capsys):
     assert main(["infer", str(tmp_path / "single.toml"), "-o", str(tmp_path / "x")]) == 3
     assert "Add --measurements" in capsys.readouterr().err
     with pytest.raises(StudyError, match="the only maps of the campaign"):
-        diagnose(study, maps["body"], session(tmp_path / "d"))
+        diagnose(study, maps["body"], Session.open(tmp_path / "d"))
     with pytest.raises(StudyError, match="those that are given, by name"):
         maps_of(study, {"body": maps["body"]})
     with pytest.raises(StudyError, match=r"the same instrument\.gain"):
@@ -331,8 +308,8 @@ study says."""
 def test_maps_on_one_stage_know_their_poses_better(generator, tmp_path, monkeypatch):
     monkeypatch.setitem(POSES, "fringe", SHIFTED)
     maps = two_maps(generator, mixing=MIXING)
-    shared, apart = (infer(build_magnet(stage_study(name)), maps, session(tmp_path / str(name)))
-                     for name in ("table", None))
+    shared, apart = (infer(build_magnet(stage_study(name)), maps,
+                           Session.open(tmp_path / str(name))) for name in ("table", None))
     found = terms(shared)
     assert not any(name.startswith("fringe.translation") for name in found)
     value, sd = found["fringe.stage_shift_z_m"]
@@ -354,7 +331,7 @@ def test_maps_on_one_stage_know_their_poses_better(generator, tmp_path, monkeypa
 def test_maps_that_are_not_on_one_stage_disagree(generator, tmp_path):
     """Control: the second map is turned by 9 mrad against the first."""
     result = infer(build_magnet(stage_study("table")), two_maps(generator, mixing=MIXING),
-                   session(tmp_path))
+                   Session.open(tmp_path))
     assert result.disagreement
 
 

@@ -19,8 +19,8 @@ from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.report.registration import by_hypothesis, sentences
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
-from tests.inference.test_registration import TEXT as CIRCLES
-from tests.inference.test_registration import truth
+from tests.support.short_dipole import TEXT as CIRCLES
+from tests.support.short_dipole import truth
 
 TEXT = CIRCLES.replace("scan_lines_every = 5", "every = 5").replace(
     "magnitude_sd = 0.01", "magnitude_sd = 0.003").replace(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import tomllib
 
-import magpylib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,75 +18,12 @@ from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
-
-TEXT = """
-name = "short"
-[array]
-multipole_order = 1
-rings = 2
-blocks_per_ring = 8
-inner_radius_m = 0.02
-outer_radius_m = 0.04
-ring_length_m = 0.03
-remanence_T = 1.3
-[array.block]
-shape = "sector"
-[mesh]
-block_size_m = 0.01
-[observation]
-quantity = "flux_density"
-[observation.positions]
-kind = "circles"
-radius_m = 0.01
-angles = 8
-[[noise.regions]]
-name = "bore"
-sigma_T = 2e-5
-[prior]
-magnitude_sd = 0.01
-direction_sd_deg = 0.6
-common_mode_sd = 0.01
-[inference.held_out]
-scan_lines_every = 5
-"""
-GRID = np.stack(np.meshgrid(0.005 * np.arange(-2, 3), 0.005 * np.arange(-2, 3),
-                            0.006 * np.arange(16), indexing="ij"), axis=-1).reshape(-1, 3)
-NOISE_T = 2e-5
+from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
 
 
 @pytest.fixture(scope="module")
 def magnet():
     return build_magnet(parse_study(tomllib.loads(TEXT)))
-
-
-def truth(generator, magnitude=0.01, stretch=1.0, twist_deg=0.0):
-    """A magnet of magpylib with errors of its blocks.
-
-    It is longer than the study says by a factor, and its second ring is turned about z.
-    """
-    sources = []
-    for z, twist in ((-0.015, 0.0), (0.015, twist_deg)):
-        for slot in range(8):
-            angle = 45.0 * slot + twist
-            direction = np.radians(90.0 * slot + twist) + 0.01 * generator.standard_normal()
-            polarization = 1.3 * (1 + magnitude * generator.standard_normal()) * np.array([
-                np.cos(direction), np.sin(direction), 0.01 * generator.standard_normal()])
-            sources.append(magpylib.magnet.CylinderSegment(
-                dimension=(0.02, 0.04, 0.03 * stretch, angle - 22.5, angle + 22.5),
-                polarization=polarization, position=(0.0, 0.0, z * stretch)))
-    return magpylib.Collection(*sources)
-
-
-def measured(magnet_of, generator, turn, shift, mixing=None, noise=NOISE_T):
-    """A map in coordinates s of a stage: the place in the magnet is turn s + shift."""
-    matrix = turn.as_matrix()
-    field = magnet_of.getB(GRID @ matrix.T + shift) @ matrix
-    field = field @ (np.eye(3) if mixing is None else mixing).T
-    return field_map(GRID, field + noise * generator.standard_normal(field.shape))
-
-
-def session(folder):
-    return Session.open(folder)
 
 
 @pytest.mark.parametrize("number", [0, 5, 17])
@@ -98,12 +34,12 @@ def test_a_pose_is_found_from_nothing(magnet, generator, tmp_path, number):
     if np.abs(GRID @ turn.as_matrix().T + shift)[:, :2].max() > 0.018:
         # the long side lies across the bore: the map would be inside blocks
         with pytest.raises(MeasurementError, match="unexplained"):
-            register(magnet, field_map(GRID, np.ones_like(GRID)), session(tmp_path))
+            register(magnet, field_map(GRID, np.ones_like(GRID)), Session.open(tmp_path))
         return
     # the origin of the stage is half a metre away
     data = measured(truth(generator), generator, turn, shift)
     moved = field_map(GRID + np.array([0.3, -0.2, 0.4]), data["B_T"].values)
-    found = register(magnet, moved, session(tmp_path))
+    found = register(magnet, moved, Session.open(tmp_path))
     # rotations by half a turn about the field's axis are symmetric
     angle, best = min([((Rotation.from_rotvec(each.instrument.rotation_rad) * turn.inv()
                         ).magnitude(), each)
@@ -125,7 +61,7 @@ def test_a_pose_is_found_from_nothing(magnet, generator, tmp_path, number):
 def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     data = measured(truth(generator, 0.0), generator, Rotation.identity(),
                     np.array([0.0, 0.0, -0.045]))
-    found = register(magnet, data, session(tmp_path))
+    found = register(magnet, data, Session.open(tmp_path))
     assert len(found) > 1  # half a turn about y changes nothing of an ideal dipole
     probabilities = odds(found)
     assert probabilities.sum() == pytest.approx(1.0)
@@ -166,24 +102,24 @@ def test_open_keys_and_probe(magnet, generator, tmp_path):
     data = measured(truth(generator, 0.002, 1.01), generator, Rotation.from_rotvec([0, 0, 0.0]),
                     np.array([0.0, 0.0, -0.04]), mixing)
     tight = magnet.with_(prior__magnitude_sd=0.003, prior__direction_sd_deg=0.6)
-    best = register(tight, data, session(tmp_path), open_keys=[
+    best = register(tight, data, Session.open(tmp_path), open_keys=[
         OpenKey("array.ring_length_m", 5e-4)])[0]
     value, sd = best.open_keys["array.ring_length_m"]
     assert value == pytest.approx(0.0303, abs=max(4 * sd, 2e-5))
     assert sd < 2e-4
     crosstalk = best.instrument.crosstalk
     assert crosstalk["yz"] + crosstalk["zy"] == pytest.approx(0.004, abs=1.5e-3)
-    closed = register(tight, data, session(tmp_path))[0]
+    closed = register(tight, data, Session.open(tmp_path))[0]
     assert closed.log_evidence < best.log_evidence - 5  # control: without the key it fits worse
     with pytest.raises(StudyError, match=r"array\.ring_length"):
-        register(tight, data, session(tmp_path), open_keys=[OpenKey("array.ring_length", 1.0)])
+        register(tight, data, Session.open(tmp_path), open_keys=[OpenKey("array.ring_length", 1.0)])
 
 
 def test_every_pose_has_its_own_derivatives(magnet, generator, tmp_path):
     """Equal poses of an ideal dipole find the same length, whichever is fitted first."""
     data = measured(truth(generator, 0.0, 1.01), generator, Rotation.identity(),
                     np.array([0.0, 0.0, -0.04]))
-    found = register(magnet.with_(prior__magnitude_sd=1e-3), data, session(tmp_path),
+    found = register(magnet.with_(prior__magnitude_sd=1e-3), data, Session.open(tmp_path),
                      open_keys=[OpenKey("array.ring_length_m", 5e-4)])
     assert len(found) > 1
     for each in found:
@@ -196,17 +132,17 @@ def test_readings_that_the_study_excludes_are_not_fitted(magnet, generator, tmp_
     """A spike of 0.1 T, and a noise that the map states, not the study."""
     data = measured(truth(generator), generator, Rotation.identity(), np.array([0.0, 0.0, -0.045]))
     data["B_T"][24] += 0.1  # on a line that is not held out
-    spoiled = register(magnet, data, session(tmp_path))[0]
+    spoiled = register(magnet, data, Session.open(tmp_path))[0]
     excluding = magnet.with_(inference=magnet.study.inference.with_(excluded_readings=[25]))
-    found = register(excluding, data, session(tmp_path))[0]
+    found = register(excluding, data, Session.open(tmp_path))[0]
     assert np.nanmax(found.rms_T) < 1.3 * NOISE_T < np.nanmax(spoiled.rms_T)
     data["sigma_T"] = data["B_T"].copy(data=np.full_like(data["B_T"].values, 2 * NOISE_T))
-    noisier = register(excluding.with_(noise=None), data, session(tmp_path))[0]
+    noisier = register(excluding.with_(noise=None), data, Session.open(tmp_path))[0]
     # twice the noise makes error bars up to twice as wide; the prior of blocks holds the rest
     assert (noisier.translation_sd_m > found.translation_sd_m).all()
     del data["sigma_T"]
     with pytest.raises(StudyError, match="noise"):
-        register(excluding.with_(noise=None), data, session(tmp_path))
+        register(excluding.with_(noise=None), data, Session.open(tmp_path))
 
 
 def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):

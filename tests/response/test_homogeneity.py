@@ -19,7 +19,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from tests.inference.test_registration import TEXT, truth
+from tests.support.short_dipole import TEXT, truth
 
 RADIUS_M = 0.008
 REGIONS = [Region.sphere(RADIUS_M), Region.sphere(0.006, (0.002, -0.001, 0.003)),
