@@ -23,6 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     parser.add_argument("--posterior", type=InputFile, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
+    add_region_arguments(parser)
+    parser.add_argument("--degrees", type=int, choices=range(1, 21), metavar="L",
+                        help="largest degree of the spherical harmonics, 1 to 20 (default: 6)")
+
+
+def add_region_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that describe a region, see `region_of`."""
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument("--sphere-m", type=common.positive_number, metavar="R",
                        help="radius of the sphere in m (default: half the radius of the bore)")
@@ -32,12 +39,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        metavar=("R", "LENGTH"), help="radius and length along z in m")
     parser.add_argument("--centre-m", type=common.finite_number, nargs=3, metavar=("X", "Y", "Z"),
                         default=(0.0, 0.0, 0.0), help="centre of the region in m (default: 0 0 0)")
-    parser.add_argument("--degrees", type=int, choices=range(1, 21), metavar="L",
-                        help="largest degree of the spherical harmonics, 1 to 20 (default: 6)")
 
 
 def region_of(arguments: argparse.Namespace) -> Region | None:
-    """Return the region that the options describe; None for the default one."""
+    """Return the region that the options describe; None for the default one.
+
+    Raises
+    ------
+    StudyError
+        If only its centre is given.
+    """
+    from halbach_fe.core.errors import StudyError, must_be
     from halbach_fe.response.homogeneity import Region
 
     x, y, z = arguments.centre_m
@@ -47,13 +59,17 @@ def region_of(arguments: argparse.Namespace) -> Region | None:
     if arguments.cylinder_m:
         radius, length = arguments.cylinder_m
         return Region("cylinder", (radius, radius, length / 2), (x, y, z))
-    return Region.sphere(arguments.sphere_m, (x, y, z)) if arguments.sphere_m else None
+    if arguments.sphere_m:
+        return Region.sphere(arguments.sphere_m, (x, y, z))
+    if any(arguments.centre_m):
+        raise StudyError(must_be("--centre-m", "the command line", "beside a region",
+                                 "given alone", "Add --sphere-m R."))
+    return None
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute the homogeneity, write the results, print the answer and the tables."""
     from halbach_fe.api import homogeneity
-    from halbach_fe.core.errors import StudyError, must_be
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.homogeneity import (
@@ -68,9 +84,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     magnet, region = build_magnet(study), region_of(arguments)
-    if region is None and any(arguments.centre_m):
-        raise StudyError(must_be("--centre-m", "the command line", "beside a region",
-                                 "given alone", "Add --sphere-m R."))
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
     with common.session(arguments, study) as session:
         found = homogeneity(magnet, session, region, posterior,

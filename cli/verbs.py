@@ -19,7 +19,7 @@ VERBS = {
     "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
     "multipoles": "multipoles", "homogeneity": "homogeneity",
     "forces": "forces", "plan": "plan", "prior": "prior",
-    "shim": "shim", "sort": "sort",
+    "shim": "shim", "shim-tray": "shim_tray", "sort": "sort",
     "tolerance": "tolerance", "demagnetization": "demagnetization",
     "simulate-measurement": "simulate_measurement", "import-map": "import_map", "check": "check",
     "register": "register",

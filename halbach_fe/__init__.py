@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from halbach_fe.design.forces import Forces as Forces
     from halbach_fe.design.forces import forces as forces
     from halbach_fe.design.measurement_plan import MeasurementPlan as MeasurementPlan
+    from halbach_fe.design.shim_tray import FilledTray as FilledTray
+    from halbach_fe.design.shim_tray import shim_tray as shim_tray
     from halbach_fe.design.shimming import Shim as Shim
     from halbach_fe.design.sorting import SortedBlocks as SortedBlocks
     from halbach_fe.design.tolerance import Tolerance as Tolerance
@@ -71,7 +73,8 @@ _HOME = {
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
     "forces": "design.forces",
-    "plan": "api", "shim": "api",
+    "plan": "api", "shim": "api", "shim_tray": "design.shim_tray",
+    "FilledTray": "design.shim_tray",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
     "write_report": "report.result_files",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",

@@ -34,8 +34,8 @@ def verdict(found: HomogeneityResult) -> str:
     """Return the answer in words, for the magnet that is known best."""
     name, best = list(found.by_name.items())[-1]
     text = (f"In {found.model.region.text} the field is {_field(best)}; it deviates by "
-            f"{_ppm(best.rms_ppm)} ppm rms and {_ppm(best.peak_to_peak_ppm)} ppm peak to peak")
-    low, middle, high = map(_ppm, best.rms_range_ppm)
+            f"{ppm(best.rms_ppm)} ppm rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
+    low, middle, high = map(ppm, best.rms_range_ppm)
     if name != "prior":
         return f"{text} (95 % of what the {name} allows: {low} to {high} ppm rms)."
     return (f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study says, "
@@ -48,7 +48,7 @@ def _known_as(name: str) -> str:
         name, f"of the {name}")
 
 
-def _ppm(value: float) -> str:
+def ppm(value: float) -> str:
     """Return a number of ppm as text, without an exponent."""
     return f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000 else f"{value:.3g}"
 
@@ -69,9 +69,9 @@ def homogeneity_rows(found: HomogeneityResult) -> list[dict[str, str]]:
         rows.append({
             "magnet": name, "mean field": _field(known),
             "direction": f"({direction}) ± {1e3 * known.direction_sd_rad:.2g} mrad",
-            "rms in ppm": _ppm(known.rms_ppm),
-            "peak to peak in ppm": _ppm(known.peak_to_peak_ppm),
-            **{key: f"{_ppm(low)} to {_ppm(high)}" for key, (low, _, high) in ranges.items()}})
+            "rms in ppm": ppm(known.rms_ppm),
+            "peak to peak in ppm": ppm(known.peak_to_peak_ppm),
+            **{key: f"{ppm(low)} to {ppm(high)}" for key, (low, _, high) in ranges.items()}})
     return rows
 
 
@@ -89,7 +89,7 @@ def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
         for name in names:
             term = found.by_name[name].harmonics[number]
             sign = "+" if term.ppm > 0 else ""
-            row[f"{name} in ppm"] = f"{sign}{_ppm(term.ppm)} ± {_ppm(term.sd_ppm)}"
+            row[f"{name} in ppm"] = f"{sign}{ppm(term.ppm)} ± {ppm(term.sd_ppm)}"
         rows.append(row)
     return rows
 
@@ -117,7 +117,7 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
                       extend="both")
         lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels[::4],
                              colors="black", linewidths=0.5)
-        axis.clabel(lines, fmt=_ppm, fontsize=7)
+        axis.clabel(lines, fmt=ppm, fontsize=7)
         axis.set_aspect("equal")
         axis.set_xlabel(f"{names[0]} in mm")
         axis.set_ylabel(f"{names[1]} in mm")

@@ -268,6 +268,8 @@ class HomogeneityModel:
     Attributes
     ----------
     region : Region
+    points : ndarray, shape (m, 3), in m
+        Those of the region, followed by those of the slices that are in air.
     weights : ndarray, shape (n,)
         Of the region's points in means over the volume.
     surface : int
@@ -283,6 +285,7 @@ class HomogeneityModel:
     """
 
     region: Region
+    points: Floats
     weights: Floats
     surface: int
     in_air: NDArray[np.bool_]
@@ -415,7 +418,7 @@ def homogeneity_model(
             region.centre_m,))))
     every = np.vstack([points, planes[in_air]])
     observation = observe(bare.study, every, np.ones(every.shape, bool))
-    return HomogeneityModel(region, weights, int((weights == 0).sum()), in_air,
+    return HomogeneityModel(region, every, weights, int((weights == 0).sum()), in_air,
                             response_matrix(bare, observation, session), degrees, surface_degree)
 
 

@@ -27,6 +27,7 @@ from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd, MapSettin
 from halbach_fe.study.material_keys import STRENGTHS, grade_of
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
+from halbach_fe.study.shim_tray import ShimTray
 from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 
@@ -59,6 +60,7 @@ class Study(StudyModel):
     inference: Inference = Inference()
     plan: Plan = Plan()
     demagnetization: Demagnetization | None = None
+    shim_tray: ShimTray | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -1,0 +1,57 @@
+"""Choose small magnets for the places of a shim tray so that the field becomes homogeneous.
+
+The tray and its inventory are [shim_tray] of the study; the magnet is the measured one, whose
+posterior halbach-fe infer wrote. Writes shim_tray.csv, the table to fill the tray from,
+shim_tray.json, shim_tray.html and its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from halbach_fe.cli import common
+from halbach_fe.cli.homogeneity import add_region_arguments, region_of
+from halbach_fe.core.files import InputFile
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add this verb's options."""
+    common.add_study_arguments(parser)
+    parser.add_argument("--posterior", type=InputFile, metavar="H5", required=True,
+                        help="posterior.h5 that halbach-fe infer wrote for this magnet")
+    add_region_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fill the tray, write the results, print the answer and the table."""
+    from halbach_fe.design.shim_tray import shim_tray
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.report.shim_tray import (
+        LISTED,
+        homogeneity_rows,
+        rows,
+        shim_tray_summary,
+        verdict,
+        write_shim_tray,
+    )
+    from halbach_fe.study.reader import read_study
+
+    study = read_study(arguments.study)
+    magnet, region = build_magnet(study), region_of(arguments)
+    posterior = read_posterior(magnet, arguments.posterior)["posterior"]
+    with common.session(arguments, study) as session:
+        found = shim_tray(magnet, posterior, session, region)
+    write_shim_tray(found, arguments.output, {"GetDP": session.getdp.version, **common.digests(
+        {"study file": arguments.study, "posterior": arguments.posterior})})
+    if arguments.json:
+        common.print_json(shim_tray_summary(found))
+    else:
+        common.say(" ".join(verdict(found)))
+        common.print_table(homogeneity_rows(found), f"The field in {found.model.region.text}")
+        table = rows(found)
+        common.print_table(table[:LISTED], "The tray" if len(table) <= LISTED else
+                           f"The first {LISTED} of {len(table)} magnets")
+        common.say(f"Table: {arguments.output / 'shim_tray.csv'}")
+        common.say(f"Report: {arguments.output / 'shim_tray.html'}")
+    return 0

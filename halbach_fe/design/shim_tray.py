@@ -1,0 +1,448 @@
+"""Filling a shim tray: which small magnets to put where so that the field becomes homogeneous.
+
+The field of the measured magnet in the region is normal with mean b and a covariance that no choice
+of shims changes, so that the expected mean square of its deviations is least where that of the mean
+field with the shims is. Each place holds one magnet of the inventory at one of its angles, or none:
+a quadratic function of choices. Starting from an empty tray, the best change of one place is made
+until none helps, then the best change of two places at once, and so on. A shim whose strength is
+uncertain adds the square of its field times that uncertainty, so that weak gains are not bought
+with many magnets.
+
+The shims' field is that of cuboids in vacuum. What permeable blocks and iron answer to it is left
+out; it counts among the uncertainty of the shims' strength.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.geometry.blocks import MagnetBlock, vector
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import closed_outline
+from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
+from halbach_fe.response.block_variation import with_variations
+from halbach_fe.response.homogeneity import (
+    PPM,
+    Homogeneity,
+    HomogeneityModel,
+    Region,
+    default_region,
+    homogeneity_model,
+)
+from halbach_fe.solver.exact_block_field import unit_field
+from halbach_fe.solver.session import Session, alone
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.grades import grade
+from halbach_fe.study.shim_tray import ShimMagnet, ShimTray
+
+MOST_CHOICES = 6000
+"""Largest number of places times magnets times angles, which limits memory to a gigabyte."""
+
+MOST_PAIRS = 400
+"""Largest number of changes of two places at once."""
+
+LEAST_GAIN = 1e-9
+"""Smallest decrease of the mean square for which a place is changed, relative to that of the empty
+tray: of smaller ones, rounding decides."""
+
+EMPTY = -1
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A magnet in a place of a tray.
+
+    Attributes
+    ----------
+    place : int
+        Number of the place, counted from 1.
+    position_m : tuple of float
+    magnet : ShimMagnet
+    from_radius_deg : float
+        Angle of the polarization from the radius of the place.
+    direction_deg : float
+        Angle of the polarization from the x axis of the magnet.
+    """
+
+    place: int
+    position_m: tuple[float, float, float]
+    magnet: ShimMagnet
+    from_radius_deg: float
+    direction_deg: float
+
+
+@dataclass(frozen=True)
+class FilledTray(ShownInNotebook):
+    """How a shim tray is to be filled, and the homogeneity before and after.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    model : HomogeneityModel
+        The linear model of the field in the region, without the shims.
+    shimmed : HomogeneityModel
+        The same with the shims, whose relative strengths are its last parameters.
+    before_known, after_known : Gaussian
+        Distributions of the parameters of both models.
+    before, after : Homogeneity
+    filled : tuple of Filled
+        In the order of the places; empty places are left out.
+    places_m : ndarray, shape (places, 3), in m
+    left : dict of str to int
+        Number of magnets of each kind that remain in the inventory.
+    """
+
+    magnet: Magnet
+    model: HomogeneityModel
+    shimmed: HomogeneityModel
+    before_known: Gaussian
+    after_known: Gaussian
+    before: Homogeneity
+    after: Homogeneity
+    filled: tuple[Filled, ...]
+    places_m: Floats
+    left: dict[str, int]
+
+
+@alone
+def shim_tray(
+    magnet: Magnet, posterior: Gaussian, session: Session, region: Region | None = None
+) -> FilledTray:
+    """Choose small magnets for the places of a shim tray so that the field becomes homogeneous.
+
+    Parameters
+    ----------
+    magnet : Magnet
+        Its study has a ``shim_tray``.
+    posterior : Gaussian
+        Distribution of the magnetizations of the measured magnet in A/m.
+    session : Session
+        Its folder receives the runs of GetDP and the response matrix.
+    region : Region, optional
+        By default the sphere about the origin of half the radius of the bore.
+
+    Returns
+    -------
+    FilledTray
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section or has no tray, or a magnet of the tray would touch the
+        region, a block, iron or another place.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> tray = {"rings": [{"radius_m": 0.08, "count": 8}], "magnets": [
+    ...     {"name": "cube", "size_m": [0.005] * 3, "remanence_T": 1.2, "count": 8}]}
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml").with_(shim_tray=tray))
+    >>> known = hf.homogeneity(magnet, hf.Session.open("results")).distributions["prior"]
+    >>> found = hf.shim_tray(magnet, known, hf.Session.open("tray"))
+    >>> found.after.rms_ppm <= found.before.rms_ppm
+    True
+    """
+    tray = magnet.study.shim_tray
+    if tray is None:
+        raise StudyError(must_be("`shim_tray`", f"study {magnet.name}", "a tray with its magnets",
+                                 "nothing", "Add [shim_tray], see docs/design.md."))
+    region = region or default_region(magnet)
+    choices = _Choices.of(tray, magnet.name)
+    _check(magnet, choices, region)
+    model = homogeneity_model(magnet, region, session)
+    before = model.of(posterior)
+    chosen = _best(model, posterior, before, choices, tray)
+    shimmed, known = _with_shims(model, posterior, choices.fields(model.points, chosen), tray)
+    filled = []
+    for place in np.flatnonzero(chosen != EMPTY).tolist():
+        number, angle = divmod_of(choices, int(chosen[place]))
+        azimuth = float(np.degrees(choices.azimuth[place]))
+        filled.append(Filled(place + 1, vector(choices.places[place]), tray.magnets[number], angle,
+                             (azimuth + angle) % 360))
+    left = {each.name: each.count for each in tray.magnets}
+    for one in filled:
+        left[one.magnet.name] -= 1
+    return FilledTray(magnet, model, shimmed, posterior, known, before, shimmed.of(known),
+                      tuple(filled), choices.places, left)
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """What each place can hold: a kind of magnet at an angle.
+
+    Attributes
+    ----------
+    tray : ShimTray
+    places : ndarray, shape (p, 3), in m
+    azimuth : ndarray, shape (p,), in rad
+    kind, angle : ndarray, shape (o,)
+        Number of the magnet and angle in degrees from the radius of each choice for a place.
+    blocks : tuple of tuple of MagnetBlock
+        For each kind of magnet the blocks that it is in all places.
+    """
+
+    tray: ShimTray
+    places: Floats
+    azimuth: Floats
+    kind: Ints
+    angle: Floats
+    blocks: tuple[tuple[MagnetBlock, ...], ...]
+
+    @classmethod
+    def of(cls, tray: ShimTray, study: str) -> _Choices:
+        """Return the choices of a tray."""
+        places = [np.array([ring.radius_m * np.cos(phi), ring.radius_m * np.sin(phi), z])
+                  for ring in tray.rings for z in ring.z_m
+                  for phi in np.radians(ring.first_angle_deg) + 2 * np.pi * np.arange(
+                      ring.count) / ring.count]
+        every = np.array([*places, *map(np.array, tray.places_m)])
+        options = [(number, angle) for number, each in enumerate(tray.magnets)
+                   for angle in each.angles_deg]
+        if len(every) * len(options) > MOST_CHOICES:
+            raise StudyError(must_be(
+                "`shim_tray`", f"study {study}", f"at most {MOST_CHOICES} choices",
+                f"{len(every)} places times {len(options)} magnets and angles",
+                "Leave out places, kinds of magnets or angles."))
+        azimuth = np.arctan2(every[:, 1], every[:, 0])
+        blocks = tuple(tuple(_block(each, place, float(phi), number + 1) for number, (place, phi)
+                             in enumerate(zip(every, azimuth, strict=True)))
+                       for each in tray.magnets)
+        return cls(tray, every, azimuth, np.array([number for number, _ in options]),
+                   np.array([angle for _, angle in options]), blocks)
+
+    def all_fields(self, points: Floats) -> Floats:
+        """Return B (p, o, n, 3) in T at points (n, 3) in m of every choice for every place."""
+        found = np.empty((len(self.places), len(self.kind), len(points), 3))
+        for number, blocks in enumerate(self.blocks):
+            mine = np.flatnonzero(self.kind == number)
+            for place, block in enumerate(blocks):
+                unit = block.remanence * unit_field(block, points)
+                for option in mine:
+                    found[place, option] = unit @ self._direction(place, int(option))
+        return found
+
+    def fields(self, points: Floats, chosen: Ints) -> Floats:
+        """Return B (shims, n, 3) in T at points (n, 3) in m of the magnets that were chosen."""
+        found = []
+        for place in np.flatnonzero(chosen != EMPTY).tolist():
+            option = int(chosen[place])
+            block = self.blocks[int(self.kind[option])][place]
+            found.append(block.remanence * unit_field(block, points)
+                         @ self._direction(place, option))
+        return np.array(found).reshape(-1, len(points), 3)
+
+    def _direction(self, place: int, option: int) -> Floats:
+        """Return the direction (3,) of a polarization."""
+        angle = self.azimuth[place] + np.radians(self.angle[option])
+        return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def divmod_of(choices: _Choices, option: int) -> tuple[int, float]:
+    """Return the number of the magnet and its angle from the radius in degrees."""
+    return int(choices.kind[option]), float(choices.angle[option])
+
+
+def _block(magnet: ShimMagnet, place: Floats, azimuth: float, number: int) -> MagnetBlock:
+    """Return a magnet of the inventory in a place of the tray."""
+    x, y, z = np.array(magnet.size_m) / 2
+    remanence = magnet.remanence_T or float(np.mean(grade(str(magnet.material)).remanence_T))
+    return MagnetBlock(
+        ring=0, slot=number, outline=closed_outline(np.array(
+            [(-x, -y), (x, -y), (x, y), (-x, y)])), z_min=-float(z), z_max=float(z),
+        easy_axis=(float(np.cos(azimuth)), float(np.sin(azimuth)), 0.0), remanence=remanence,
+        recoil_permeability=1.0, recoil_permeability_across=1.0, origin_m=vector(place),
+        orientation_rad=(0.0, 0.0, azimuth), label=f"place {number}")
+
+
+def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
+    """Raise a StudyError if a magnet of the tray would touch anything.
+
+    The largest magnet in each direction stands for all of them.
+    """
+    if magnet.dimension == 2:
+        raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3, for a shim tray", "2"))
+    study = f"study {magnet.name}"
+    sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0).tolist()
+    largest = choices.tray.magnets[0].with_(size_m=tuple(sizes))
+    blocks = [_block(largest, place, float(phi), number + 1) for number, (place, phi) in enumerate(
+        zip(choices.places, choices.azimuth, strict=True))]
+
+    def refuse(number: int, what: str, hint: str) -> None:
+        x, y, z = 1e3 * choices.places[number]
+        raise StudyError(must_be(
+            f"place {number + 1} of `shim_tray`", study, "free for the largest of its magnets",
+            f"({x:.4g}, {y:.4g}, {z:.4g}) mm, where it touches {what}", hint))
+
+    if touched := overlapping_blocks(blocks):
+        refuse(touched[1], f"that of place {touched[0] + 1}", "Take fewer or smaller magnets.")
+    if touched := block_in_others(blocks, magnet.blocks):
+        refuse(touched[0], f"block {magnet.blocks[touched[1]].name}",
+               "Is the tray within the bore?")
+    if magnet.iron and (touched := block_in_iron(blocks, magnet.iron)):
+        refuse(touched[0], "iron", "Is the tray within the bore?")
+    outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
+    if (outer > magnet.radius).any():
+        refuse(int(np.argmax(outer)), "nothing: it is outside of the magnet",
+               "Is its radius in metres?")
+    points, _ = region.points(12)
+    for number, block in enumerate(blocks):
+        if block.contains(points).any() or region.contains(block.middle[None]).any():
+            refuse(number, "the region whose field is to be homogeneous",
+                   "Choose a smaller region or a tray of larger radius.")
+
+
+def _best(
+    model: HomogeneityModel, posterior: Gaussian, before: Homogeneity, choices: _Choices,
+    tray: ShimTray,
+) -> Ints:
+    """Return for each place the number of its choice, or EMPTY, (p,)."""
+    inner = model.weights > 0
+    weight = np.sqrt(model.weights[inner])
+
+    def whitened(field: Floats) -> Floats:
+        """Return deviations in ppm (..., n) of B (..., n, 3); their squares sum to the variance."""
+        along = field @ before.direction
+        return PPM / before.mean_T * weight * (
+            along - (along @ model.weights[inner])[..., None])
+
+    field = (model.response.offset + model.response.matrix @ posterior.mean).reshape(-1, 3)
+    target = whitened(field[:len(inner)][inner])
+    effect = whitened(choices.all_fields(model.points[:len(inner)][inner]))
+    flat = effect.reshape(-1, effect.shape[-1])
+    search = _Search(flat @ flat.T, flat @ target, float(target @ target), tray.strength_sd**2,
+                     np.tile(choices.kind, len(choices.places)), len(choices.places),
+                     np.array([each.count for each in tray.magnets]))
+    return search.run()
+
+
+class _Search:
+    """Local search for the choices of least mean square.
+
+    The mean square is ``c + 2 sum g_j + sum G_jl + s sum G_jj`` over the chosen j and l.
+    ``products`` (m, m) is G and ``gradient`` (m,) is g in ppm^2, for m = places times options, and
+    ``kinds`` (m,) are the numbers of the magnets, of which there are ``counts`` (k,).
+    """
+
+    def __init__(
+        self, products: Floats, gradient: Floats, constant: float, variance: float, kinds: Ints,
+        places: int, counts: Ints,
+    ) -> None:
+        self.products, self.gradient = products, gradient.copy()
+        self.cost = variance * np.diag(products)
+        self.kinds, self.places, self.left = kinds, places, counts.copy()
+        self.options = len(kinds) // places
+        self.place = np.repeat(np.arange(places), self.options)
+        self.chosen = np.full(places, EMPTY)
+        self.least = LEAST_GAIN * constant
+
+    def run(self) -> Ints:
+        """Return the choice for every place, (places,)."""
+        for _ in range(MOST_PAIRS):
+            while self._change_one():
+                pass
+            if not self._change_two():
+                break
+        return np.where(self.chosen == EMPTY, EMPTY, self.chosen % self.options)
+
+    def _change_one(self) -> bool:
+        """Make the best change of one place; tell whether it helps."""
+        change, empty = self._changes()
+        allowed = self._allowed()
+        change = np.where(allowed, change, np.inf)
+        best, bare = int(np.argmin(change)), int(np.argmin(empty))
+        if min(change[best], empty[bare]) >= -self.least:
+            return False
+        if empty[bare] < change[best]:
+            self._put(bare, EMPTY)
+        else:
+            self._put(int(self.place[best]), best)
+        return True
+
+    def _changes(self) -> tuple[Floats, Floats]:
+        """Return the change of the mean square by every choice (m,), and by emptying places."""
+        own = self.chosen[self.place]
+        there = own != EMPTY
+        diagonal = np.diag(self.products)
+        empty = np.zeros(self.places)
+        full = np.flatnonzero(self.chosen != EMPTY)
+        now = self.chosen[full]
+        empty[full] = -2 * self.gradient[now] + diagonal[now] - self.cost[now]
+        change = 2 * self.gradient + diagonal + self.cost + empty[self.place]
+        change[there] -= 2 * self.products[np.flatnonzero(there), own[there]]
+        return change, empty
+
+    def _allowed(self) -> NDArray[np.bool_]:
+        """Return which choices (m,) the inventory allows, instead of what is in the place."""
+        own = self.chosen[self.place]
+        same = (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == self.kinds)
+        return np.asarray((self.left[self.kinds] > 0) | same)
+
+    def _change_two(self) -> bool:
+        """Make the best change of two places at once; tell whether it helps."""
+        change, empty = self._changes()
+        # each candidate is a choice, or the emptying of a full place
+        full = np.flatnonzero(self.chosen != EMPTY)
+        place = np.append(self.place, full)
+        delta = np.append(change, empty[full])
+        new = np.append(np.arange(len(change)), np.full(len(full), EMPTY))
+        best = (-self.least, 0, 0)
+        used = np.zeros((len(self.left), len(place)), int)
+        for kind in range(len(self.left)):
+            used[kind] = (new != EMPTY) & (self.kinds[np.maximum(new, 0)] == kind)
+            own = self.chosen[place]
+            used[kind] -= (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == kind)
+        for first in range(len(place)):
+            mixed = self._product(place[first], new[first], place, new)
+            total = delta[first] + delta + 2 * mixed
+            total[(place == place[first])
+                  | (used[:, first, None] + used > self.left[:, None]).any(axis=0)] = np.inf
+            second = int(np.argmin(total))
+            if total[second] < best[0]:
+                best = (float(total[second]), first, second)
+        if best[1] == best[2]:
+            return False
+        for number in best[1:]:
+            self._put(int(place[number]), int(new[number]))
+        return True
+
+    def _product(self, place: int, new: int, places: Ints, others: Ints) -> Floats:
+        """Return the products (n,) of the change of one place with changes of others."""
+        old, olds = self.chosen[place], self.chosen[places]
+        found = np.zeros(len(places))
+        for one, sign in ((new, 1.0), (old, -1.0)):
+            if one == EMPTY:
+                continue
+            row = np.append(self.products[one], 0.0)  # EMPTY is the last element
+            found += sign * (row[others] - row[olds])
+        return found
+
+    def _put(self, place: int, choice: int) -> None:
+        """Put a choice into a place."""
+        for one, sign in ((self.chosen[place], -1), (choice, 1)):
+            if one != EMPTY:
+                self.gradient += sign * self.products[:, one]
+                self.left[self.kinds[one]] -= sign
+        self.chosen[place] = choice
+
+
+def _with_shims(
+    model: HomogeneityModel, posterior: Gaussian, fields: Floats, tray: ShimTray
+) -> tuple[HomogeneityModel, Gaussian]:
+    """Return the model with shims of B (shims, n, 3) in T, and the distribution of parameters.
+
+    Its last parameters are the errors of the shims' strengths in their standard deviations.
+    """
+    columns = fields.reshape(len(fields), 3 * len(model.points)).T
+    response = replace(
+        model.response, matrix=np.hstack([model.response.whole, tray.strength_sd * columns]),
+        offset=model.response.offset + columns.sum(axis=1),
+        nominal=np.append(model.response.nominal, np.zeros(len(fields))),
+        parameters=model.response.parameters + tuple(
+            f"shim {number}" for number in range(1, len(fields) + 1)))
+    return replace(model, response=response), with_variations(posterior, len(fields))

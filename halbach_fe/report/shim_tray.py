@@ -1,0 +1,144 @@
+"""Table to fill a shim tray from, figures and page of the field before and after."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.shim_tray import FilledTray
+from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.homogeneity import ppm, slices_figure
+from halbach_fe.report.page import PUBLISHED, own_style, save, write_page
+from halbach_fe.response.homogeneity import Homogeneity
+
+LISTED = 12
+"""Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
+
+FEW = 1.2
+"""Factor below which the deviations are called hardly smaller."""
+
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
+
+
+def verdict(found: FilledTray) -> list[str]:
+    """Return the answer in sentences: what the tray does, with how many magnets, and what next."""
+    region = found.model.region.text
+    if not found.filled:
+        return [f"Leave the tray empty: none of its magnets makes the field in {region} more "
+                f"homogeneous than {ppm(found.before.rms_ppm)} ppm rms."]
+    low, _, high = map(ppm, found.after.rms_range_ppm)
+    text = [f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
+            f"the field in {region} deviates by {ppm(found.after.rms_ppm)} ppm rms (95 %: "
+            f"{low} to {high}) in place of {ppm(found.before.rms_ppm)}."]
+    used_up = [name for name, count in found.left.items() if not count]
+    if len(used_up) == len(found.left):
+        text.append("The whole inventory is used: more magnets may do better.")
+    if found.before.rms_ppm < FEW * found.after.rms_ppm:
+        text.append("That is hardly less: take larger magnets or more places, or look for what the "
+                    "deviation comes from (halbach-fe homogeneity lists its harmonics).")
+    elif found.after.rms_range_ppm[1] > 2 * found.after.rms_ppm:
+        text.append("What remains is mostly what the measurement and the strength of the shims "
+                    "leave open: measure again with the tray filled, and fill a second one.")
+    else:
+        text.append("Fill it from shim_tray.csv, then measure again.")
+    return text
+
+
+def rows(found: FilledTray) -> list[dict[str, str]]:
+    """Return a row of text for every magnet."""
+    return [{
+        "place": str(one.place),
+        "at": "({})\u00a0mm".format(", ".join(f"{1e3 * value:.4g}" for value in one.position_m)),
+        "magnet": one.magnet.name,
+        "polarization from the radius": f"{one.from_radius_deg:g}°",
+        "from the x axis": f"{one.direction_deg:.1f}°"} for one in found.filled]
+
+
+def homogeneity_rows(found: FilledTray) -> list[dict[str, str]]:
+    """Return a row of text for the field before and after."""
+    def row(name: str, known: Homogeneity) -> dict[str, str]:
+        low, _, high = map(ppm, known.rms_range_ppm)
+        return {"tray": name, "mean field": f"{1e3 * known.mean_T:.6g}\u00a0mT",
+                "rms in ppm": ppm(known.rms_ppm), "rms, 95 % in ppm": f"{low} to {high}",
+                "peak to peak in ppm": ppm(known.peak_to_peak_ppm)}
+
+    return [row("empty", found.before), row("filled", found.after)]
+
+
+def shim_tray_summary(found: FilledTray) -> dict[str, object]:
+    """Return the content of shim_tray.json."""
+    def plain(known: Homogeneity) -> dict[str, object]:
+        return asdict(known) | {"direction": known.direction.tolist()}
+
+    return {"study": found.magnet.name, "region": asdict(found.model.region),
+            "places": len(found.places_m), "magnets": len(found.filled), "left": found.left,
+            "before": plain(found.before), "after": plain(found.after),
+            "filled": [{"place": one.place, "position_m": one.position_m,
+                        "magnet": one.magnet.name, "from_radius_deg": one.from_radius_deg,
+                        "direction_deg": one.direction_deg} for one in found.filled]}
+
+
+def columns(found: FilledTray) -> dict[str, Iterable[object]]:
+    """Return the columns of shim_tray.csv, with a row for every place, also of empty ones."""
+    there = {one.place: one for one in found.filled}
+    every = [there.get(number) for number in range(1, len(found.places_m) + 1)]
+    return {"place": range(1, len(every) + 1),
+            **{f"{axis}_m": found.places_m[:, number] for number, axis in enumerate("xyz")},
+            "magnet": ["" if one is None else one.magnet.name for one in every],
+            **{key: [np.nan if one is None else getattr(one, key) for one in every]
+               for key in ("from_radius_deg", "direction_deg")}}
+
+
+def tray_figure(found: FilledTray) -> Figure:
+    """Draw the tray unrolled; arrows are polarizations, upwards ones away from the axis."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    axis = figure.subplots()
+
+    def unrolled(places: Floats) -> tuple[Floats, Floats]:
+        return np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360, 1e3 * places[:, 2]
+
+    axis.plot(*unrolled(found.places_m), "o", ms=12, mfc="none", mec=PUBLISHED, lw=0.5,
+              label="empty place")
+    names = list(found.left)
+    for number, name in enumerate(names):
+        mine = [one for one in found.filled if one.magnet.name == name]
+        if not mine:
+            continue
+        angle, z = unrolled(np.array([one.position_m for one in mine]))
+        turn = np.radians([one.from_radius_deg for one in mine])
+        colour = COLOURS[number % len(COLOURS)]
+        axis.quiver(angle, z, np.sin(turn) * -1, np.cos(turn), pivot="mid", color=colour,
+                    scale=45, width=0.0035, label=name)
+    axis.set(xlabel="angle about z in degrees", ylabel="z in mm", xlim=(-10, 360))
+    axis.margins(y=0.2)
+    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(names) + 1, frameon=False)
+    return figure
+
+
+@own_style
+def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, str]) -> None:
+    """Write shim_tray.csv, shim_tray.json, shim_tray.html and its figures."""
+    write_text(folder / "shim_tray.json",
+               json.dumps(shim_tray_summary(found), indent=1, allow_nan=False) + "\n")
+    with atomic(folder / "shim_tray.csv") as temporary:
+        write_csv(columns(found), {"study": found.magnet.name}, temporary)
+    before, after = (model.slices(known.mean) for model, known in (
+        (found.model, found.before_known), (found.shimmed, found.after_known)))
+    text = "Deviation of |B| from its mean over the region, in planes through its centre, with {}"
+    pictures = save({
+        "shim_tray.png": (tray_figure(found), "The tray unrolled, seen from the axis. Arrows are "
+                          "polarizations; one that points up points away from the axis"),
+        "before.png": (slices_figure(before, found.before.mean_T), text.format("an empty tray")),
+        "after.png": (slices_figure(after, found.after.mean_T), text.format("the filled tray"))},
+        folder)
+    write_page(folder / "shim_tray.html", "shim_tray.html.j2", pictures, study=found.magnet.study,
+               provenance=provenance, verdict=verdict(found), rows=rows(found),
+               fields=homogeneity_rows(found), strength=100 * (
+                   found.magnet.study.shim_tray.strength_sd if found.magnet.study.shim_tray else 0))

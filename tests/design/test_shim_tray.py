@@ -1,0 +1,213 @@
+"""Filled shim trays beside magpylib's field of their magnets, and the search beside all choices."""
+
+from __future__ import annotations
+
+import csv
+import json
+from itertools import product
+
+import magpylib
+import numpy as np
+import pytest
+import tomlkit
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import StudyError
+from halbach_fe.design.shim_tray import EMPTY, _Search, shim_tray
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.homogeneity import PPM, Region
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+
+NOISE_T, STRENGTH_SD = 2e-6, 0.03
+REGION = Region.sphere(0.03)
+
+DOCUMENT = {
+    "name": "tray", "dimension": 3,
+    "array": {
+        "blocks_per_ring": 8, "rings": 6, "inner_radius_m": 0.1, "outer_radius_m": 0.15,
+        "ring_length_m": 0.05, "ring_gap_m": 0.02, "remanence_T": 1.2, "recoil_permeability": 1.0,
+        "block": {"shape": "cuboid", "width_m": 0.05, "orientation": "magnetization"}},
+    "mesh": {"block_size_m": 0.03},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": [0.03, 0.06], "angles": 16, "z_min_m": -0.06,
+        "z_max_m": 0.06, "count": 7}},
+    "noise": {"regions": [{"name": "bore", "sigma_T": NOISE_T}]},
+    "prior": {"magnitude_sd": 0.01, "direction_sd_deg": 1.0},
+    "shim_tray": {
+        "rings": [{"radius_m": 0.08, "count": 16, "z_m": [-0.09, -0.045, 0.0, 0.045, 0.09]}],
+        "strength_sd": STRENGTH_SD,
+        "magnets": [{"name": f"{size} mm", "size_m": [1e-3 * size] * 3, "remanence_T": 1.2,
+                     "count": 40} for size in (10, 6, 4)]}}
+
+
+def tray(**changes):
+    """The study with another tray."""
+    return parse_study(DOCUMENT | {"shim_tray": DOCUMENT["shim_tray"] | changes})
+
+
+def cuboid(size, polarization, position, orientation):
+    return magpylib.magnet.Cuboid(
+        dimension=size, polarization=orientation.inv().apply(polarization), position=position,
+        orientation=orientation)
+
+
+def true_magnet(magnet, generator):
+    """magpylib's cuboids with errors of 1 % and 1 degree."""
+    sources = []
+    for block in magnet.blocks:
+        nominal = block.remanence * np.array(block.easy_axis)
+        polarization = nominal * (1 + 0.01 * generator.standard_normal()) + np.radians(
+            1.0) * block.remanence * generator.standard_normal(3)
+        middle = block.middle
+        sources.append(cuboid((0.05, 0.05, 0.05), polarization, middle,
+                              Rotation.from_euler("z", block.facing_deg, degrees=True)))
+    return magpylib.Collection(*sources)
+
+
+def shims(filled, generator=None, turned_deg=0.0):
+    """magpylib's magnets of a tray, perhaps of uncertain strength, or all turned."""
+    sources = []
+    for one in filled:
+        strength = 1.2 * (1 + (STRENGTH_SD * generator.standard_normal() if generator else 0.0))
+        angle = np.radians(one.direction_deg + turned_deg)
+        x, y, _ = one.position_m
+        sources.append(cuboid(
+            one.magnet.size_m, strength * np.array([np.cos(angle), np.sin(angle), 0.0]),
+            one.position_m, Rotation.from_euler("z", np.arctan2(y, x))))
+    return magpylib.Collection(*sources)
+
+
+def rms_ppm(field):
+    """Rms deviation of |B| (n, 3) over the volume of the region."""
+    _, weights = REGION.points(36)
+    size = np.linalg.norm(field, axis=1)
+    mean = weights @ size
+    return PPM * np.sqrt(weights @ (size / mean - 1)**2)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """The study, its magnet as magpylib builds it, and what a map says of it."""
+    study, generator = parse_study(DOCUMENT), np.random.default_rng(4)
+    magnet = build_magnet(study)
+    points = points_from(study.observation.positions)
+    truth = true_magnet(magnet, generator)
+    data = field_map(points, truth.getB(points) + NOISE_T * generator.standard_normal(points.shape))
+    session = Session.open(tmp_path_factory.mktemp("inferred"))
+    return study, truth, data, infer(magnet, data, session).posterior
+
+
+def test_the_field_becomes_homogeneous_as_foretold(measured, tmp_path):
+    study, truth, _, posterior = measured
+    found = shim_tray(build_magnet(study), posterior, Session.open(tmp_path), REGION)
+    points, _ = REGION.points(36)
+    bare = truth.getB(points)
+    assert found.before.rms_ppm == pytest.approx(rms_ppm(bare), rel=0.01)
+    generator = np.random.default_rng(5)
+    after = [rms_ppm(bare + shims(found.filled, generator).getB(points)) for _ in range(20)]
+    low, middle, high = found.after.rms_range_ppm
+    # of 20 trays of shims with their tolerance, about one is outside of 95 %; they share the map
+    assert sum(low <= each <= high for each in after) >= 15
+    assert np.median(after) == pytest.approx(middle, rel=0.1)
+    assert np.median(after) < rms_ppm(bare) / 5
+    counts = {each.name: each.count for each in study.shim_tray.magnets}
+    for name, left in found.left.items():
+        assert left >= 0
+        assert left == counts[name] - sum(one.magnet.name == name for one in found.filled)
+    # control: the same magnets a quarter of a turn off
+    assert rms_ppm(bare + shims(found.filled, turned_deg=90).getB(points)) > 0.9 * rms_ppm(bare)
+
+
+@pytest.mark.parametrize("counts", [[9, 9], [1, 2], [0, 1]])
+def test_the_search_finds_the_best_of_all(counts):
+    """Four places, three choices of two kinds of magnets: all 256 trays are tried."""
+    generator, excess = np.random.default_rng(8), []
+    kinds = np.tile([0, 0, 1], 4)
+    for _ in range(20):
+        effect, target = generator.standard_normal((12, 6)), 2 * generator.standard_normal(6)
+        found = _Search(effect @ effect.T, effect @ target, target @ target, 0.01, kinds, 4,
+                        np.array(counts)).run()
+
+        def size(chosen, effect=effect, target=target):
+            rows = [3 * place + one for place, one in enumerate(chosen) if one != EMPTY]
+            used = np.bincount(kinds[rows], minlength=2) if rows else np.zeros(2)
+            if (used > counts).any():
+                return np.inf
+            return np.sum((target + effect[rows].sum(axis=0))**2) + 0.01 * np.sum(effect[rows]**2)
+
+        best = min(size(each) for each in product([EMPTY, 0, 1, 2], repeat=4))
+        # changes of two places at a time end in a minimum that may not be the least
+        excess.append((size(found) - best) / (target @ target))
+    assert max(excess) < 0.2
+    assert np.mean(excess) < 0.02
+
+
+def test_a_tray_that_cannot_help_stays_empty(measured, tmp_path):
+    study, _, _, posterior = measured
+    weak = [{"name": "huge", "size_m": [0.03] * 3, "remanence_T": 1.4, "count": 4}]
+    far = study.with_(shim_tray=DOCUMENT["shim_tray"] | {
+        "magnets": weak, "rings": [{"radius_m": 0.07, "count": 2}], "strength_sd": 0.5})
+    found = shim_tray(build_magnet(far), posterior, Session.open(tmp_path), REGION)
+    assert found.filled == ()
+    assert found.after.rms_ppm == pytest.approx(found.before.rms_ppm)
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"rings": [{"radius_m": 0.098, "count": 8, "z_m": 0.035}]}, "place 1 .*touches block"),
+    ({"rings": [{"radius_m": 0.3, "count": 8}]}, "outside of the magnet"),
+    ({"rings": [{"radius_m": 0.025, "count": 4}]}, "touches the region"),
+    ({"rings": [{"radius_m": 0.08, "count": 70}]}, "touches that of place"),
+    ({"rings": [{"radius_m": 0.08, "count": 900}]}, "at most 6000 choices"),
+])
+def test_trays_that_do_not_fit(measured, tmp_path, changes, said):
+    _, _, _, posterior = measured
+    with pytest.raises(StudyError, match=said):
+        shim_tray(build_magnet(tray(**changes)), posterior, Session.open(tmp_path), REGION)
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"rings": []}, "needs 1 to 2000 places"),
+    ({"magnets": []}, "1 or more elements"),
+    ({"magnets": [DOCUMENT["shim_tray"]["magnets"][0] | {"material": "N42"}]}, "give either"),
+    ({"magnets": [DOCUMENT["shim_tray"]["magnets"][0] | {"count": 0}]}, "count"),
+    ({"magnets": DOCUMENT["shim_tray"]["magnets"][:1] * 2}, "two of the shim magnets are called"),
+])
+def test_trays_that_are_wrong(changes, said):
+    with pytest.raises(StudyError, match=said):
+        tray(**changes)
+
+
+def test_a_study_without_a_tray(measured, tmp_path):
+    study, _, _, posterior = measured
+    with pytest.raises(StudyError, match=r"Add \[shim_tray\]"):
+        shim_tray(build_magnet(study.with_(shim_tray=None)), posterior, Session.open(tmp_path))
+
+
+def test_command(measured, tmp_path, capsys):
+    _, _, data, _ = measured
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DOCUMENT))
+    write_map(data, tmp_path / "map.csv")
+    inferred, out = tmp_path / "inferred", tmp_path / "tray"
+    assert main(["infer", str(path), "-o", str(inferred), "--measurements",
+                 str(tmp_path / "map.csv")]) == 0
+    arguments = ["shim-tray", str(path), "--posterior", str(inferred / "posterior.h5"),
+                 "--sphere-m", "0.03", "-o", str(out)]
+    assert main(arguments) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "magnets in the 80 places of the tray" in said
+    summary = json.loads((out / "shim_tray.json").read_text())
+    with (out / "shim_tray.csv").open() as file:
+        table = list(csv.DictReader(line for line in file if line[0] != "#"))
+    assert len(table) == summary["places"] == 80
+    assert sum(bool(row["magnet"]) for row in table) == summary["magnets"]
+    page = (out / "shim_tray.html").read_text()
+    assert "in place of" in page
+    assert "(None" not in page
+    assert main([*arguments[:-1], str(tmp_path / "json"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == summary
