@@ -53,6 +53,9 @@ tray: of smaller ones, rounding decides."""
 
 EMPTY = -1
 
+ROUNDED = 12
+"""Decimals of the places in m, so that those on an axis are."""
+
 
 @dataclass(frozen=True)
 class Filled:
@@ -201,7 +204,7 @@ class _Choices:
                   for ring in tray.rings for z in ring.z_m
                   for phi in np.radians(ring.first_angle_deg) + 2 * np.pi * np.arange(
                       ring.count) / ring.count]
-        every = np.array([*places, *map(np.array, tray.places_m)])
+        every = np.array([*places, *map(np.array, tray.places_m)]).round(ROUNDED) + 0.0
         options = [(number, angle) for number, each in enumerate(tray.magnets)
                    for angle in each.angles_deg]
         if len(every) * len(options) > MOST_CHOICES:

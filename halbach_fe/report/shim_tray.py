@@ -97,7 +97,11 @@ def columns(found: FilledTray) -> dict[str, Iterable[object]]:
 
 
 def tray_figure(found: FilledTray) -> Figure:
-    """Draw the tray unrolled; arrows are polarizations, upwards ones away from the axis."""
+    """Draw the tray unrolled, seen from outside.
+
+    Arrows are polarizations: upwards ones point away from the axis, those to the right towards
+    larger angles.
+    """
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     axis = figure.subplots()
 
@@ -114,7 +118,7 @@ def tray_figure(found: FilledTray) -> Figure:
         angle, z = unrolled(np.array([one.position_m for one in mine]))
         turn = np.radians([one.from_radius_deg for one in mine])
         colour = COLOURS[number % len(COLOURS)]
-        axis.quiver(angle, z, np.sin(turn) * -1, np.cos(turn), pivot="mid", color=colour,
+        axis.quiver(angle, z, np.sin(turn), np.cos(turn), pivot="mid", color=colour,
                     scale=45, width=0.0035, label=name)
     axis.set(xlabel="angle about z in degrees", ylabel="z in mm", xlim=(-10, 360))
     axis.margins(y=0.2)
@@ -133,8 +137,8 @@ def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, st
         (found.model, found.before_known), (found.shimmed, found.after_known)))
     text = "Deviation of |B| from its mean over the region, in planes through its centre, with {}"
     pictures = save({
-        "shim_tray.png": (tray_figure(found), "The tray unrolled, seen from the axis. Arrows are "
-                          "polarizations; one that points up points away from the axis"),
+        "shim_tray.png": (tray_figure(found), "The tray unrolled, seen from outside. Arrows are "
+                          "polarizations: up is away from the axis, right is counter-clockwise"),
         "before.png": (slices_figure(before, found.before.mean_T), text.format("an empty tray")),
         "after.png": (slices_figure(after, found.after.mean_T), text.format("the filled tray"))},
         folder)
