@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,10 @@ def small_disk(tmp_path, request):
     if mounted.returncode:
         pytest.skip("mounting a small file system needs root")
     yield path
+    for _ in range(60):  # on a busy machine what was killed may take a while to end
+        if not subprocess.run(["umount", str(path)], capture_output=True, check=False).returncode:
+            return
+        time.sleep(0.5)
     subprocess.run(["umount", str(path)], check=True)
 
 
