@@ -58,8 +58,8 @@ Outcome = dict[str, Any]
 Generator = np.random.Generator
 
 WITHIN = 4.0
-"""Largest deviation of a term from its truth in standard deviations. A case has up to 18 of them,
-and one of 18 normal deviates is beyond in one case of 900."""
+"""Largest deviation of a term from its truth in standard deviations. A case has up to 12 of them,
+and one of 12 normal deviates is beyond in one case of 1 300."""
 
 ALMOST_ZERO = 1e-2
 """Odds of a pose below which it is no answer."""
@@ -131,7 +131,7 @@ def reversed_probe(generator: Generator, session: Session) -> Outcome:
 
 
 def sensors_apart(generator: Generator, session: Session) -> Outcome:
-    """Find where the sensors of a probe are, how it is turned, and its gains."""
+    """Find where the sensors of a probe are that is turned too, with other gains."""
     sensors = SENSORS_M * generator.standard_normal((3, 3))
     sensors -= sensors.mean(axis=0)
     check = checked(generator, sensors, ROLL_RAD * generator.standard_normal(3),
@@ -146,7 +146,7 @@ def sensors_apart(generator: Generator, session: Session) -> Outcome:
 
 
 def two_maps(generator: Generator, session: Session) -> Outcome:
-    """Find the poses of two overlapping maps, and the gains of their probe."""
+    """Find the poses of two overlapping maps by a probe of other gains."""
     source = truth(generator, generator.uniform(0.005, 0.02))
     gain = 0.005 * generator.standard_normal(3)
     maps, right = {}, {}

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     magnet, region = build_magnet(study), region_of(arguments)
     posterior = read_posterior(magnet, arguments.posterior)["posterior"]
     with common.session(arguments, study) as session:
-        found = shim_tray(magnet, posterior, session, region)
+        found = shim_tray(magnet, session, posterior, region)
     write_shim_tray(found, arguments.output, {"GetDP": session.getdp.version, **common.digests(
         {"study file": arguments.study, "posterior": arguments.posterior})})
     if arguments.json:

@@ -8,8 +8,9 @@ until none helps, then the best change of two places at once, and so on. A shim 
 uncertain adds the square of its field times that uncertainty, so that weak gains are not bought
 with many magnets.
 
-The shims' field is that of cuboids in vacuum. What permeable blocks and iron answer to it is left
-out; it counts among the uncertainty of the shims' strength.
+The shims' field is that of cuboids in vacuum. What permeable blocks answer to it is left out; it
+counts among the uncertainty that all shims' strengths share. Magnets with iron, which answers more,
+are refused.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, vector
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
-from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
+from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
+from halbach_fe.inference.result import InferenceResult
 from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.homogeneity import (
     PPM,
@@ -36,6 +38,7 @@ from halbach_fe.response.homogeneity import (
     homogeneity_model,
 )
 from halbach_fe.solver.exact_block_field import unit_field
+from halbach_fe.solver.separate_blocks import present_blocks
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.grades import grade
@@ -52,6 +55,9 @@ LEAST_GAIN = 1e-9
 tray: of smaller ones, rounding decides."""
 
 EMPTY = -1
+
+LATTICE = 9
+"""Points along each side of a magnet that must be outside of the region."""
 
 ROUNDED = 12
 """Decimals of the places in m, so that those on an axis are."""
@@ -90,7 +96,8 @@ class FilledTray(ShownInNotebook):
     model : HomogeneityModel
         The linear model of the field in the region, without the shims.
     shimmed : HomogeneityModel
-        The same with the shims, whose relative strengths are its last parameters.
+        The same with the shims, whose relative strengths are its last parameters: of each, and of
+        all together.
     before_known, after_known : Gaussian
         Distributions of the parameters of both models.
     before, after : Homogeneity
@@ -115,7 +122,8 @@ class FilledTray(ShownInNotebook):
 
 @alone
 def shim_tray(
-    magnet: Magnet, posterior: Gaussian, session: Session, region: Region | None = None
+    magnet: Magnet, session: Session, posterior: Gaussian | InferenceResult,
+    region: Region | None = None,
 ) -> FilledTray:
     """Choose small magnets for the places of a shim tray so that the field becomes homogeneous.
 
@@ -123,10 +131,10 @@ def shim_tray(
     ----------
     magnet : Magnet
         Its study has a ``shim_tray``.
-    posterior : Gaussian
-        Distribution of the magnetizations of the measured magnet in A/m.
     session : Session
         Its folder receives the runs of GetDP and the response matrix.
+    posterior : Gaussian or InferenceResult
+        Distribution of the magnetizations of the measured magnet in A/m.
     region : Region, optional
         By default the sphere about the origin of half the radius of the bore.
 
@@ -137,8 +145,8 @@ def shim_tray(
     Raises
     ------
     StudyError
-        If the study is a cross-section or has no tray, or a magnet of the tray would touch the
-        region, a block, iron or another place.
+        If the study is a cross-section, has no tray or has iron, or a magnet of the tray would
+        touch the region, a block or another place.
 
     Examples
     --------
@@ -147,7 +155,7 @@ def shim_tray(
     ...     {"name": "cube", "size_m": [0.005] * 3, "remanence_T": 1.2, "count": 8}]}
     >>> magnet = hf.build_magnet(hf.read_study("mri.toml").with_(shim_tray=tray))
     >>> known = hf.homogeneity(magnet, hf.Session.open("results")).distributions["prior"]
-    >>> found = hf.shim_tray(magnet, known, hf.Session.open("tray"))
+    >>> found = hf.shim_tray(magnet, hf.Session.open("tray"), known)
     >>> found.after.rms_ppm <= found.before.rms_ppm
     True
     """
@@ -155,6 +163,8 @@ def shim_tray(
     if tray is None:
         raise StudyError(must_be("`shim_tray`", f"study {magnet.name}", "a tray with its magnets",
                                  "nothing", "Add [shim_tray], see docs/design.md."))
+    if isinstance(posterior, InferenceResult):
+        posterior = posterior.posterior
     region = region or default_region(magnet)
     choices = _Choices.of(tray, magnet.name)
     _check(magnet, choices, region)
@@ -164,10 +174,10 @@ def shim_tray(
     shimmed, known = _with_shims(model, posterior, choices.fields(model.points, chosen), tray)
     filled = []
     for place in np.flatnonzero(chosen != EMPTY).tolist():
-        number, angle = divmod_of(choices, int(chosen[place]))
+        number, angle = choices.magnet_and_angle(int(chosen[place]))
         azimuth = float(np.degrees(choices.azimuth[place]))
         filled.append(Filled(place + 1, vector(choices.places[place]), tray.magnets[number], angle,
-                             (azimuth + angle) % 360))
+                             round(azimuth + angle, 6) % 360))
     left = {each.name: each.count for each in tray.magnets}
     for one in filled:
         left[one.magnet.name] -= 1
@@ -240,21 +250,20 @@ class _Choices:
                          @ self._direction(place, option))
         return np.array(found).reshape(-1, len(points), 3)
 
+    def magnet_and_angle(self, option: int) -> tuple[int, float]:
+        """Return the number of the magnet of a choice, and its angle from the radius in degrees."""
+        return int(self.kind[option]), float(self.angle[option])
+
     def _direction(self, place: int, option: int) -> Floats:
         """Return the direction (3,) of a polarization."""
         angle = self.azimuth[place] + np.radians(self.angle[option])
         return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-def divmod_of(choices: _Choices, option: int) -> tuple[int, float]:
-    """Return the number of the magnet and its angle from the radius in degrees."""
-    return int(choices.kind[option]), float(choices.angle[option])
-
-
 def _block(magnet: ShimMagnet, place: Floats, azimuth: float, number: int) -> MagnetBlock:
     """Return a magnet of the inventory in a place of the tray."""
     x, y, z = np.array(magnet.size_m) / 2
-    remanence = magnet.remanence_T or float(np.mean(grade(str(magnet.material)).remanence_T))
+    remanence = magnet.remanence_T or grade(str(magnet.material)).nominal_remanence
     return MagnetBlock(
         ring=0, slot=number, outline=closed_outline(np.array(
             [(-x, -y), (x, -y), (x, y), (-x, y)])), z_min=-float(z), z_max=float(z),
@@ -270,6 +279,11 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
     """
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3, for a shim tray", "2"))
+    if magnet.iron:
+        raise StudyError(must_be(
+            "`shim_tray`", f"study {magnet.name}", "in a magnet without iron", "iron",
+            "What iron answers to the shims is not computed: leave it out and measure again with "
+            "the tray filled."))
     study = f"study {magnet.name}"
     sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0).tolist()
     largest = choices.tray.magnets[0].with_(size_m=tuple(sizes))
@@ -284,18 +298,21 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
 
     if touched := overlapping_blocks(blocks):
         refuse(touched[1], f"that of place {touched[0] + 1}", "Take fewer or smaller magnets.")
-    if touched := block_in_others(blocks, magnet.blocks):
-        refuse(touched[0], f"block {magnet.blocks[touched[1]].name}",
-               "Is the tray within the bore?")
-    if magnet.iron and (touched := block_in_iron(blocks, magnet.iron)):
-        refuse(touched[0], "iron", "Is the tray within the bore?")
+    others = present_blocks(magnet.blocks) + neighbour_blocks(
+        magnet.blocks, magnet.external.neighbours)
+    if touched := block_in_others(blocks, others):
+        refuse(touched[0], f"block {others[touched[1]].name}", "Is the tray within the bore?")
     outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
     if (outer > magnet.radius).any():
-        refuse(int(np.argmax(outer)), "nothing: it is outside of the magnet",
-               "Is its radius in metres?")
+        raise StudyError(must_be(
+            f"place {int(np.argmax(outer)) + 1} of `shim_tray`", study, "within the magnet, whose "
+            f"radius is {1e3 * magnet.radius:.4g} mm", f"{1e3 * outer.max():.4g} mm from the axis",
+            "Is it in metres?"))
     points, _ = region.points(12)
+    lattice = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, LATTICE)]), axis=-1).reshape(-1, 3)
     for number, block in enumerate(blocks):
-        if block.contains(points).any() or region.contains(block.middle[None]).any():
+        own = block.from_frame(lattice * sizes)
+        if block.contains(points).any() or region.contains(own).any():
             refuse(number, "the region whose field is to be homogeneous",
                    "Choose a smaller region or a tray of larger radius.")
 
@@ -318,7 +335,9 @@ def _best(
     target = whitened(field[:len(inner)][inner])
     effect = whitened(choices.all_fields(model.points[:len(inner)][inner]))
     flat = effect.reshape(-1, effect.shape[-1])
-    search = _Search(flat @ flat.T, flat @ target, float(target @ target), tray.strength_sd**2,
+    # an error that all shims share adds the square of their whole field
+    search = _Search((1 + tray.common_sd**2) * (flat @ flat.T), flat @ target,
+                     float(target @ target), tray.strength_sd**2,
                      np.tile(choices.kind, len(choices.places)), len(choices.places),
                      np.array([each.count for each in tray.magnets]))
     return search.run()
@@ -439,13 +458,16 @@ def _with_shims(
 ) -> tuple[HomogeneityModel, Gaussian]:
     """Return the model with shims of B (shims, n, 3) in T, and the distribution of parameters.
 
-    Its last parameters are the errors of the shims' strengths in their standard deviations.
+    Its last parameters are the errors of the shims' strengths, and the one that they share, in
+    their standard deviations.
     """
     columns = fields.reshape(len(fields), 3 * len(model.points)).T
+    whole = columns.sum(axis=1)
     response = replace(
-        model.response, matrix=np.hstack([model.response.whole, tray.strength_sd * columns]),
-        offset=model.response.offset + columns.sum(axis=1),
-        nominal=np.append(model.response.nominal, np.zeros(len(fields))),
-        parameters=model.response.parameters + tuple(
-            f"shim {number}" for number in range(1, len(fields) + 1)))
-    return replace(model, response=response), with_variations(posterior, len(fields))
+        model.response, matrix=np.hstack([
+            model.response.whole, tray.strength_sd * columns, tray.common_sd * whole[:, None]]),
+        offset=model.response.offset + whole,
+        nominal=np.append(model.response.nominal, np.zeros(len(fields) + 1)),
+        parameters=(*model.response.parameters, *(
+            f"shim {number}" for number in range(1, len(fields) + 1)), "all shims"))
+    return replace(model, response=response), with_variations(posterior, len(fields) + 1)

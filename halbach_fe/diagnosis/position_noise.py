@@ -146,7 +146,8 @@ def _of_map(
     rows = np.arange(count)
     if count > MAX_READINGS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MAX_READINGS, replace=False))
-    magnet = update.magnet.with_study(scanned.study_of(update.study))
+    # the whitening contains the present noise of positions in the gradient of this magnet
+    magnet = update.noise_magnet.with_study(scanned.study_of(update.study))
     moved = noise.whitening @ readings_per_displacement(magnet, analysis, points, np.ones(3))
     scale, smooth = SMOOTH_SCALE * float(np.median(noise.sd)), []
     for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):

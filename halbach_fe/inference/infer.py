@@ -117,10 +117,12 @@ def infer(
     noises: Noises = {}
     solved: _Solved | None = None
     at = _Estimate.of(magnet, session) if len(open_terms) else None
-    uncertain = any(one.study.noise is not None and one.study.noise.position_sd_m is not None
+    uncertain = any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
                     for one in maps)
     estimated: tuple[MagnetBlock, ...] | None = None
-    for _ in range(ROUNDS + uncertain):
+    rounds = 0
+    while rounds < ROUNDS:
+        rounds += 1
         readings = read_campaign(magnet, maps, noises, estimated)
         if solved is None:
             check_validation_map(readings, magnet.study)
@@ -158,8 +160,8 @@ def infer(
             at = replace(at, deviations=values - model.nominal)
         if at_rest and not uncertain:
             break
-        if at_rest:  # once more, with the noise that positions make in this magnet's gradient
-            uncertain, noises = False, {}
+        if at_rest:  # again, with the noise that positions make in this magnet's gradient
+            uncertain, noises, rounds = False, {}, 0
             estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
         warnings.warn(
@@ -192,7 +194,8 @@ def infer(
         terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
                               at_rest, _poses(open_terms, maps, whole))
         if len(open_terms) else None,
-        overlaps=overlaps(matrix, residual, errors, whole_prior, readings))
+        overlaps=overlaps(matrix, residual, errors, whole_prior, readings),
+        noise_blocks=estimated)
 
 
 @dataclass(frozen=True)

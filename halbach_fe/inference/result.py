@@ -7,7 +7,7 @@ of them, with error bars, and the predictions are compared with the readings reg
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.matrix import Response
@@ -250,6 +251,9 @@ class InferenceResult(ShownInNotebook):
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
     overlaps : tuple of Overlap
         How maps agree where they overlap.
+    noise_blocks : tuple of MagnetBlock or None
+        Blocks in whose gradient uncertain positions make the noise, as a first update estimated
+        them; None if they are the nominal ones.
 
     Examples
     --------
@@ -282,6 +286,13 @@ class InferenceResult(ShownInNotebook):
     left_out: float = 0.0
     terms: InstrumentTerms | None = None
     overlaps: tuple[Overlap, ...] = ()
+    noise_blocks: tuple[MagnetBlock, ...] | None = None
+
+    @property
+    def noise_magnet(self) -> Magnet:
+        """The magnet in whose gradient uncertain positions make the noise."""
+        return self.magnet if self.noise_blocks is None else replace(
+            self.magnet, blocks=self.noise_blocks)
 
     @property
     def is_campaign(self) -> bool:

@@ -4,7 +4,8 @@ The map is fitted by a field of sources outside the mapped region (`halbach_fe.m
 harmonic_field`), of which no magnet is assumed. An instrument that exchanges axes, reverses signs,
 has its three sensors in three places or turns during the scan makes a map that no such field has;
 its parameters are fitted together with the field. What remains is the model-free floor: no model of
-a magnet can explain the map any better.
+a magnet explains the map any better, except within a spacing of the points from edges of magnets,
+where the sources outside follow the field less well.
 
 Some errors no map can show by itself: a common factor or sign of all components, a shift of the
 whole map, a uniform offset, and a position axis that counts backwards (the map of a mirrored
@@ -290,7 +291,8 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     matrix, alike = _orientation(*seen, spacing)
     say("fitting the field and the instrument")
     gap, sensors, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing)
-    charges = Charges.around(_read_at(places, sensors), gap)
+    # around all rows, of which those that are not fitted are read too
+    charges = Charges.around(_read_at(points[usable], sensors), gap)
     turned = field @ matrix.T
     model = ProbeModel(charges, points, turned, time, directions)
     train = fit_probe(model, train_rows, first_fit)
@@ -311,7 +313,9 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     if far_off.any():
         usable, chosen = usable & ~far_off, chosen & ~far_off
         held_out = _held_out(lines, chosen)
-        train = fit_probe(model, chosen & ~held_out, fit, train)
+        for _ in range(WEIGHTINGS):  # the spikes took part in the weights
+            model = model.weighted(train, chosen & ~held_out)
+            train = fit_probe(model, chosen & ~held_out, fit, train)
         whole = fit_probe(model, chosen, fit, train)
     floor = turned[held_out] - model.readings(train, held_out)
     residual = turned - model.readings(whole)

@@ -102,8 +102,8 @@ def readings_per_displacement(
     The field gradient is that of the magnet's blocks in vacuum. The reaction field of recoil
     permeability and iron, some per cent of the field in the bore, is neglected: the result only
     sets the size of the noise. Deviations of the blocks have a gradient of their own, which is
-    the larger part where that of the nominal field is small, near the blocks of a dipole: an
-    update therefore estimates the noise again with the blocks as they are updated.
+    the larger part where the nominal field is uniform: an update therefore estimates the noise
+    again with the blocks as they are updated.
 
     Parameters
     ----------

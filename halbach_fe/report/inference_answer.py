@@ -39,7 +39,7 @@ def _prediction(result: InferenceResult) -> str:
 
 def _before(result: InferenceResult) -> str:
     """Say which magnet the update starts from."""
-    return ("the magnet as ordered" if result.measured_blocks is None
+    return ("the magnet before the update" if result.measured_blocks is None
             else "the magnet of the measured blocks")
 
 

@@ -14,6 +14,7 @@ from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
 from halbach_fe.design.tolerance import Tolerance
@@ -22,6 +23,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.report import shim_tray
 from halbach_fe.report.demagnetization import worst_block_table
 from halbach_fe.report.diagnosis import change_table, found_table, verdict
 from halbach_fe.report.forces import force_rows
@@ -98,6 +100,11 @@ def _(result: HomogeneityResult) -> str:
 @_html_of.register
 def _(result: Forces) -> str:
     return table(force_rows(result))
+
+
+@_html_of.register
+def _(result: FilledTray) -> str:
+    return table(shim_tray.homogeneity_rows(result)) + table(shim_tray.rows(result))
 
 
 @_html_of.register

@@ -14,6 +14,7 @@ from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
 from halbach_fe.design.tolerance import Tolerance
@@ -30,6 +31,7 @@ from halbach_fe.report.homogeneity import write_homogeneity
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.multipoles import write_multipoles
 from halbach_fe.report.plan import write_plan
+from halbach_fe.report.shim_tray import write_shim_tray
 from halbach_fe.report.shimming import write_shim
 from halbach_fe.report.solution import write_solution_report
 from halbach_fe.report.sorting import write_sorted
@@ -53,7 +55,7 @@ def write_report(result: object, folder: str | Path) -> Path:
     Parameters
     ----------
     result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
-HomogeneityResult, Forces, MeasurementPlan, Shim, SortedBlocks, \
+HomogeneityResult, Forces, MeasurementPlan, FilledTray, Shim, SortedBlocks, \
 Tolerance, DemagnetizationMap or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path
@@ -132,6 +134,12 @@ def _(result: HomogeneityResult, folder: str | Path) -> Path:
 def _(result: Forces, folder: str | Path) -> Path:
     write_forces(result, Path(folder), provenance())
     return Path(folder) / "forces.html"
+
+
+@_write.register
+def _(result: FilledTray, folder: str | Path) -> Path:
+    write_shim_tray(result, Path(folder), provenance())
+    return Path(folder) / "shim_tray.html"
 
 
 @_write.register

@@ -32,18 +32,19 @@ def verdict(found: FilledTray) -> list[str]:
     region = found.model.region.text
     if not found.filled:
         return [f"Leave the tray empty: none of its magnets makes the field in {region} more "
-                f"homogeneous than {ppm(found.before.rms_ppm)} ppm rms."]
+                f"homogeneous than {ppm(found.before.rms_range_ppm[1])} ppm rms."]
+    (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
     text = [f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
-            f"the field in {region} deviates by {ppm(found.after.rms_ppm)} ppm rms (95 %: "
-            f"{low} to {high}) in place of {ppm(found.before.rms_ppm)}."]
+            f"the field in {region} deviates by {ppm(after)} ppm rms (95 %: "
+            f"{low} to {high}) in place of {ppm(before)}."]
     used_up = [name for name, count in found.left.items() if not count]
     if len(used_up) == len(found.left):
         text.append("The whole inventory is used: more magnets may do better.")
-    if found.before.rms_ppm < FEW * found.after.rms_ppm:
+    if before < FEW * after:
         text.append("That is hardly less: take larger magnets or more places, or look for what the "
                     "deviation comes from (halbach-fe homogeneity lists its harmonics).")
-    elif found.after.rms_range_ppm[1] > 2 * found.after.rms_ppm:
+    elif after > 2 * found.after.rms_ppm:
         text.append("What remains is mostly what the measurement and the strength of the shims "
                     "leave open: measure again with the tray filled, and fill a second one.")
     else:
@@ -64,10 +65,11 @@ def rows(found: FilledTray) -> list[dict[str, str]]:
 def homogeneity_rows(found: FilledTray) -> list[dict[str, str]]:
     """Return a row of text for the field before and after."""
     def row(name: str, known: Homogeneity) -> dict[str, str]:
-        low, _, high = map(ppm, known.rms_range_ppm)
+        low, middle, high = map(ppm, known.rms_range_ppm)
         return {"tray": name, "mean field": f"{1e3 * known.mean_T:.6g}\u00a0mT",
-                "rms in ppm": ppm(known.rms_ppm), "rms, 95 % in ppm": f"{low} to {high}",
-                "peak to peak in ppm": ppm(known.peak_to_peak_ppm)}
+                "rms in ppm": middle, "rms, 95 % in ppm": f"{low} to {high}",
+                "rms of the mean field in ppm": ppm(known.rms_ppm),
+                "peak to peak in ppm": ppm(known.peak_to_peak_range_ppm[1])}
 
     return [row("empty", found.before), row("filled", found.after)]
 
@@ -144,5 +146,4 @@ def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, st
         folder)
     write_page(folder / "shim_tray.html", "shim_tray.html.j2", pictures, study=found.magnet.study,
                provenance=provenance, verdict=verdict(found), rows=rows(found),
-               fields=homogeneity_rows(found), strength=100 * (
-                   found.magnet.study.shim_tray.strength_sd if found.magnet.study.shim_tray else 0))
+               fields=homogeneity_rows(found), tray=found.magnet.study.shim_tray)

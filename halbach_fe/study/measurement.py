@@ -240,8 +240,8 @@ class NoiseSettings(StudyModel):
     ``regions`` give the standard deviation of a reading; a map with a sigma of its own replaces
     them. ``position_sd_m`` is the standard deviation of every point's position along x, y and z (a
     single value holds for all three). The position uncertainty adds to the noise of both: it
-    changes the readings of a point by the local gradient of the nominal field, all components of
-    the point together, which is much in the fringe field and little in the homogeneous field.
+    changes the readings of a point by the local gradient of the field, all components of the point
+    together, which is much in the fringe field and little in the homogeneous field.
     """
 
     regions: tuple[NoiseRegion, ...] = ()

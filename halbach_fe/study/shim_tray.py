@@ -37,9 +37,10 @@ class TrayRing(StudyModel):
 class ShimMagnet(StudyModel):
     """Cuboids of one kind that are there to fill a tray.
 
-    ``size_m`` is along the radius, the azimuth and z of a place. The polarization lies across z, at
-    one of ``angles_deg`` from the radius, counted counter-clockwise: those at which a cuboid fits
-    into its place, four for a cube.
+    ``size_m`` is along the radius, the azimuth and z of a place; the radius of a place on the z
+    axis is the x axis. The polarization lies across z, at one of ``angles_deg`` from the radius,
+    counted counter-clockwise: multiples of 90 degrees for a square, those of 180 degrees otherwise,
+    as magnets are turned in their place.
     """
 
     name: Annotated[Line, Field(min_length=1, max_length=100)]
@@ -47,8 +48,16 @@ class ShimMagnet(StudyModel):
     remanence_T: Remanence | None = None
     material: Material | None = None
     count: Annotated[int, Field(ge=1, le=1_000_000)]
-    angles_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=72)] = (
+    angles_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=4)] = (
         0.0, 90.0, 180.0, 270.0)
+
+    @model_validator(mode="after")
+    def _turns_in_its_place(self) -> Self:
+        step = 90 if self.size_m[0] == self.size_m[1] else 180
+        if any(angle % step for angle in self.angles_deg):
+            raise ValueError(f"angles_deg of shim magnet '{self.name}' must be multiples of "
+                             f"{step}, so that it fits into its place")
+        return self
 
     @model_validator(mode="after")
     def _has_strength(self) -> Self:
@@ -61,14 +70,15 @@ class ShimTray(StudyModel):
     """Places for small magnets, and the magnets that are there.
 
     Places are those of ``rings``, in their order, followed by ``places_m``. ``strength_sd`` is the
-    relative standard deviation of a magnet's field: of its remanence, and of what permeable blocks
-    answer, which is left out.
+    relative standard deviation of the field of each magnet, and ``common_sd`` that of all together:
+    of the remanence of a delivery, and of what permeable blocks answer, which is left out.
     """
 
     rings: tuple[TrayRing, ...] = ()
     places_m: tuple[Point, ...] = ()
     magnets: Annotated[tuple[ShimMagnet, ...], Field(min_length=1)]
-    strength_sd: Annotated[float, Field(ge=0.0, le=0.5)] = 0.03
+    strength_sd: Annotated[float, Field(ge=0.0, le=0.5)] = 0.02
+    common_sd: Annotated[float, Field(ge=0.0, le=0.5)] = 0.02
 
     @model_validator(mode="after")
     def _has_places(self) -> Self:

@@ -19,11 +19,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.notebook import html_of
+from halbach_fe.report.result_files import write_report
 from halbach_fe.response.homogeneity import PPM, Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 
-NOISE_T, STRENGTH_SD = 2e-6, 0.03
+NOISE_T, STRENGTH_SD = 2e-6, 0.02
 REGION = Region.sphere(0.03)
 
 DOCUMENT = {
@@ -71,9 +73,10 @@ def true_magnet(magnet, generator):
 
 def shims(filled, generator=None, turned_deg=0.0):
     """magpylib's magnets of a tray, perhaps of uncertain strength, or all turned."""
-    sources = []
+    sources, common = [], STRENGTH_SD * generator.standard_normal() if generator else 0.0
     for one in filled:
-        strength = 1.2 * (1 + (STRENGTH_SD * generator.standard_normal() if generator else 0.0))
+        own = STRENGTH_SD * generator.standard_normal() if generator else 0.0
+        strength = 1.2 * (1 + common + own)
         angle = np.radians(one.direction_deg + turned_deg)
         x, y, _ = one.position_m
         sources.append(cuboid(
@@ -104,10 +107,12 @@ def measured(tmp_path_factory):
 
 def test_the_field_becomes_homogeneous_as_foretold(measured, tmp_path):
     study, truth, _, posterior = measured
-    found = shim_tray(build_magnet(study), posterior, Session.open(tmp_path), REGION)
+    found = shim_tray(build_magnet(study), Session.open(tmp_path), posterior, REGION)
     points, _ = REGION.points(36)
     bare = truth.getB(points)
     assert found.before.rms_ppm == pytest.approx(rms_ppm(bare), rel=0.01)
+    assert "tray" in html_of(found)
+    assert write_report(found, tmp_path / "report").name == "shim_tray.html"
     generator = np.random.default_rng(5)
     after = [rms_ppm(bare + shims(found.filled, generator).getB(points)) for _ in range(20)]
     low, middle, high = found.after.rms_range_ppm
@@ -149,30 +154,33 @@ def test_the_search_finds_the_best_of_all(counts):
 
 def test_a_tray_that_cannot_help_stays_empty(measured, tmp_path):
     study, _, _, posterior = measured
-    weak = [{"name": "huge", "size_m": [0.03] * 3, "remanence_T": 1.4, "count": 4}]
-    far = study.with_(shim_tray=DOCUMENT["shim_tray"] | {
-        "magnets": weak, "rings": [{"radius_m": 0.07, "count": 2}], "strength_sd": 0.5})
-    found = shim_tray(build_magnet(far), posterior, Session.open(tmp_path), REGION)
+    huge = [{"name": "huge", "size_m": [0.03] * 3, "remanence_T": 1.4, "count": 4}]
+    other = study.with_(shim_tray=DOCUMENT["shim_tray"] | {
+        "magnets": huge, "rings": [{"radius_m": 0.07, "count": 2}], "strength_sd": 0.5})
+    found = shim_tray(build_magnet(other), Session.open(tmp_path), posterior, REGION)
     assert found.filled == ()
     assert found.after.rms_ppm == pytest.approx(found.before.rms_ppm)
 
 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"rings": [{"radius_m": 0.098, "count": 8, "z_m": 0.035}]}, "place 1 .*touches block"),
-    ({"rings": [{"radius_m": 0.3, "count": 8}]}, "outside of the magnet"),
+    ({"rings": [{"radius_m": 0.3, "count": 8}]}, "within the magnet"),
     ({"rings": [{"radius_m": 0.025, "count": 4}]}, "touches the region"),
+    ({"rings": [{"radius_m": 0.0345, "count": 4}]}, "touches the region"),
     ({"rings": [{"radius_m": 0.08, "count": 70}]}, "touches that of place"),
     ({"rings": [{"radius_m": 0.08, "count": 900}]}, "at most 6000 choices"),
 ])
 def test_trays_that_do_not_fit(measured, tmp_path, changes, said):
     _, _, _, posterior = measured
     with pytest.raises(StudyError, match=said):
-        shim_tray(build_magnet(tray(**changes)), posterior, Session.open(tmp_path), REGION)
+        shim_tray(build_magnet(tray(**changes)), Session.open(tmp_path), posterior, REGION)
 
 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"rings": []}, "needs 1 to 2000 places"),
     ({"magnets": []}, "1 or more elements"),
+    ({"magnets": [{"name": "bar", "size_m": [0.005, 0.01, 0.005], "remanence_T": 1.0,
+                   "count": 1}]}, "multiples of 180"),
     ({"magnets": [DOCUMENT["shim_tray"]["magnets"][0] | {"material": "N42"}]}, "give either"),
     ({"magnets": [DOCUMENT["shim_tray"]["magnets"][0] | {"count": 0}]}, "count"),
     ({"magnets": DOCUMENT["shim_tray"]["magnets"][:1] * 2}, "two of the shim magnets are called"),
@@ -185,7 +193,7 @@ def test_trays_that_are_wrong(changes, said):
 def test_a_study_without_a_tray(measured, tmp_path):
     study, _, _, posterior = measured
     with pytest.raises(StudyError, match=r"Add \[shim_tray\]"):
-        shim_tray(build_magnet(study.with_(shim_tray=None)), posterior, Session.open(tmp_path))
+        shim_tray(build_magnet(study.with_(shim_tray=None)), Session.open(tmp_path), posterior)
 
 
 def test_command(measured, tmp_path, capsys):

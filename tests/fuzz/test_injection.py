@@ -30,6 +30,14 @@ TINY = changed(DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__
                open_boundary={"radius_m": 0.3}, prior={"types": {"a": [1, 2], "b": [3, 4]}},
                noise={"regions": [{"name": "bore", "sigma_T": 1e-4}]}, description="plain")
 
+
+
+def tray(**keys):
+    """A shim tray of one place, with one magnet."""
+    return {"places_m": [[0.05, 0.0, 0.0]], "magnets": [
+        {"name": "cube", "size_m": [0.005] * 3, "count": 1} | keys]}
+
+
 FIELDS = {
     "name": lambda text: {"name": text},
     "description": lambda text: {"description": text},
@@ -42,6 +50,8 @@ FIELDS = {
     "maps.name": lambda text: {"maps": [{"name": text, "file": "map.csv"}]},
     "maps.probe": lambda text: {"maps": [{"name": "a", "file": "map.csv", "probe": text}]},
     "maps.stage": lambda text: {"maps": [{"name": "a", "file": "map.csv", "stage": text}]},
+    "shim_tray.magnets.name": lambda text: {"shim_tray": tray(name=text, remanence_T=1.0)},
+    "shim_tray.magnets.material": lambda text: {"shim_tray": tray(material=text)},
     "array.ring.material": lambda text: {"array__ring": [{"material": text}]},
 }
 """All free text of a study, with what makes a study of it; names of files have tests below."""
@@ -64,7 +74,8 @@ def test_there_is_no_other_text():
     assert set(text_fields(Study.model_json_schema())) == {
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
         "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file", "MapSettings.name",
-        "MapSettings.file", "MapSettings.probe", "MapSettings.stage"}
+        "MapSettings.file", "MapSettings.probe", "MapSettings.stage", "ShimMagnet.name",
+        "ShimMagnet.material"}
 
 
 def hostile_studies():
@@ -100,7 +111,7 @@ def test_nothing_of_a_study_becomes_code_of_getdp(staged):
             content = content.replace(f"study {study.name},", "study dipole,")
             assert content == harmless[name], (field, text)
     assert taken == {"name", "description", "noise.regions.name", "prior.types", "maps.name",
-                     "maps.probe", "maps.stage"}
+                     "maps.probe", "maps.stage", "shim_tray.magnets.name"}
     assert refused == set(FIELDS)
     for payload in ("}; Exit; Group {", "../../../etc/passwd", "a\nb", "<< 7*7 >>"):
         with pytest.raises(StudyError):
