@@ -126,7 +126,8 @@ def update_of(residual, root, points=POINTS):
         positions=np.repeat(points, 3, axis=0),
         read=lambda fields: fields.reshape(len(fields), -1))
     return SimpleNamespace(
-        study=STUDY, magnet=build_magnet(STUDY), observation=observation,
+        study=STUDY, magnet=build_magnet(STUDY), noise_magnet=build_magnet(STUDY),
+        observation=observation,
         errors=independent_noise(np.full(count, NOISE_T)),
         held_out=np.zeros(count, bool), parts=("training",) * count, maps=(ONLY_MAP,) * count,
         readings=residual,
