@@ -61,6 +61,7 @@ def edited_text(text: str, steps: Iterable[tuple[Study, str]]) -> str:
         If a study is not valid.
     """
     notes = []
+    text = text.removeprefix("\ufeff")  # a byte order mark, which TOML does not know
     for study, note in steps:
         parse_study(study.model_dump(), f"changed study {study.name}")
         before = _parsed(text, study)

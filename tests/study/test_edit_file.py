@@ -99,6 +99,12 @@ def test_files_read_back_to_the_study(layout, names, seed):
             assert line.partition("#")[2].strip() in changed
 
 
+def test_a_byte_order_mark_is_no_part_of_the_study():
+    study = read_study(ROOT / "studies" / "faser" / "study.toml")
+    after = study.with_(array__inner_radius_m=0.9 * study.array.inner_radius_m)
+    assert edited_text(f"\ufeff{PLAIN}", [(after, "why")]) == edited_text(PLAIN, [(after, "why")])
+
+
 def test_nothing_to_change_is_the_file_itself():
     study = parse_study(tomllib.loads(PLAIN))
     assert edited_text(PLAIN, [(study, "not needed")]) == PLAIN
