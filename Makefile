@@ -18,6 +18,9 @@
 # make benchmark-scaling   time and memory by blocks, readings, unknowns of the mesh and workers
 # Both set up everything they need first (tools/setup.sh).
 
+# Without compiled files beside the sources every process of the tests would compile all again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup

@@ -17,6 +17,7 @@ from pathlib import Path
 from benchmarks import (
     calibration,
     campaign_kinds,
+    design,
     diagnosis,
     inference,
     iron3d,
@@ -26,6 +27,7 @@ from benchmarks import (
     recovery,
     response,
     scaling,
+    speed,
     suspicion,
     unknown,
 )
@@ -38,9 +40,10 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
          "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
          "campaign_kinds": campaign_kinds.run, "real": real.emphatic, "real_mri": real.mri,
-         "faser": real.faser}
+         "faser": real.faser, "design": design.run, "speed": speed.run}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
-         "campaign_kinds", "real", "real_mri", "faser")
+         "campaign_kinds", "real", "real_mri", "faser",
+         "design", "speed")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from datetime import datetime
-from pathlib import Path
 
 from halbach_fe.cli import common
 from halbach_fe.solver.getdp_cache import default_cache
@@ -24,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     parser.add_argument("what", choices=("ls", "clear"),
                         help="list the entries, or remove all of them")
-    parser.add_argument("--cache", type=Path, metavar="DIR",
+    parser.add_argument("--cache", type=common.path, metavar="DIR",
                         help="folder of the cache (default: $HALBACH_FE_CACHE, then "
                         "~/.cache/halbach-fe)")
     common.add_json_argument(parser)

@@ -12,17 +12,15 @@ probe without errors would have read.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("map", type=InputFile, metavar="MAP",
+    parser.add_argument("map", type=common.input_file, metavar="MAP",
                         help="field map (CSV, HDF5 or VTU); see import-map for other formats")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR",
+    parser.add_argument("-o", "--output", type=common.path, metavar="DIR",
                         help="folder for the page and its files")
     common.add_json_argument(parser)
 
@@ -32,6 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.measurement.field_map import read_map
     from halbach_fe.measurement.map_check import check_map
     from halbach_fe.report.map_check import (
+        answer,
         check_summary,
         instrument_table,
         sentences,
@@ -50,6 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
     for sentence in sentences(check):
         common.say(sentence)
     common.print_table(instrument_table(check), "The instrument, by the map alone")
-    if arguments.output is not None:
-        common.say(f"Report: {arguments.output / 'check.html'}")
+    common.say_answer(arguments, answer(check),
+                      None if arguments.output is None else arguments.output / "check.html")
     return 0

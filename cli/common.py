@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import io
 import json
 import math
 import multiprocessing
@@ -27,11 +28,13 @@ from halbach_fe.cli.streams import say as say
 from halbach_fe.cli.streams import show
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, StudyError, must_be, printable
 from halbach_fe.core.files import InputFile
+from halbach_fe.core.numbers import LIMIT_PPM, LIMIT_UNITS
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from halbach_fe.measurement.block_table import BlockTable
+    from halbach_fe.report.answer import Answer
     from halbach_fe.response.multipoles import MultipoleReference
     from halbach_fe.response.resource_estimate import Estimate
     from halbach_fe.solver.getdp_cache import Cache
@@ -48,11 +51,10 @@ MAX_ORDER = 100
 MOST_MPI = 1024
 """Largest number of MPI processes of a run."""
 
-Number = TypeVar("Number", int, float)
+MOST_NAME_BYTES, MOST_PATH_BYTES = 255, 4095
+"""Longest name of a file or folder, and longest path, that Linux allows."""
 
-LIMITS = 1e-6, 1e6
-"""Smallest and largest limit of unwanted multipoles in units of 1e-4 of the main one: from 1e-10 of
-it, below all errors, to a hundred times it."""
+Number = TypeVar("Number", int, float)
 
 
 def add_study_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
@@ -119,11 +121,12 @@ def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = Tru
                         "large for a single process (default: %(default)s)")
     parser.add_argument("--scheduler", metavar="ADDRESS",
                         help="Dask scheduler whose workers run GetDP instead of this machine")
-    parser.add_argument("--cache", type=Path, metavar="DIR",
-                        help="folder of the cache of GetDP's answers (default: $HALBACH_FE_CACHE, "
-                        "then ~/.cache/halbach-fe)")
-    parser.add_argument("--no-cache", action="store_true",
-                        help="neither read nor write the cache of GetDP's answers")
+    answers = parser.add_mutually_exclusive_group()
+    answers.add_argument("--cache", type=path, metavar="DIR",
+                         help="folder of the cache of GetDP's answers (default: "
+                         "$HALBACH_FE_CACHE, then ~/.cache/halbach-fe)")
+    answers.add_argument("--no-cache", action="store_true",
+                         help="neither read nor write the cache of GetDP's answers")
     if time_limit:
         parser.add_argument("--time-limit", type=positive_number, default=GETDP_LIMIT_S,
                             metavar="SECONDS",
@@ -133,8 +136,8 @@ def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = Tru
 
 def add_study_and_output(parser: argparse.ArgumentParser) -> None:
     """Add STUDY and -o."""
-    parser.add_argument("study", type=InputFile, metavar="STUDY", help="study file (TOML)")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+    parser.add_argument("study", type=input_file, metavar="STUDY", help="study file (TOML)")
+    parser.add_argument("-o", "--output", type=path, required=True, metavar="DIR",
                         help="folder for results; made if it does not exist")
 
 
@@ -148,7 +151,7 @@ def run_study(
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.set_defaults(study=InputFile(study))
-    parser.add_argument("-o", "--output", type=Path, default=Path("results", output),
+    parser.add_argument("-o", "--output", type=path, default=Path("results", output),
                         metavar="DIR", help="folder for results (default: %(default)s)")
     add_solver_arguments(parser)
     options(parser)
@@ -201,7 +204,7 @@ def keep_input(output: Path, *inputs: Path) -> None:
 
 def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
     """Add --getdp."""
-    parser.add_argument("--getdp", metavar="PATH",
+    parser.add_argument("--getdp", type=given, metavar="PATH",
                         help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
 
 
@@ -231,32 +234,43 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
                         help="in 3D: multipoles on the circle at Z in m, instead of those of the "
                         "field integrated along z")
-    parser.add_argument("--limit-units", type=within(positive_number, *LIMITS), metavar="U",
+    parser.add_argument("--limit-units", type=within(positive_number, *LIMIT_UNITS), metavar="U",
                         help="largest unwanted multipole that is allowed, in units of 1e-4 of the "
                         "main multipole")
 
 
-def reference(arguments: argparse.Namespace) -> MultipoleReference:
-    """Return the reference that the options of `add_multipole_arguments` describe."""
+def add_objective_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of multipoles, and the limit of a study that asks for a homogeneous field."""
+    add_multipole_arguments(parser)
+    parser.add_argument("--limit-ppm", type=within(positive_number, *LIMIT_PPM), metavar="P",
+                        help="if the study has a table [homogeneity]: largest rms deviation of |B| "
+                        "in its region that is allowed, in ppm of the mean")
+
+
+def reference(arguments: argparse.Namespace) -> MultipoleReference | None:
+    """Return the reference that options of `add_multipole_arguments` describe, if any is given."""
     from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
 
+    given = (arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
+    if all(option is None for option in given):
+        return None
     return MultipoleReference(arguments.reference_radius_m, arguments.orders or DEFAULT_ORDERS,
                               arguments.at_z_m)
 
 
 def add_measurement_arguments(parser: argparse.ArgumentParser, several: bool = False) -> None:
     """Add --measurements and --blocks; ``several`` maps may be listed by the study instead."""
-    parser.add_argument("--measurements", type=InputFile, required=not several, metavar="MAP",
+    parser.add_argument("--measurements", type=input_file, required=not several, metavar="MAP",
                         help="measured field map (CSV or HDF5)"
                         + (", unless the study lists maps" if several else ""))
-    parser.add_argument("--blocks", type=InputFile, metavar="CSV",
+    parser.add_argument("--blocks", type=input_file, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
 
 
 def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
     """Add --held-out."""
-    parser.add_argument("--held-out", type=InputFile, metavar="MAP",
+    parser.add_argument("--held-out", type=input_file, metavar="MAP",
                         help="another map at other positions, which is predicted but does not "
                         "update the model")
 
@@ -289,7 +303,7 @@ def read_measurements(
     Raises
     ------
     StudyError
-        If both or neither are given.
+        If both or neither are given, or options describe the format of maps that are listed.
     """
     from halbach_fe.measurement.campaign import different_maps
 
@@ -299,6 +313,11 @@ def read_measurements(
             "both" if study.maps else "neither",
             "Leave --measurements out." if study.maps else "Add --measurements, or [[maps]]."))
     if study.maps:
+        if getattr(arguments, "held_out", None) is None and _describes_a_format(arguments):
+            raise StudyError(must_be(
+                "options of the format", "the command line", "left out, as the study lists its "
+                "maps", "given", "State maps.instrument.length_unit_m and flux_density_unit_T in "
+                "the study, or convert its maps by halbach-fe import-map."))
         return different_maps(study, _listed(arguments, study))
     return read_one(arguments, arguments.measurements)
 
@@ -307,18 +326,24 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     """Read a map, in halbach-fe's own columns or as the options of `import-map` describe it."""
     from halbach_fe.measurement.field_map import read_map
 
-    if not hasattr(arguments, "columns"):
+    if not _describes_a_format(arguments):
         return read_map(path)
     from halbach_fe.cli.format_options import declared_format
-    from halbach_fe.measurement.formats.declared import DeclaredFormat
     from halbach_fe.measurement.formats.files import import_map
 
-    declared = declared_format(arguments)
-    if declared == DeclaredFormat() and not arguments.format:
-        return read_map(path)
-    data = import_map(path, declared, arguments.format).data
+    data = import_map(path, declared_format(arguments), arguments.format).data
     data.encoding["source"] = str(path)
     return data
+
+
+def _describes_a_format(arguments: argparse.Namespace) -> bool:
+    """Tell whether any option says how a map in other columns or units is read."""
+    if not hasattr(arguments, "columns"):
+        return False
+    from halbach_fe.cli.format_options import declared_format
+    from halbach_fe.measurement.formats.declared import DeclaredFormat
+
+    return bool(declared_format(arguments) != DeclaredFormat() or arguments.format)
 
 
 def map_files(arguments: argparse.Namespace, study: Study) -> dict[str, Path | None]:
@@ -369,6 +394,28 @@ def within(
         return value
 
     return parsed
+
+
+def given(text: str) -> str:
+    """Return the text of an option, or refuse an empty one, as an unset variable of a shell is."""
+    if not text:
+        raise argparse.ArgumentTypeError("must not be empty")
+    return text
+
+
+def path(text: str) -> Path:
+    """Return a path, or refuse one that is empty (the current folder) or too long."""
+    raw = os.fsencode(given(text))
+    if len(raw) > MOST_PATH_BYTES or max(map(len, raw.split(b"/"))) > MOST_NAME_BYTES:
+        raise argparse.ArgumentTypeError(
+            f"must be a path of up to {MOST_PATH_BYTES} bytes, with names of up to "
+            f"{MOST_NAME_BYTES}, not {printable(text, 50)!r} of {len(raw)} bytes")
+    return Path(text)
+
+
+def input_file(text: str) -> InputFile:
+    """Return an input file, or refuse a path as `path` does."""
+    return InputFile(path(text))
 
 
 def count(text: str) -> int:
@@ -434,7 +481,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)
-        if arguments.scheduler:
+        if arguments.scheduler is not None:
             cluster = stack.enter_context(connected(arguments.scheduler))
             opened = replace(opened, run=cluster.run, jobs=arguments.jobs or cluster.cores)
         yield opened
@@ -450,7 +497,7 @@ def cache(arguments: argparse.Namespace) -> Cache | None:
 @contextmanager
 def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
     """Open an executor: processes of this machine, or the workers of --scheduler."""
-    if arguments.scheduler:
+    if arguments.scheduler is not None:
         from halbach_fe.solver.dask_cluster import connected
 
         with connected(arguments.scheduler) as cluster:
@@ -498,12 +545,14 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         MofNCompleteColumn,
         Progress,
         TextColumn,
+        TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
     console = Console(stderr=True)
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
-                  MofNCompleteColumn(), TimeRemainingColumn(), console=console, transient=True,
+                  MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+                  TimeRemainingColumn(), console=console, transient=True,
                   disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=None)
 
@@ -513,6 +562,21 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total)
 
         yield show
+
+
+def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None = None) -> None:
+    """Say the answer of a command, the command to go on with, and where its page is."""
+    named = answer.with_paths({
+        "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
+        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None))})
+    output = getattr(arguments, "output", None)
+    for sentence in named.sentences:
+        say(sentence)
+    if named.command:
+        command = named.command if output is None else named.command.replace("DIR/", f"{output}/")
+        say(f"  {command}")
+    if page is not None:
+        say(f"Report: {page}")
 
 
 def print_json(value: object) -> None:
@@ -532,7 +596,10 @@ def print_table(rows: Sequence[Mapping[str, str]], title: str = "") -> None:
 
     if not rows:
         return
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    # rich would write to standard output, if only an empty text: it gets another file like it
+    like_stdout = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding)
+    console = Console(file=like_stdout, force_terminal=sys.stdout.isatty() or None,
+                      width=None if sys.stdout.isatty() else 140)
     table = Table(title=title or None, title_justify="left")
     for number, name in enumerate(rows[0]):
         table.add_column(cell(name), justify="left" if number < 2 else "right")

@@ -10,15 +10,13 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-
-MOST_CELLS = 100
-"""Most cells across a block: their number in a block grows with the third power."""
+from halbach_fe.core.numbers import ACROSS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--across", type=common.within(common.positive, 1, MOST_CELLS), metavar="N",
+    parser.add_argument("--across", type=common.within(common.positive, *ACROSS), metavar="N",
                         help="cells across the thickness of a block (default: 6)")
 
 
@@ -27,6 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.demagnetization import (
+        answer,
         demagnetization_summary,
         worst_block_table,
         write_demagnetization,
@@ -43,7 +42,5 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         common.print_table(worst_block_table(result.by_block()),
                            "Blocks with the smallest margin")
-        common.say(f"{100 * result.share_beyond_now:.2g} % of the volume is past the knee at "
-                   f"{result.material.temperature_C:g} °C.")
-        common.say(f"Report: {arguments.output / 'demagnetization.html'}")
+        common.say_answer(arguments, answer(result), arguments.output / "demagnetization.html")
     return 0

@@ -148,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(diagnosis_summary(diagnosis, separating))
     else:
-        print_diagnosis(diagnosis, arguments.output)
+        print_diagnosis(diagnosis, arguments)
     return 0
 
 
@@ -170,13 +170,13 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
     return 0
 
 
-def print_diagnosis(diagnosis: Diagnosis, folder: Path) -> None:
-    """Print the verdict, the missing effects, and the scores before and after."""
-    from halbach_fe.report.diagnosis import change_table, found_table, residual_table, verdict
+def print_diagnosis(diagnosis: Diagnosis, arguments: argparse.Namespace) -> None:
+    """Print the missing effects, the scores before and after, and the answer."""
+    from halbach_fe.report.diagnosis import change_table, found_table, residual_table
+    from halbach_fe.report.diagnosis_answer import answer
 
-    common.say(" ".join(verdict(diagnosis)))
     if diagnosis.found_anything:
         common.print_table(found_table(diagnosis), "Missing from the study")
     common.print_table(change_table(diagnosis), "The model before and after")
     common.print_table(residual_table(diagnosis), "Rms difference of model and readings")
-    common.say(f"Report: {folder / 'diagnosis.html'}")
+    common.say_answer(arguments, answer(diagnosis), arguments.output / "diagnosis.html")

@@ -15,7 +15,6 @@ import tomllib
 from pathlib import Path
 
 from halbach_fe.cli import common
-from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.block_export import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
@@ -29,11 +28,11 @@ BLOCKS = "blocks"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("input", type=InputFile, metavar="MAP",
+    parser.add_argument("input", type=common.input_file, metavar="MAP",
                         help="map in m and T (CSV, HDF5 or VTU); for the format blocks, a study")
     parser.add_argument("--format", choices=(*WRITERS, BLOCKS), required=True,
                         help="format of FILE")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE",
+    parser.add_argument("-o", "--output", type=common.path, required=True, metavar="FILE",
                         help="file to write")
 
 

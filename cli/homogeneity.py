@@ -1,9 +1,10 @@
 """Compute how homogeneous the field of a magnet is in a region, in ppm and with error bars.
 
-The region is a sphere about the centre of the magnet (default: of half the radius of the bore), an
-ellipsoid or a cylinder. With --posterior the magnet is the measured one, otherwise those that the
-study's prior allows. Writes homogeneity.json, harmonics.csv if the region is a sphere,
-homogeneity.html and its figures.
+The region is a sphere, an ellipsoid or a cylinder: by default that of the study's table
+[homogeneity], or else the sphere about the centre of the magnet of half the radius of the bore.
+With --posterior the magnet is the measured one, otherwise those that the study's prior allows.
+Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and its
+figures.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
-from halbach_fe.core.files import InputFile
 
 if TYPE_CHECKING:
     from halbach_fe.response.homogeneity import Region
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--posterior", type=InputFile, metavar="H5",
+    parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     add_region_arguments(parser)
     parser.add_argument("--degrees", type=int, choices=range(1, 21), metavar="L",
@@ -32,7 +32,8 @@ def add_region_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that describe a region, see `region_of`."""
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument("--sphere-m", type=common.positive_number, metavar="R",
-                       help="radius of the sphere in m (default: half the radius of the bore)")
+                       help="radius of the sphere in m (default: the study's region, or half the "
+                       "radius of the bore)")
     shape.add_argument("--ellipsoid-m", type=common.positive_number, nargs=3,
                        metavar=("A", "B", "C"), help="half axes along x, y and z in m")
     shape.add_argument("--cylinder-m", type=common.positive_number, nargs=2,
@@ -52,19 +53,12 @@ def region_of(arguments: argparse.Namespace) -> Region | None:
     from halbach_fe.core.errors import StudyError, must_be
     from halbach_fe.response.homogeneity import Region
 
-    x, y, z = arguments.centre_m
-    if arguments.ellipsoid_m:
-        a, b, c = arguments.ellipsoid_m
-        return Region("ellipsoid", (a, b, c), (x, y, z))
-    if arguments.cylinder_m:
-        radius, length = arguments.cylinder_m
-        return Region("cylinder", (radius, radius, length / 2), (x, y, z))
-    if arguments.sphere_m:
-        return Region.sphere(arguments.sphere_m, (x, y, z))
-    if any(arguments.centre_m):
+    region = Region.of(arguments.sphere_m, arguments.ellipsoid_m, arguments.cylinder_m,
+                       arguments.centre_m)
+    if region is None and any(arguments.centre_m):
         raise StudyError(must_be("--centre-m", "the command line", "beside a region",
                                  "given alone", "Add --sphere-m R."))
-    return None
+    return region
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -73,10 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.homogeneity import (
+        answer,
         harmonic_rows,
         homogeneity_rows,
         homogeneity_summary,
-        verdict,
         write_homogeneity,
     )
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
@@ -94,8 +88,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(homogeneity_summary(found))
     else:
-        common.say(verdict(found))
-        common.print_table(homogeneity_rows(found), f"The field in {found.model.region.text}")
+        common.print_table(homogeneity_rows(found.by_name),
+                           f"The field in {found.model.region.text}")
         common.print_table(harmonic_rows(found), "Spherical harmonics in ppm of the mean field")
-        common.say(f"Report: {arguments.output / 'homogeneity.html'}")
+        common.say_answer(arguments, answer(found), arguments.output / "homogeneity.html")
     return 0

@@ -9,13 +9,11 @@ guessed.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
-from halbach_fe.core.files import InputFile
 from halbach_fe.measurement.field_map import points_of, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
@@ -23,8 +21,9 @@ from halbach_fe.study.types import COMPONENTS
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("file", type=InputFile, metavar="FILE", help="map as it was delivered")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="MAP",
+    parser.add_argument("file", type=common.input_file, metavar="FILE",
+                        help="map as it was delivered")
+    parser.add_argument("-o", "--output", type=common.path, required=True, metavar="MAP",
                         help="map to write: .csv, .h5 or .vtu")
     add_format_arguments(parser)
     common.add_json_argument(parser)

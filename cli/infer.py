@@ -96,13 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(inference_summary(result))
     else:
-        for sentence in answer(result):
-            common.say(sentence)
-        if result.disagreement:
-            common.say(f"Model and measurement disagree. {result.disagreement}")
-        common.print_table(score_table(result), "Median relative error, before and after")
+        common.print_table(score_table(result), "Differences of readings and predictions")
         common.print_table(term_table(result), "The instruments, estimated with the blocks")
         common.print_table(pose_table(result), "Where the maps lie in the magnet")
         common.print_table(overlap_table(result), "Maps where they overlap")
-        common.say(f"Report: {arguments.output / 'report.html'}")
+        common.say_answer(arguments, answer(result), arguments.output / "report.html")
     return 0

@@ -11,13 +11,12 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--posterior", type=InputFile, metavar="H5",
+    parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     common.add_multipole_arguments(parser)
 
@@ -27,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import multipoles
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.multipoles import multipoles_summary, write_multipoles
+    from halbach_fe.report.multipoles import answer, multipoles_summary, place_of, write_multipoles
     from halbach_fe.response.multipoles import text_table
     from halbach_fe.study.reader import read_study
 
@@ -45,6 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
         for model, columns in tables:
             common.print_table(text_table(**columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
-                "of the cross-section" if model.z is None else f"at z = {model.z:g} m"))
-        common.say(f"Report: {arguments.output / 'multipoles.html'}")
+                "of the cross-section" if model.z is None else f"on {place_of(model)}"))
+        common.say_answer(arguments, answer(tables, limit), arguments.output / "multipoles.html")
     return 0

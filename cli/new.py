@@ -7,16 +7,32 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
+import shlex
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
 
 from halbach_fe.cli import common
-from halbach_fe.study.template import MagnetTemplate, write_new_study
+from halbach_fe.core.errors import CommandLineError, must_be
+from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study, write_new_study
+
+LEAST_SIGMA_T = 1e-6
+"""Noise of the best probes in T."""
+
+STAGES_M = (1e-5, 1e-4)
+"""Errors in m of good and of usual stages."""
+
+FIELDS = 200
+"""About so many points suffice for the size of the field."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     template = MagnetTemplate()
-    parser.add_argument("study", type=Path, metavar="STUDY", help="file to write (TOML)")
+    parser.add_argument("study", type=common.path, metavar="STUDY", help="file to write (TOML)")
     strength = parser.add_mutually_exclusive_group()
     rings = parser.add_mutually_exclusive_group()
     groups = {"remanence-T": strength, "inner-radius-m": rings}
@@ -36,16 +52,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                             help=text if "default" in text or default is None
                             else f"{text} (default: {default})")
     parser.add_argument("--shape", choices=("sector", "trapezoid", "cuboid"),
-                        default=template.shape,
-                        help="shape of the blocks (default: %(default)s)")
+                        help=f"shape of the blocks (default: {template.shape})")
     strength.add_argument("--material", metavar="GRADE",
                         help="grade of the blocks, such as N42, in place of the remanence")
     rings.add_argument("--inner-radii-m", type=_radii, metavar="X,X,...", default=(),
-                       help="inner radii of rings that differ, in the order of z")
-    rings.add_argument("--free-blocks", type=Path, metavar="TABLE",
+                       help="inner radii of rings that differ, in the order of z; needs "
+                       "--ring-length-m")
+    rings.add_argument("--free-blocks", type=common.path, metavar="TABLE",
                        help="table of the blocks (CSV or HDF5), in place of rings")
+    rings.add_argument("--cube-m", type=common.positive_number, metavar="X",
+                       help="edge of cubes in rings on --radius-m; sets shape, radii and length")
+    parser.add_argument("--radius-m", type=common.positive_number, metavar="X",
+                        help="radius of the middles of the cubes of --cube-m")
     parser.add_argument("--iron-ring", action="store_true",
                         help="add an iron tube around the blocks")
+    parser.add_argument("--steel", metavar="NAME",
+                        help="steel of the iron tube, whose magnetization curve is known, such as "
+                        "aisi_1010; adds the tube")
+    parser.add_argument("--dsv-m", type=common.positive_number, metavar="X",
+                        help="diameter of a spherical volume in the middle, on whose surface the "
+                        "field is measured (default: circles along the magnet)")
 
 
 def _radii(text: str) -> tuple[float, ...]:
@@ -56,12 +82,72 @@ def _radii(text: str) -> tuple[float, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and print the command that solves it."""
     given = {name: value for name, value in vars(arguments).items()
-             if name in MagnetTemplate.__dataclass_fields__ and value is not None}
-    inner = max([*given["inner_radii_m"], given.get("inner_radius_m", 0.0)])
+             if name in MagnetTemplate.__dataclass_fields__ and value}
+    _check(given, arguments.radius_m)
+    if "cube_m" in given:
+        edge, radius = given["cube_m"], arguments.radius_m
+        given |= {"shape": "cuboid", "ring_length_m": edge,
+                  "inner_radius_m": round(radius - edge / 2, 9),
+                  "outer_radius_m": round(radius + edge / 2, 9)}
+    if "steel" in given:
+        given["iron_ring"] = True
+    inner = max([*given.get("inner_radii_m", ()), given.get("inner_radius_m", 0.0)])
     if inner:
         given.setdefault("outer_radius_m", round(1.8 * inner, 6))
+    path, folder = arguments.study, arguments.study.parent
     if "free_blocks" in given:
-        given["free_blocks"] = os.path.relpath(given["free_blocks"], arguments.study.parent)
-    write_new_study(arguments.study, MagnetTemplate(**given))
-    common.say(f"Wrote {arguments.study}. Next: halbach-fe solve {arguments.study} -o DIR")
+        given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
+    template = MagnetTemplate(**given)
+    magnet = build_magnet(parse_new_study(new_study(path.stem, template, folder), folder))
+    sigma, position = _noise(magnet)
+    write_new_study(path, replace(template, sigma_T=sigma, position_sd_m=position))
+    name = str(path) if not str(path).startswith("-") else f"./{path}"
+    common.say(f"Wrote {path}. Its noise suits the field of the magnet: {1e6 * sigma:g} µT for a "
+               f"reading, {1e6 * position:g} µm for a position. Next: halbach-fe solve "
+               f"{shlex.quote(name)} -o DIR")
     return 0
+
+
+def _noise(magnet: Magnet) -> tuple[float, float]:
+    """Return standard deviations of a reading in T and of a position in m that suit a magnet, of
+    one digit.
+
+    A good probe reads to a ten-thousandth of the largest field, but not below `LEAST_SIGMA_T`. A
+    stage is so exact that its errors make about the same noise, within `STAGES_M`. The field is
+    that of the blocks alone.
+    """
+    from halbach_fe.solver.exact_block_field import field_of, gradient_of
+
+    points = points_from(magnet.study.observation.positions)
+    points = points[::max(1, len(points) // FIELDS)]
+    sigma = max(LEAST_SIGMA_T, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
+    slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
+    stage = float(np.clip(sigma / slope if slope else np.inf, *STAGES_M))
+    return float(f"{sigma:.1g}"), float(f"{stage:.1g}")
+
+
+def _check(given: Mapping[str, object], radius_m: float | None) -> None:
+    """Refuse options that the study would not show beside others.
+
+    Raises
+    ------
+    CommandLineError
+    """
+    if "inner_radii_m" in given and "ring_length_m" not in given:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
+            "Rings that follow each other along z have a length."))
+    if ("cube_m" in given) != (radius_m is not None):
+        raise CommandLineError(must_be(
+            "--radius-m", "the command line", "given together with --cube-m", "one of them",
+            "Cubes have their middles at this radius."))
+    of_table = given.keys() - {"free_blocks", "multipole_order", "iron_ring", "steel", "dsv_m"}
+    for option, others, why in (
+            ("free_blocks", of_table, "The table has it."),
+            ("inner_radii_m", given.keys() & {"rings"}, "There is a ring of each radius."),
+            ("cube_m", given.keys() & {"shape", "outer_radius_m", "ring_length_m"},
+             "The cube has it.")):
+        if option in given and others:
+            raise CommandLineError(must_be(
+                f"--{min(others).replace('_', '-')}", "the command line",
+                f"left out with --{option.replace('_', '-')}", "both", why))

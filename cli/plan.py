@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Choose the positions, write the results, print a summary."""
     from halbach_fe.design.measurement_plan import plan_measurement
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.report.plan import plan_summary, write_plan  # imports matplotlib
+    from halbach_fe.report.plan import answer, plan_summary, plan_table, write_plan
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
@@ -33,7 +33,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(plan_summary(plan))
     else:
-        common.print_table([{"quantity": key, "value": str(value)}
-                            for key, value in plan_summary(plan).items()])
-        common.say(f"Report: {arguments.output / 'plan.html'}")
+        common.print_table(plan_table(plan), "The plan beside the positions of the study")
+        common.say_answer(arguments, answer(plan), arguments.output / "plan.html")
     return 0

@@ -9,13 +9,12 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_and_output(parser)
-    parser.add_argument("blocks", type=InputFile, metavar="BLOCKS",
+    parser.add_argument("blocks", type=common.input_file, metavar="BLOCKS",
                         help="table of measured blocks (CSV)")
     common.add_json_argument(parser)
 
@@ -25,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.block_prior import prior_from_blocks
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.prior import prior_summary, type_table, write_prior
+    from halbach_fe.report.prior import answer, prior_summary, type_table, write_prior
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
@@ -36,5 +35,5 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(prior_summary(magnet, prior))
     else:
         common.print_table(type_table(prior), "Measured blocks relative to the nominal, by type")
-        common.say(f"Report: {arguments.output / 'prior.html'}")
+        common.say_answer(arguments, answer(prior), arguments.output / "prior.html")
     return 0

@@ -14,11 +14,11 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
 
 if TYPE_CHECKING:
@@ -31,12 +31,13 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--measurements", type=InputFile, metavar="MAP",
+    parser.add_argument("--measurements", type=common.input_file, metavar="MAP",
                         help="measured field map (CSV or HDF5), unless the study lists maps")
-    parser.add_argument("--fit", type=_open_key, action="append", default=[], metavar="KEY=SD",
-                        help="a number of the study that is open, with its standard deviation, "
-                        "such as array.remanence_T=0.02, or instrument.z_scale=0.02 for the "
-                        "step of the map; can be given several times")
+    parser.add_argument("--fit", type=_open_key, action=_DifferentKeys, default=[],
+                        metavar="KEY=SD", help="a number of the study that is open, with its "
+                        "standard deviation, such as array.remanence_T=0.02, or "
+                        "instrument.z_scale=0.02 for the step of the map; can be given several "
+                        "times")
     parser.add_argument("--alternative", type=_open_keys, action="append", default=[],
                         metavar="KEY=SD,...", help="other numbers that may be open in place of "
                         "those of --fit; their odds are compared; can be given several times")
@@ -66,7 +67,24 @@ def _open_key(text: str) -> OpenKey:
 
 
 def _open_keys(text: str) -> list[OpenKey]:
-    return [_open_key(part.strip()) for part in text.split(",")]
+    found = [_open_key(part.strip()) for part in text.split(",")]
+    keys = [each.key for each in found]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise argparse.ArgumentTypeError(f"must name {key} once")
+    return found
+
+
+class _DifferentKeys(argparse.Action):
+    """An option that can be given several times, for another key each time."""
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        before = getattr(namespace, self.dest)
+        if any(each.key == values.key for each in before):
+            raise argparse.ArgumentError(self, f"is given twice for {values.key}; leave one out")
+        setattr(namespace, self.dest, [*before, values])
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -99,8 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(registration_summary(found))
         return 0
-    _print(found)
-    common.say(f"Report: {arguments.output / 'registration.html'}")
+    _print(arguments, found, arguments.output / "registration.html")
     return 0
 
 
@@ -113,6 +130,7 @@ def _run_campaign(
     from halbach_fe.inference.campaign_registration import register_maps, registered_study
     from halbach_fe.measurement.campaign import maps_of, with_paths_from
     from halbach_fe.report.registration import (
+        NOMINAL,
         UPDATED,
         registration_summary,
         write_campaign_registration,
@@ -131,15 +149,17 @@ def _run_campaign(
         return 0
     for number, (name, poses) in enumerate(found.items()):
         common.say(f"Map {name}:")
-        _print(poses, *([UPDATED] if number else []))
-        common.say(f"Report: {arguments.output / name / 'registration.html'}")
+        _print(arguments, poses, arguments.output / name / "registration.html",
+               UPDATED if number else NOMINAL, name)
     return 0
 
 
-def _print(found: Sequence[Registration], *before: str) -> None:
-    """Print what was found about one map."""
-    from halbach_fe.report.registration import pose_table, sentences
+def _print(arguments: argparse.Namespace, found: Sequence[Registration], page: Path,
+           *of_map: str) -> None:
+    """Print what was found about one map, see `halbach_fe.report.registration.answer`."""
+    from halbach_fe.report.registration import answer, pose_table, sentences
 
-    for sentence in sentences(found, *before):
+    for sentence in sentences(found):
         common.say(sentence)
-    common.print_table(pose_table(found, *before), "Where the map lies in the magnet")
+    common.print_table(pose_table(found, *of_map[:1]), "Where the map lies in the magnet")
+    common.say_answer(arguments, answer(found, *of_map), page)

@@ -11,15 +11,14 @@ import argparse
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError
-from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--measurements", type=InputFile, required=True, metavar="MAP",
+    parser.add_argument("--measurements", type=common.input_file, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
-    parser.add_argument("--blocks", type=InputFile, metavar="CSV",
+    parser.add_argument("--blocks", type=common.input_file, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
     common.add_multipole_arguments(parser)
@@ -31,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replace", type=common.count, default=0, metavar="N",
                         help="largest number of blocks replaced by blocks of the stock, or without "
                         "--stock by new ones (default: %(default)s)")
-    parser.add_argument("--stock", type=InputFile, metavar="CSV",
+    parser.add_argument("--stock", type=common.input_file, metavar="CSV",
                         help="table of measured blocks that may replace others: blocks "
                         "that are not in the magnet, without ring and slot")
     common.add_seed_argument(parser)
@@ -45,8 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.campaign import refuse_several_maps
-    from halbach_fe.report.shimming import move_table, shim_summary, write_shim
-    from halbach_fe.response.multipoles import text_table, unwanted_orders
+    from halbach_fe.report.shimming import answer, move_table, shim_summary, write_shim
+    from halbach_fe.response.multipoles import MultipoleReference, text_table, unwanted_orders
     from halbach_fe.study.reader import read_study
 
     if arguments.stock and not arguments.replace:
@@ -57,8 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_several_maps(magnet.study, "shim")
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
-    unwanted_orders(magnet, common.reference(arguments))  # refuse before the solves, which may
-    if stock:  # take long, what does not fit the study
+    # refuse before the solves, which may take long, what does not fit the study
+    unwanted_orders(magnet, common.reference(arguments) or MultipoleReference())
+    if stock:
         check_stock(magnet, stock, blocks.serial if blocks else None)
     with common.session(arguments, magnet.study) as session:
         result = infer(magnet, data, session, blocks)
@@ -74,5 +74,5 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_table(move_table(moves), "Moves")
         common.print_table(text_table(before=moves.before, after=moves.after),
                            "Multipoles in units of 1e-4")
-        common.say(f"Report: {arguments.output / 'shim.html'}")
+        common.say_answer(arguments, answer(moves, result), arguments.output / "shim.html")
     return 0

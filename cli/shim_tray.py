@@ -11,13 +11,12 @@ import argparse
 
 from halbach_fe.cli import common
 from halbach_fe.cli.homogeneity import add_region_arguments, region_of
-from halbach_fe.core.files import InputFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--posterior", type=InputFile, metavar="H5", required=True,
+    parser.add_argument("--posterior", type=common.input_file, metavar="H5", required=True,
                         help="posterior.h5 that halbach-fe infer wrote for this magnet")
     add_region_arguments(parser)
 
@@ -29,10 +28,10 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.shim_tray import (
         LISTED,
+        answer,
         homogeneity_rows,
         rows,
         shim_tray_summary,
-        verdict,
         write_shim_tray,
     )
     from halbach_fe.study.reader import read_study
@@ -47,11 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(shim_tray_summary(found))
     else:
-        common.say(" ".join(verdict(found)))
         common.print_table(homogeneity_rows(found), f"The field in {found.model.region.text}")
         table = rows(found)
         common.print_table(table[:LISTED], "The tray" if len(table) <= LISTED else
                            f"The first {LISTED} of {len(table)} magnets")
         common.say(f"Table: {arguments.output / 'shim_tray.csv'}")
-        common.say(f"Report: {arguments.output / 'shim_tray.html'}")
+        common.say_answer(arguments, answer(found), arguments.output / "shim_tray.html")
     return 0

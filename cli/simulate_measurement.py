@@ -64,15 +64,27 @@ def _effect(text: str) -> RequestedEffect:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate the campaign, write the results, print a summary."""
-    from halbach_fe.report.campaign import write_campaign_page  # imports matplotlib
+    from halbach_fe.report.campaign import answer, campaign_table, write_campaign_page
 
     study = read_study(arguments.study)
-    build_magnet(study)  # refuses, as every command does, what cannot be built
+    magnet = build_magnet(study)  # refuses, as every command does, what cannot be built
+    # before the simulation, which may take long; a refused study leaves no folder all the same
+    common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
     elements = Elements(arguments.element_size, arguments.order)
+    said = arguments.json
+
+    def progress(done: int, total: int) -> None:
+        """Say that the computation has begun: what is hidden has been checked by then."""
+        nonlocal said
+        if not said:
+            common.say("Computing the field with magpylib" + (
+                "." if magnet.is_vacuum else " and NGSolve, which may take minutes."))
+        said = True
+        show(done, total)
+
     with common.progress_bar("magpylib") as show:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
-                            arguments.hide_random, elements, show)
-    common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
+                                     arguments.hide_random, elements, progress)
     written = write_campaign(campaign, arguments.output)
     write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,
                         arguments.output, [common.digest(path) for path in written])
@@ -85,7 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table([{"quantity": key, "value": str(value)}
-                            for key, value in summary.items()])
-        common.say(f"Report: {arguments.output / 'campaign.html'}")
+        common.print_table(campaign_table(study, campaign.readings, campaign.held_out),
+                           "What was measured")
+        common.say_answer(arguments, answer(study, campaign.readings, campaign.held_out,
+                                            len(campaign.blocks)),
+                          arguments.output / "campaign.html")
     return 0

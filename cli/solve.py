@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     write_solution(solution, arguments.output)
     summary = solution.summary() | {
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output)}
-    from halbach_fe.report.solution import write_solution_report
+    from halbach_fe.report.solution import answer, field_table, write_solution_report
 
     write_solution_report(solution, arguments.output, {
         "study file": common.digest(arguments.study), "GetDP": solution.getdp,
@@ -52,7 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table([{"quantity": key, "value": str(value)}
-                            for key, value in summary.items()])
-        common.say(f"Report: {arguments.output / 'report.html'}")
+        common.print_table(field_table(solution), "The field at the study's positions")
+        common.say_answer(arguments, answer(solution), arguments.output / "report.html")
     return 0

@@ -18,11 +18,11 @@ from halbach_fe.core.errors import EXIT_CODES
 VERBS = {
     "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
     "multipoles": "multipoles", "homogeneity": "homogeneity",
-    "forces": "forces", "plan": "plan", "prior": "prior",
+    "forces": "forces", "design": "design", "cad": "cad", "plan": "plan", "prior": "prior",
     "shim": "shim", "shim-tray": "shim_tray", "sort": "sort",
     "tolerance": "tolerance", "demagnetization": "demagnetization",
     "simulate-measurement": "simulate_measurement", "import-map": "import_map", "check": "check",
-    "register": "register",
+    "register": "register", "report": "report",
     "export": "export",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
 """Name of the module of each verb."""
@@ -87,9 +87,13 @@ def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
 
 
 def _docstring(module: str) -> str:
-    """Return the docstring of a verb's module, without importing the module."""
+    """Return the docstring of a verb's module, without importing the module.
+
+    A docstring stands first in its file, so that the rest need not be parsed.
+    """
     source = Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
-    return ast.get_docstring(ast.parse(source)) or ""
+    first = source[:source.index('"""', 3) + 3]
+    return ast.get_docstring(ast.parse(first)) or ""
 
 
 def with_values(words: Sequence[str]) -> list[str]:

@@ -22,11 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Estimate the error, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.report.verification import (
-        difference_table,
-        verification_verdict,
-        write_verification,
-    )
+    from halbach_fe.report.verification import answer, difference_table, write_verification
+    from halbach_fe.report.words import flux_density
     from halbach_fe.response.mesh_convergence import verify
     from halbach_fe.response.resource_estimate import estimate_verify
     from halbach_fe.study.reader import read_study
@@ -45,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         common.print_table(
             difference_table(verification),
-            f"Route {verification.route}; relative to {verification.main_field_T:.4g} T")
-        common.say(verification_verdict(magnet, verification))
-        common.say(f"Report: {arguments.output / 'verification.html'}")
+            f"Changes of B in ppm of {flux_density(verification.main_field_T, 4)}, route "
+            f"{verification.route.replace('_', ' ')}")
+        common.say_answer(arguments, answer(verification), arguments.output / "verification.html")
     return 0

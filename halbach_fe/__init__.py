@@ -33,14 +33,19 @@ if TYPE_CHECKING:
     from halbach_fe.api import tolerance as tolerance
     from halbach_fe.core.errors import HalbachError as HalbachError
     from halbach_fe.core.errors import HalbachWarning as HalbachWarning
+    from halbach_fe.design.assembly import Assembly as Assembly
+    from halbach_fe.design.assembly import cad as cad
     from halbach_fe.design.demagnetization import DemagnetizationMap as DemagnetizationMap
     from halbach_fe.design.forces import Forces as Forces
     from halbach_fe.design.forces import forces as forces
     from halbach_fe.design.measurement_plan import MeasurementPlan as MeasurementPlan
+    from halbach_fe.design.ring_design import Designed as Designed
+    from halbach_fe.design.ring_design import design_rings as design_rings
     from halbach_fe.design.shim_tray import FilledTray as FilledTray
     from halbach_fe.design.shim_tray import shim_tray as shim_tray
     from halbach_fe.design.shimming import Shim as Shim
     from halbach_fe.design.sorting import SortedBlocks as SortedBlocks
+    from halbach_fe.design.tolerance import HomogeneityTolerance as HomogeneityTolerance
     from halbach_fe.design.tolerance import Tolerance as Tolerance
     from halbach_fe.diagnosis.result import Diagnosis as Diagnosis
     from halbach_fe.geometry.magnet import Magnet as Magnet
@@ -53,6 +58,7 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.field_map import read_map as read_map
     from halbach_fe.measurement.map_check import MapCheck as MapCheck
     from halbach_fe.measurement.map_check import check_map as check_map
+    from halbach_fe.report.campaign_report import campaign_report as campaign_report
     from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.mesh_convergence import Verification as Verification
@@ -75,8 +81,10 @@ _HOME = {
     "forces": "design.forces",
     "plan": "api", "shim": "api", "shim_tray": "design.shim_tray",
     "FilledTray": "design.shim_tray",
+    "design_rings": "design.ring_design", "Designed": "design.ring_design",
+    "cad": "design.assembly", "Assembly": "design.assembly",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
-    "write_report": "report.result_files",
+    "write_report": "report.result_files", "campaign_report": "report.campaign_report",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "MapCheck": "measurement.map_check", "Solution": "response.solution",
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
@@ -86,6 +94,7 @@ _HOME = {
     "Forces": "design.forces",
     "MeasurementPlan": "design.measurement_plan", "Shim": "design.shimming",
     "SortedBlocks": "design.sorting", "Tolerance": "design.tolerance",
+    "HomogeneityTolerance": "design.tolerance",
     "DemagnetizationMap": "design.demagnetization", "SimulatedCampaign": "synthetic.simulate",
     "HalbachError": "core.errors", "HalbachWarning": "core.errors"}
 """Module of each name: what is not used is not imported."""

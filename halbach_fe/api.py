@@ -16,13 +16,21 @@ import xarray as xr
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.numbers import ACROSS, DRAWS, LIMIT_UNITS, check_number
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
+from halbach_fe.design.objective import check_objective, objective_of
 from halbach_fe.design.shimming import Kind, Shim
 from halbach_fe.design.shimming import shim as choose_moves
 from halbach_fe.design.sorting import SortedBlocks, sort_blocks, sortable
-from halbach_fe.design.tolerance import Tolerance, assembled_prior, predict_tolerance
+from halbach_fe.design.tolerance import (
+    HomogeneityTolerance,
+    Tolerance,
+    assembled_prior,
+    predict_homogeneity,
+    predict_tolerance,
+)
 from halbach_fe.diagnosis import diagnose as diagnosis_room
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.result import Diagnosis
@@ -30,6 +38,7 @@ from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.inference.same_magnet import distributions_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
@@ -163,6 +172,8 @@ def diagnose(
     >>> diagnosis.study.name
     'dipole'
     """
+    if time_limit_s is not None:
+        check_number("time_limit_s", "diagnose", time_limit_s, 0)
     effect_by_name = {effect.name: effect for effect in catalogue()}
     for name in effects or ():
         if name not in effect_by_name:
@@ -205,6 +216,8 @@ def multipoles(
     ------
     StudyError
         If the reference does not fit the study, or the nominal magnet has no main multipole.
+    MeasurementError
+        If the posterior is that of another magnet.
 
     Examples
     --------
@@ -215,14 +228,13 @@ def multipoles(
     >>> model.main, sorted(multipoles)
     (1, ['prior'])
     """
+    known = None if posterior is None else distributions_of(magnet, posterior)
     reference = reference or MultipoleReference()
     references = [reference]
     if magnet.dimension == 3:
         references = [replace(reference, z_m=None), replace(reference, z_m=reference.z_m or 0.0)]
     models = multipole_models(magnet, references, session)
-    if isinstance(posterior, InferenceResult):
-        posterior = {"prior": posterior.prior, "posterior": posterior.posterior}
-    distributions = posterior or {"prior": assembled_prior(magnet, models[0].nominal)}
+    distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
         for model in models])
@@ -242,7 +254,7 @@ def homogeneity(
     session : Session
         Its folder receives the runs of GetDP and the response matrix.
     region : Region, optional
-        By default the sphere about the origin of half the radius of the bore.
+        By default the study's, or the sphere about the origin of half the radius of the bore.
     posterior : mapping of str to Gaussian, or InferenceResult, optional
         Distributions of the magnetizations in A/m by name. By default the study's prior of an
         assembled magnet is the only distribution.
@@ -257,6 +269,8 @@ def homogeneity(
     ------
     StudyError
         If the study is a cross-section, or the region reaches into material.
+    MeasurementError
+        If the posterior is that of another magnet.
 
     Examples
     --------
@@ -267,10 +281,10 @@ def homogeneity(
     >>> known.peak_to_peak_ppm > known.rms_ppm > 0
     True
     """
+    known = None if posterior is None else distributions_of(magnet, posterior)
+    check_number("degrees", "homogeneity", degrees, 1, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
-    if isinstance(posterior, InferenceResult):
-        posterior = {"prior": posterior.prior, "posterior": posterior.posterior}
-    distributions = posterior or {"prior": assembled_prior(magnet, model.response.nominal)}
+    distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
         distributions)
@@ -298,8 +312,9 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
     Raises
     ------
     StudyError
-        If there are fewer candidates than positions to choose, a position is not in air within the
-        meshed region, or the study does not observe flux densities.
+        If there are fewer candidates than positions to choose, or less than one position to
+        choose, a position is not in air within the meshed region, or the study does not observe
+        flux densities.
 
     Examples
     --------
@@ -308,6 +323,8 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
     >>> len(hf.plan(magnet, hf.Session.open("results"), points=8).points)
     8
     """
+    if points is not None:
+        check_number("points", "plan", points, 1, whole=True)
     return plan_measurement(magnet, session, points)
 
 
@@ -346,7 +363,8 @@ def shim(
     Raises
     ------
     StudyError
-        If ``stock`` is given without ``replacements``, or the reference does not fit the study.
+        If ``stock`` is given without ``replacements``, a number is out of its range, or the
+        reference does not fit the study.
     MeasurementError
         If the stock does not fit the study, or its blocks are in the magnet.
 
@@ -359,6 +377,11 @@ def shim(
     >>> bool(hf.shim(result, session, swaps=1, turns=0).before.orders)
     True
     """
+    for name, value in (("swaps", swaps), ("turns", turns), ("replacements", replacements),
+                        ("seed", seed)):
+        check_number(name, "shim", value, 0, whole=True)
+    if limit_units is not None:
+        check_number("limit_units", "shim", limit_units, *LIMIT_UNITS)
     if stock is not None and not replacements:
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
                          "replaced; instead replacements is 0. Give replacements.")
@@ -372,8 +395,11 @@ def shim(
 def sort(
     magnet: Magnet, blocks: BlockTable, session: Session,
     reference: MultipoleReference | None = None, seed: int = 1, progress: Progress | None = None,
+    turns: bool = False,
 ) -> SortedBlocks:
-    """Assign measured blocks to slots so that unwanted multipoles become small.
+    """Assign measured blocks to slots: for small multipoles, or a homogeneous field.
+
+    If the study has a table ``homogeneity``, the deviation of |B| in that region becomes small.
 
     Every block goes to a slot of its own type. The table may have more blocks than there are slots.
 
@@ -391,6 +417,9 @@ def sort(
         Seed of the random orders from which the search starts.
     progress : callable, optional
         Called with the number of starts done and their total number.
+    turns : bool
+        Whether blocks may also be turned in their slots, as far as shape and nominal magnetization
+        allow: a cube about its magnetization.
 
     Returns
     -------
@@ -399,7 +428,7 @@ def sort(
     Raises
     ------
     StudyError
-        If the reference does not fit the study.
+        If reference or region do not fit the study, or a number is out of its range.
     MeasurementError
         If the table does not fit the study, or has too few blocks of a type.
 
@@ -411,19 +440,23 @@ def sort(
     >>> assignment.left_over
     2
     """
+    check_number("seed", "sort", seed, 0, whole=True)
+    check_objective(magnet, reference, None, None)
     blocks = sortable(magnet, blocks)  # before the solves, which may take long
-    model = multipole_model(magnet, reference or MultipoleReference(), session)
+    model = objective_of(magnet, reference, session)
     return sort_blocks(magnet, blocks, model, np.random.default_rng(seed),
-                       progress or (lambda done, total: None))
+                       progress or (lambda done, total: None), turns)
 
 
 @alone
 def tolerance(
     magnet: Magnet, session: Session, blocks: BlockTable | None = None,
     reference: MultipoleReference | None = None, draws: int = 10_000,
-    limit_units: float | None = None, seed: int = 1,
-) -> Tolerance:
-    """Predict the multipoles of magnets whose blocks are drawn from the prior.
+    limit_units: float | None = None, seed: int = 1, limit_ppm: float | None = None,
+) -> Tolerance | HomogeneityTolerance:
+    """Predict the multipoles, or the homogeneity, of magnets whose blocks are drawn from the prior.
+
+    If the study has a table ``homogeneity``, it is the deviation of |B| in that region.
 
     Parameters
     ----------
@@ -441,16 +474,18 @@ def tolerance(
         Largest unwanted multipole that is allowed, in units of 1e-4 of the main multipole.
     seed : int
         Seed of the random draws.
+    limit_ppm : float, optional
+        Largest rms deviation of |B| that is allowed, in ppm, if the study asks for homogeneity.
 
     Returns
     -------
-    Tolerance
-        The multipoles to expect, and with a limit the share of the magnets that meet it.
+    Tolerance or HomogeneityTolerance
+        What to expect, and with a limit the share of the magnets that meet it.
 
     Raises
     ------
     StudyError
-        If the reference does not fit the study.
+        If reference, limit or region do not fit the study, or a number is out of its range.
     MeasurementError
         If the blocks do not fit the study.
 
@@ -462,10 +497,15 @@ def tolerance(
     >>> hf.tolerance(magnet, session, draws=100, limit_units=1e4).share
     1.0
     """
+    check_number("draws", "tolerance", draws, *DRAWS, whole=True)
+    check_number("seed", "tolerance", seed, 0, whole=True)
+    check_objective(magnet, reference, limit_units, limit_ppm)
     measured = None if blocks is None else prior_from_blocks(magnet, blocks).gaussian
-    model = multipole_model(magnet, reference or MultipoleReference(), session)
+    model, generator = objective_of(magnet, reference, session), np.random.default_rng(seed)
     prior = measured or assembled_prior(magnet, model.nominal)
-    return predict_tolerance(model, magnet, prior, draws, np.random.default_rng(seed), limit_units)
+    if isinstance(model, MultipoleModel):
+        return predict_tolerance(model, magnet, prior, draws, generator, limit_units)
+    return predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm)
 
 
 @alone
@@ -501,6 +541,7 @@ def demagnetization(
     >>> hf.demagnetization(hot, hf.Session.open("results")).share_beyond_now
     0.0
     """
+    check_number("across", "demagnetization", across, *ACROSS, whole=True)
     return demagnetization_room.demagnetization_map(magnet, session, across)
 
 
@@ -548,6 +589,8 @@ def simulate_measurement(
     >>> campaign.readings.sizes["point"]
     24
     """
+    check_number("seed", "simulate_measurement", seed, 0, whole=True)
+    check_number("hide_random", "simulate_measurement", hide_random, 0, whole=True)
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
                              hide_random=hide_random, progress=progress)

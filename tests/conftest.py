@@ -47,6 +47,22 @@ DIPOLE: dict[str, Any] = {
 
 StudyMaker = Callable[..., Study]
 
+LONGEST = [
+    "docs/test_docs.py", "cli/test_all_keys.py", "diagnosis/test_sealed_cases.py",
+    "synthetic/test_fields.py", "solver/test_oracles.py", "cli/test_killed.py",
+    "response/test_nonlinear.py", "solver/test_azimuthal_modes.py",
+    "synthetic/test_hidden_effects.py", "inference/test_mcmc.py",
+    "diagnosis/test_unlisted_causes.py", "response/test_homogeneity.py",
+    "geometry/test_symmetry.py", "inference/test_infer.py",
+]
+"""Files that take a minute or more of processor time, the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files: one that a worker begins last keeps the others waiting."""
+    place = {ROOT / "tests" / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
+
 
 def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """A copy with some keys changed; ``array__rings=2`` goes one level down."""

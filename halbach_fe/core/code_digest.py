@@ -10,8 +10,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 
@@ -70,21 +69,26 @@ def _path_of(module: str) -> Path | None:
     return None if spec is None or spec.origin is None else Path(spec.origin)
 
 
-def _imported(path: Path, name: str) -> Iterator[str]:
-    """Yield the names that a file imports absolutely, at its top or inside functions.
+@cache
+def _imported(path: Path, name: str) -> tuple[str, ...]:
+    """Return the names that a file imports absolutely, at its top or inside functions.
 
     From ``from a import b`` both ``a`` and ``a.b`` follow, because ``b`` may be a module. Imports
-    for type checkers (``if TYPE_CHECKING``) do not count: they are never executed.
+    for type checkers (``if TYPE_CHECKING``) do not count: they are never executed. An import is a
+    statement, so that the expressions, most of the tree, need not be searched.
     """
+    found: list[str] = []
     waiting: list[ast.AST] = [ast.parse(path.read_bytes(), filename=name)]
     while waiting:
         node = waiting.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             waiting += node.orelse
-            continue
-        waiting += ast.iter_child_nodes(node)
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            if node.module:
+                found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+                waiting += getattr(node, block, [])
+    return tuple(found)

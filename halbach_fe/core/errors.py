@@ -47,6 +47,12 @@ class HalbachWarning(UserWarning):
     """A warning about a result that is delivered nevertheless."""
 
 
+class CommandLineError(HalbachError):
+    """Options of a command line contradict each other, or one of them would be without effect."""
+
+    exit_code = 2
+
+
 class StudyError(HalbachError):
     """The study file cannot be read or describes something that cannot be built."""
 
@@ -182,7 +188,7 @@ READER_LEFT = 141
 EXIT_CODES: dict[int, str] = {
     0: "success",
     1: "unexpected error (a bug: please report it)",
-    2: "wrong command line",
+    CommandLineError.exit_code: "wrong command line",
     StudyError.exit_code: "study file refused",
     MeasurementError.exit_code: "measured map or block table refused",
     MeshError.exit_code: "mesh could not be built or verified",

@@ -1,9 +1,28 @@
-"""Parsing of numbers in text files."""
+"""Numbers in text files, and those that a user gives to a function."""
 
 from __future__ import annotations
 
 import math
 import re
+from numbers import Integral, Real
+
+from halbach_fe.core.errors import StudyError, must_be
+
+LIMIT_UNITS = 1e-6, 1e6
+"""Smallest and largest limit of unwanted multipoles in units of 1e-4 of the main one: from 1e-10 of
+it, below all errors, to a hundred times it."""
+
+LIMIT_PPM = 1e-4, 1e6
+"""Smallest and largest limit of the rms deviation of a field, in ppm of its mean: from below the
+noise of all instruments to as much as the field itself."""
+
+DRAWS = 20, 1_000_000
+"""Smallest and largest number of magnets that are drawn. Fewer have no quantiles of 5 and 95 %; the
+most determine a share of 1 % to 1 % of itself, and need 1 GB for 100 multipoles."""
+
+ACROSS = 2, 100
+"""Fewest and most cells across a block. A single one has its middle in that of the block, where the
+margin is largest; their number in a block grows with the third power."""
 
 MAX_CELL = 60
 """Most characters of a cell that is parsed: no number is longer, and matching the pattern is slow
@@ -28,3 +47,24 @@ def parse_number(cell: str) -> float:
     if not math.isfinite(value):
         raise ValueError(cell)
     return value
+
+
+def check_number(
+    name: str, function: str, value: object, low: float = -math.inf, high: float = math.inf,
+    whole: bool = False,
+) -> None:
+    """Check a number that a user gives to a function of the Python interface.
+
+    Raises
+    ------
+    StudyError
+        If it is no finite number from ``low`` to ``high``, or a ``whole`` one is not.
+    """
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if whole and not isinstance(value, Integral):
+        number = math.nan
+    if not (math.isfinite(number) and low <= number <= high):
+        limits = (f" from {low:g} to {high:g}" if math.isfinite(low) and math.isfinite(high) else
+                  f" of at least {low:g}" if math.isfinite(low) else "")
+        raise StudyError(must_be(name, function, f"a {'whole' if whole else 'finite'} number"
+                                 + limits, value))

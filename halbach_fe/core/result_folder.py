@@ -1,10 +1,10 @@
 """A folder of results belongs to one command and one study, and to one run at a time.
 
-The file run.json in the folder names both, and the results that runs have written there. A later
-run of the same command and study replaces them, and removes those that it did not write again: a
-table that the study no longer asks for would pass for a result of the study as it is. Another
-command or study is refused. While a run goes on, it locks the file; functions of the Python
-interface lock it too.
+The file run.json in the folder names both, what the run read, and the results that runs have
+written there. A later run of the same command and study replaces them, and removes those that it
+did not write again: a table that the study no longer asks for would pass for a result of the study
+as it is. Another command or study is refused. While a run goes on, it locks the file; functions of
+the Python interface lock it too.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import stat
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from fnmatch import fnmatch
+from io import BufferedReader
 from pathlib import Path
 from typing import Annotated, BinaryIO
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
-from halbach_fe.core.errors import OutputError
+from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.files import make_folder, telling
 
 RECORD = "run.json"
@@ -51,12 +55,67 @@ class Record(BaseModel):
         What the folder belongs to; ``study`` is empty for a command without a study.
     files : dict of str to str
         SHA-256 of every result, by its path within the folder.
+    inputs : dict of str to str
+        SHA-256 of every file that the run was given, by its path.
+    ended : str
+        When the run ended, in ISO 8601 (UTC); empty until it has ended well.
     """
 
     model_config = ConfigDict(extra="forbid")
     command: str
     study: str
     files: dict[Annotated[str, AfterValidator(_inside)], str] = {}
+    inputs: dict[str, str] = {}
+    ended: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of a run that has ended.
+
+    Attributes
+    ----------
+    folder : Path
+    record : Record
+    """
+
+    folder: Path
+    record: Record
+
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return the content of a result.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        ValueError
+            If it is no result of the run, lies behind a link, or is larger than ``most_bytes``.
+        """
+        if name not in self.record.files:
+            raise ValueError(f"{name} is no result of this run")
+        if not (self.folder / name).resolve().is_relative_to(self.folder.resolve()):
+            raise ValueError(f"{name} is not in the folder")
+        with _regular(self.folder / name) as file:
+            content = file.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise ValueError(f"it has more than {most_bytes} bytes")
+        return content
+
+    def changed(self) -> list[str]:
+        """Return the results that somebody has changed, or put something else in place of."""
+        found = []
+        for name, digest in self.record.files.items():
+            try:
+                with _regular(self.folder / name) as file:
+                    same = hashlib.file_digest(file, "sha256").hexdigest() == digest
+            except FileNotFoundError:  # it was removed
+                continue
+            except (OSError, ValueError):
+                same = False
+            if not same:
+                found.append(name)
+        return found
 
 
 @contextlib.contextmanager
@@ -74,7 +133,7 @@ def result_folder(
         If the folder cannot be written, another run is using it, it belongs to another command or
         study, or one of the files ``inputs`` is a result in it, which this run would replace.
     """
-    base = folder.absolute()
+    base, inputs = folder.absolute(), list(inputs)
     with _locked(folder) as file:
         before = _read(file)
         if before is None and _is_json(file):
@@ -94,6 +153,7 @@ def result_folder(
                     f"Input {path} is a result of an earlier run in folder {folder}, which this "
                     "run would replace. Name another folder, or copy the input to another place.")
         record, written = before.model_copy(deep=True), set[str]()
+        record.inputs, record.ended = _inputs(inputs), ""
         _write(file, record)
 
         def note(path: Path) -> None:
@@ -108,6 +168,7 @@ def result_folder(
             for name in record.files.keys() - written:
                 if _digest(base / name) == record.files.pop(name):  # else somebody has changed it
                     (base / name).unlink(missing_ok=True)
+            record.ended = datetime.now(UTC).isoformat(timespec="seconds")
             _write(file, record)
 
         with telling(note):
@@ -117,6 +178,66 @@ def result_folder(
                 remove_stale()
                 raise
         remove_stale()
+
+
+@contextlib.contextmanager
+def finished_results(folder: Path) -> Iterator[Results]:
+    """Yield the results in a folder, and keep runs out of it while the block reads them.
+
+    Raises
+    ------
+    OutputError
+        If it is no folder of results, a run is using it, or its last run has not ended well.
+    """
+    def refused(expected: str, received: str, hint: str) -> OutputError:
+        return OutputError(must_be("DIR", "the report", expected, f"{folder}, {received}", hint))
+
+    expected, leave = f"a folder of results, with {RECORD}", "Leave it out."
+    if not folder.is_dir():
+        raise refused(expected, "a file" if folder.exists() else "which does not exist", leave)
+    try:
+        number = os.open(folder / RECORD,
+                         os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise refused(expected, f"which has no {RECORD}", leave) from None
+    except OSError as error:
+        raise refused(expected, f"whose {RECORD} cannot be read ({error.strerror})",
+                      leave) from None
+    with os.fdopen(number, "rb") as file:
+        try:
+            fcntl.flock(number, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(f"Folder {folder} is in use by a run of halbach-fe. Wait for it, or "
+                              "leave it out.") from None
+        except OSError:  # this file system has no locks
+            pass
+        regular = stat.S_ISREG(os.fstat(number).st_mode)
+        record = _read(file) if regular else None
+        if record is None:
+            raise refused(expected, f"whose {RECORD} is damaged or of another program", leave)
+        if not record.ended:
+            raise refused("the results of a run that has ended",
+                          f"where `{record.command}` failed, was killed, or is of an earlier "
+                          "version", "Run it again, or leave it out.")
+        yield Results(folder, record)
+
+
+def keep_results(path: Path) -> None:
+    """Refuse to write a file over a result of a run.
+
+    Raises
+    ------
+    OutputError
+    """
+    for folder in path.absolute().parents:
+        try:
+            with _regular(folder / RECORD) as file:
+                record = _read(file)
+        except (OSError, ValueError):
+            continue
+        if record and str(path.absolute().relative_to(folder)) in record.files:
+            raise OutputError(f"File {path} is a result of `{record.command}`, which this run "
+                              "would replace. Name another file.")
 
 
 @contextlib.contextmanager
@@ -137,6 +258,25 @@ def locked_folder(folder: Path) -> Iterator[None]:
     else:
         with _locked(folder):
             yield
+
+
+def _inputs(paths: Iterable[Path]) -> dict[str, str]:
+    """Return the SHA-256 of what was read of files, by their paths."""
+    found = {}
+    for path in paths:
+        with contextlib.suppress(OSError):  # whoever reads it says what is wrong
+            found[printable(path, MAX_QUOTED)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+@contextlib.contextmanager
+def _regular(path: Path) -> Iterator[BufferedReader]:
+    """Open a regular file that is no link; raise OSError or ValueError if it is none."""
+    number = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(number, "rb") as file:
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            raise ValueError("it is no file")
+        yield file
 
 
 def _digest(path: Path) -> str | None:

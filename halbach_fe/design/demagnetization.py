@@ -19,7 +19,7 @@ import meshio
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -34,6 +34,7 @@ from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.magnet import Demagnetization
+from halbach_fe.study.material_keys import grade_of
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
@@ -198,10 +199,15 @@ def demagnetization_map(magnet: Magnet, session: Session,
     """
     material = magnet.study.demagnetization
     if material is None:
-        raise StudyError(
-            f"Input `demagnetization` of study {magnet.name} must say what the material withstands;"
-            " instead it is missing. Add intrinsic_coercivity_A_per_m, remanence_coefficient_per_K "
-            "and coercivity_coefficient_per_K from the data sheet, and temperature_C.")
+        found = grade_of(magnet.array)
+        known = found.demagnetization_defaults if found else {}
+        keys = [key for key, field in Demagnetization.model_fields.items()
+                if field.is_required() and key not in known]
+        raise StudyError(must_be(
+            "`demagnetization`", f"study {magnet.name}", "what the material withstands", "nothing",
+            "Add [demagnetization] with temperature_C"
+            + (f", and {', '.join(keys)} from the data sheet." if keys else
+               f": the rest is known of {magnet.array.material}.")))
     warm = at_temperature(magnet, material)
     blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
@@ -131,6 +131,12 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
             f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
     check_points(magnet, baseline)
     check_points(magnet, candidates, "plan.candidates")
+    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
+    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
+        raise StudyError(must_be(
+            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
+            "the magnet, where there is some field", f"one at {farthest:.4g} m",
+            "Are they in metres?"))
     points = np.vstack([baseline, candidates])
     observation = observe(magnet.study, points, np.ones_like(points, bool))
     noise = reading_noise(magnet, observation, xr.Dataset())

@@ -28,6 +28,7 @@ from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.inference.same_magnet import distribution_of, distributions_of
 from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.homogeneity import (
     PPM,
@@ -136,7 +137,7 @@ def shim_tray(
     posterior : Gaussian or InferenceResult
         Distribution of the magnetizations of the measured magnet in A/m.
     region : Region, optional
-        By default the sphere about the origin of half the radius of the bore.
+        By default the study's, or the sphere about the origin of half the radius of the bore.
 
     Returns
     -------
@@ -147,6 +148,8 @@ def shim_tray(
     StudyError
         If the study is a cross-section, has no tray or has iron, or a magnet of the tray would
         touch the region, a block or another place.
+    MeasurementError
+        If the posterior is that of another magnet.
 
     Examples
     --------
@@ -164,7 +167,8 @@ def shim_tray(
         raise StudyError(must_be("`shim_tray`", f"study {magnet.name}", "a tray with its magnets",
                                  "nothing", "Add [shim_tray], see docs/design.md."))
     if isinstance(posterior, InferenceResult):
-        posterior = posterior.posterior
+        posterior = distributions_of(magnet, posterior)["posterior"]
+    posterior = distribution_of(magnet, posterior, "posterior")
     region = region or default_region(magnet)
     choices = _Choices.of(tray, magnet.name)
     _check(magnet, choices, region)
@@ -307,6 +311,12 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
         raise StudyError(must_be(
             f"place {int(np.argmax(outer)) + 1} of `shim_tray`", study, "within the magnet, whose "
             f"radius is {1e3 * magnet.radius:.4g} mm", f"{1e3 * outer.max():.4g} mm from the axis",
+            "Is it in metres?"))
+    along, reach = np.abs(choices.places[:, 2]), magnet.field_reach
+    if (along > reach).any():
+        raise StudyError(must_be(
+            f"place {int(np.argmax(along)) + 1} of `shim_tray`", study, f"within {reach:.3g} m of "
+            "the middle along z, where there is some field", f"{along.max():.4g} m",
             "Is it in metres?"))
     points, _ = region.points(12)
     lattice = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, LATTICE)]), axis=-1).reshape(-1, 3)

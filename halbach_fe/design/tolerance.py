@@ -1,8 +1,9 @@
-"""Multipoles of magnets whose blocks are drawn from the prior: what the tolerances allow.
+"""Multipoles or homogeneity of magnets whose blocks are drawn: what the tolerances allow.
 
 The coefficients C_n are linear in the magnetizations. Multipoles are C_n divided by the main
 coefficient; linearized in the latter, their mean and covariance have a closed form. The magnitudes
 |c_n|, their quantiles and the share of magnets within a limit are computed from samples of C_n.
+Deviations of |B| in a region are those of drawn fields, without linearization.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import with_variations
+from halbach_fe.response.homogeneity import Homogeneity, HomogeneityModel
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met
 from halbach_fe.stats.gaussian import (
     Gaussian,
@@ -27,7 +29,10 @@ from halbach_fe.stats.gaussian import (
 from halbach_fe.study.model import Study
 
 QUANTILES = (0.05, 0.5, 0.95, 0.99)
-"""Probabilities of the quantiles of |c_n| that are reported."""
+"""Probabilities of the quantiles that are reported."""
+
+AT_ONCE = 200
+"""Number of magnets whose fields are computed at a time, which limits the memory."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +78,63 @@ class Tolerance(ShownInNotebook):
 
     @property
     def share_sd(self) -> float | None:
-        """Standard error of `share`, which follows from the number of draws.
-
-        It uses Laplace's rule of succession, so that it is not 0 if the share is 0 or 1.
-        """
-        if self.share is None:
-            return None
-        count = len(self.sizes)
-        guess = (self.share * count + 1) / (count + 2)
-        return float(np.sqrt(guess * (1 - guess) / count))
+        """Standard error of `share`, which follows from the number of draws."""
+        return None if self.share is None else _share_sd(self.share, len(self.sizes))
 
     @property
     def shares(self) -> Floats | None:
         """Share of magnets within the limit for each order, (k,); None without a limit."""
         return None if self.limit is None else np.mean(self.sizes <= self.limit, axis=0)
+
+
+def _share_sd(share: float, count: int) -> float:
+    """Return the standard error of a share of ``count`` draws.
+
+    It uses Laplace's rule of succession, so that it is not 0 if the share is 0 or 1.
+    """
+    guess = (share * count + 1) / (count + 2)
+    return float(np.sqrt(guess * (1 - guess) / count))
+
+
+@dataclass(frozen=True)
+class HomogeneityTolerance(ShownInNotebook):
+    """Homogeneity of magnets whose blocks are drawn from a prior.
+
+    Attributes
+    ----------
+    study : Study
+    model : HomogeneityModel
+        The linear model from magnetizations to the field in the region.
+    ordered : Homogeneity
+        That of the magnet whose blocks are as ordered, and the range of the drawn magnets.
+    mean_T : ndarray, shape (draws,)
+        Mean of |B| of the samples.
+    rms_ppm, peak_to_peak_ppm : ndarray, shape (draws,)
+        Deviations of |B| from its mean.
+    limit : float or None
+        Limit of the rms deviation in ppm.
+    share, share_sd : float or None
+        Share of the magnets within the limit, from 0 to 1, and its standard error; None without a
+        limit.
+    """
+
+    study: Study
+    model: HomogeneityModel
+    ordered: Homogeneity
+    mean_T: Floats
+    rms_ppm: Floats
+    peak_to_peak_ppm: Floats
+    limit: float | None
+
+    @property
+    def share(self) -> float | None:
+        """Share of magnets whose rms deviation is within the limit; None without a limit."""
+        return None if self.limit is None else float(np.mean(self.rms_ppm <= self.limit))
+
+    @property
+    def share_sd(self) -> float | None:
+        """Standard error of `share`, which follows from the number of draws."""
+        return None if self.share is None else _share_sd(self.share, len(self.rms_ppm))
 
 
 def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
@@ -138,3 +186,25 @@ def predict_tolerance(
     sizes = np.hypot(*model.units(coefficients).reshape(draws, 2, -1).swapaxes(0, 1))
     return Tolerance(magnet.study, model, model.known(mean, root), sizes,
                      np.abs(coefficients[:, 0]), limit)
+
+
+def predict_homogeneity(
+    model: HomogeneityModel, magnet: Magnet, prior: Gaussian, draws: int,
+    generator: np.random.Generator, limit: float | None = None,
+) -> HomogeneityTolerance:
+    """Compute the distribution of the homogeneity of magnets from a prior.
+
+    Parameters
+    ----------
+    prior : Gaussian
+        Distribution of the magnetizations in A/m, including the errors of mounting.
+    draws : int
+        Number of samples.
+    generator : numpy.random.Generator
+    limit : float, optional
+        Limit of the rms deviation in ppm.
+    """
+    parts = [model.deviations(model.field(prior.sample(
+        min(AT_ONCE, draws - first), generator).T)) for first in range(0, draws, AT_ONCE)]
+    mean, rms, whole = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return HomogeneityTolerance(magnet.study, model, model.of(prior), mean, rms, whole, limit)

@@ -73,7 +73,7 @@ def estimate_diagnosis(
     Gross errors of the maps are found, as in the diagnosis, because the magnet is solved at the
     corrected positions.
     """
-    check_maps(study, data)
+    data = check_maps(study, data)
     _, corrected, starts = correct_map_errors(study, data, blocks, catalogue())
     blocks = blocks_of(blocks, study, corrected)
     study = apply_effects(corrected, starts[0]) if starts else corrected

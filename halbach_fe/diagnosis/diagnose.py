@@ -62,6 +62,7 @@ from halbach_fe.diagnosis.search import (
     with_short_steps,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
+from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.unknown_cause import (
     describe_unknown,
     families_of,
@@ -130,7 +131,7 @@ def diagnose(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
-    check_maps(study, data)
+    data = check_maps(study, data)
     effects = catalogue() if effects is None else effects
     pace = Pace(say, session.progress, time_limit_s)
     session = replace(session, progress=pace.advance)
@@ -162,8 +163,10 @@ def diagnose(
     identified = start
 
     for number in range(MAX_ROUNDS):
-        names = ", ".join(effect.selection.candidate.name for effect in identified)
-        say(f"round {number + 1}: the model with {names or 'no effect added'}")
+        added = "; ".join(
+            " ".join(filter(None, (effect.hypothesis.effect.title, place_in_words(effect.place))))
+            for effect in identified)
+        say(f"round {number + 1}: the model with {added or 'no effect added'}")
         pace.begin(f"round {number + 1}, solving")
         update = updated(identified, f"round-{number + 1}")
         if number == 0:
@@ -211,6 +214,8 @@ def diagnose(
             break
         if closing:  # the model has the effects of the previous round
             break
+        if converged := only_equals_took_turns(identified, found):
+            break
         identified, closing = with_short_steps(found, identified), pace.is_over
         if closing:
             say("the time is up: the effects so far are put into the model")
@@ -250,6 +255,25 @@ def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffe
     before = {effect.hypothesis: effect for effect in old}
     return before.keys() == {effect.hypothesis for effect in new} and all(
         _same_amplitudes(before[effect.hypothesis], effect) for effect in new)
+
+
+def only_equals_took_turns(
+    old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]
+) -> bool:
+    """Tell whether a round only put effects in place of others that explain the readings as well.
+
+    Such effects would take turns in all further rounds. The amplitudes of the others must have come
+    to rest.
+    """
+    before = {effect.hypothesis: effect for effect in old}
+    fresh = [effect for effect in new if effect.hypothesis not in before]
+    kept = [effect for effect in new if effect.hypothesis in before]
+    gone = before.keys() - {effect.hypothesis for effect in kept}
+    equals = {(other.effect, other.place) for effect in fresh
+              for other, _ in effect.selection.alternatives}
+    return bool(fresh) and len(fresh) == len(gone) and all(
+        (hypothesis.effect.name, hypothesis.place.name) in equals for hypothesis in gone) and all(
+        _same_amplitudes(before[effect.hypothesis], effect) for effect in kept)
 
 
 def _same_amplitudes(old: IdentifiedEffect, new: IdentifiedEffect) -> bool:

@@ -36,6 +36,9 @@ ActsOn = Literal["field", "readings", "gains", "positions"]
 SIZES = np.geomspace(0.1, 1000, 17)
 """Candidate rms sizes, in units of the noise of a reading."""
 
+SLENDER = 1e-3
+"""Width of a line relative to its length, up to which it is one."""
+
 SMOOTH_WAVES = (2.0, 5.0)
 ROUGH_WAVES = (3.0, 15.0)
 """Numbers of half waves over the range of a coordinate at which the spectrum of a smooth function
@@ -139,7 +142,7 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
     """Return the evidence of a family, from the evidence of its terms (and of nothing else)."""
     factors: list[float] = []
     best: tuple[float, tuple[int, ...], bool, Floats, Floats] | None = None
-    for axes in AXES if (family.axis >= 0).any() else ((),):
+    for axes in _axes_seen(family, evidence) if (family.axis >= 0).any() else ((),):
         used = np.flatnonzero(np.isin(family.axis, axes)) if axes else np.arange(len(family.axis))
         information = evidence.information[np.ix_(used, used)]
         for spectrum, smooth in zip(family.spectra[:, used], family.smooth, strict=True):
@@ -157,6 +160,14 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
                 best = float(some[top]), axes, smooth, deviations, mean
     assert best is not None
     return Fitted(float(special.logsumexp(factors) - np.log(len(factors))), *best)
+
+
+def _axes_seen(family: Family, evidence: Evidence) -> list[tuple[int, ...]]:
+    """Return those of `AXES` that the readings see: a map of one component has one sensor."""
+    size = np.diag(evidence.information)
+    seen = [axis for axis in range(3) if size[family.axis == axis].any()]
+    found = dict.fromkeys(tuple(axis for axis in axes if axis in seen) for axes in AXES)
+    return [axes for axes in found if axes] or list(AXES)
 
 
 def largest_factor(family: Family, evidence: Evidence) -> float:
@@ -210,6 +221,8 @@ def instrument_families(
                               np.ptp(points[:, 2]))]
     coordinates = {"z": points[:, 2], "angle": angle, "radius": radius, "time": time,
                    "field": np.linalg.norm(nominal, axis=1)}
+    if _on_a_line_along_z(points):  # where azimuth and radius are functions of z
+        del coordinates["angle"], coordinates["radius"]
     unit = np.eye(3)[:, None] * np.ones((len(points), 1))
     shapes: dict[ActsOn, Floats] = {  # (axis, n, 3)
         "readings": unit, "gains": unit * nominal, "positions": np.moveaxis(gradient, 2, 0)}
@@ -232,6 +245,13 @@ def instrument_families(
                 np.tile(waves, 3), 360.0 if name == "angle" else float(np.ptp(coordinate)),
                 noise_T / size))
     return found
+
+
+def _on_a_line_along_z(points: Floats) -> bool:
+    """Tell whether points (n, 3) in m lie on one line, rather along the magnet than across."""
+    centred = points - points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    return len(points) > 2 and bool(sizes[1] < SLENDER * sizes[0]) and abs(axes[0, 2]) > 0.5**0.5
 
 
 def _products(functions: Floats, shape: Floats) -> Floats:

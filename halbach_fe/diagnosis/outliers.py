@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as linalg
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
@@ -244,7 +244,7 @@ def _crowded(
     pairs = flagged_neighbours[flagged].sum()
     expected = CROWD_NEIGHBOURS * flagged.sum() * flagged.mean()
     crowded = flagged & (flagged_neighbours > 0)
-    probability = stats.poisson.sf(pairs - 1, expected)
+    probability = special.pdtrc(pairs - 1, expected)
     return crowded if probability < CROWD_PROBABILITY else np.zeros_like(flagged)
 
 

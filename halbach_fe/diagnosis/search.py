@@ -23,12 +23,13 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.scene import Campaign, Scene
+from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene
 from halbach_fe.diagnosis.screening import most_likely
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
+from halbach_fe.solver.mesh import with_rough_mesh
 from halbach_fe.solver.session import Progress, Session
 from halbach_fe.study.model import FIELD_KEYS, Study
 
@@ -69,6 +70,12 @@ class NominalSolver:
         """Return `solve_nominal` of the magnet of a study at points (n, 3) in m."""
         found: Floats = self._once("field", solve_nominal, study, points)
         return found
+
+    def rough_field(self, study: Study, points: Floats) -> Floats:
+        """Return `field` on a mesh that suffices for the signature of an effect, see
+        `with_rough_mesh`.
+        """
+        return self.field(with_rough_mesh(study), points)
 
     def iron_change(self, study: Study, points: Floats) -> Floats | None:
         """Return `iron_change` of the magnet of a study at points (n, 3) in m."""
@@ -170,10 +177,10 @@ def score_hypotheses(
     residual = training
     study = campaign.with_terms(apply_effects(corrected, start), update.terms)
 
-    def scene_of(other: Study) -> Scene:
-        return campaign.scene(other, solver.field, solver.iron_change, update.by_block(prior_mean))
+    def scene_of(other: Study, field: FieldAt = solver.field) -> Scene:
+        return campaign.scene(other, field, solver.iron_change, update.by_block(prior_mean))
 
-    nominal, nominal_start = scene_of(update.study), scene_of(study)
+    nominal, nominal_start = scene_of(update.study), scene_of(study, solver.rough_field)
     known = solver.signatures(study, update, prior_mean, campaign)
     in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
                 for effect in identified}

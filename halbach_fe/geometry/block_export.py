@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.free_blocks import nominal_free_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.geometry.symmetry import rotation_about_z
+from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, SIZES, FreeBlocks
 
 ROUNDING = 1e-12
@@ -59,6 +61,8 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
     table, array = magnet.array.free_blocks, magnet.array
     first = len(magnet.blocks) - (len(table) if table else 0)
     rows = []
+    materials = [array.of_ring(ring).material if array.ring else array.material
+                 for ring in range(1, array.rings + 1)]
     for number, block in enumerate(magnet.blocks):
         if not block.remanence and block.recoil_permeability == 1.0 and block.isotropic:
             continue  # a missing block has no effect on the field
@@ -66,11 +70,20 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
             row = _free_row(block, table, number - first)
         else:
             row = _ring_row(block)
-            row["material"] = array.of_ring(block.ring).material if array.ring else array.material
+            row["material"] = materials[block.ring - 1]
         rows.append(row | _material(block))
     columns = {column: [row.get(column) for row in rows] for column in COLUMNS}
     return {column: values for column, values in columns.items()
             if any(value is not None for value in values)}
+
+
+def blocks_of_table(columns: dict[str, list[Any]]) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of a table from `blocks_table`, each in a frame of its own.
+
+    The x axis of the frame of a block of a ring is along its thickness; its origin is in the middle
+    of the block, of a sector on the axis of its arcs. They are blocks of a 3D magnet.
+    """
+    return tuple(nominal_free_blocks(Array.model_validate({"free_blocks": columns}), 3))
 
 
 def _material(block: MagnetBlock) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, outline_contains, outline_part
+from halbach_fe.geometry.outline import Outline, outline_area, outline_contains, outline_part
 from halbach_fe.study.materials import MU_0
 
 CORNER = 1 / 6
@@ -162,17 +162,8 @@ class MagnetBlock:
 
     @cached_property
     def area(self) -> float:
-        """Area of the cross-section in m^2.
-
-        It is the boundary integral of Green's theorem. The quadrature is exact: the integrand is a
-        polynomial on straight edges and constant on arcs.
-        """
-        t, weight = np.polynomial.legendre.leggauss(3)
-        total = 0.0
-        for edge in self.outline:
-            points, normals = edge.at((t + 1) / 2)
-            total += float(np.sum(weight / 2 * np.einsum("ij,ij->i", points, normals))) / 2
-        return total
+        """Area of the cross-section in m^2."""
+        return outline_area(self.outline)
 
     @property
     def volume(self) -> float:

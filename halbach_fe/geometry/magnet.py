@@ -30,6 +30,13 @@ CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
 """Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
 blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
 
+BEYOND_ENDS = 4.5
+"""Distance by which the field is summed beyond the ends, relative to the magnet's outer radius. The
+field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 of a block lies
+beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles. Higher orders fall
+faster: for two rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of
+that to the boundary of 3D meshes."""
+
 SQUEEZED = 0.1
 """The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
 makes neighbours overlap a little; a larger overlap cannot be a tolerance of the assembly."""
@@ -216,6 +223,11 @@ class Magnet(ShownInNotebook):
     def array_outer_radius(self) -> float:
         """Radius in m of the smallest cylinder about the z axis around all nominal blocks."""
         return max(float(np.hypot(*points[:, :2].T).max()) for points in self._corners)
+
+    @property
+    def field_reach(self) -> float:
+        """Distance in m from the middle up to which there is some field; of a 3D magnet."""
+        return self.half_length + BEYOND_ENDS * self.radius
 
     @cached_property
     def bore_radius(self) -> float:

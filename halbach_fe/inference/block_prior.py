@@ -53,6 +53,14 @@ FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
+VOLUME_TOLERANCE = 0.1
+"""Largest deviation of a measured volume from that of the study's block, relative to the latter.
+The chamfers and tolerances of blocks change it by less."""
+
+SAME_TEMPERATURE_K = 2.0
+"""Largest difference of temperatures at which moments count as measured at the same one. It changes
+the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it."""
+
 
 @dataclass(frozen=True)
 class TypeSamples:
@@ -239,10 +247,12 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
 
 
-def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
+def as_mounted(
+    magnet: Magnet, table: BlockTable, places: Ints, turned: Floats | None = None
+) -> Floats:
     """Return the moments of blocks in the axes of new slots.
 
-    A block keeps the orientation of its faces relative to those of the slot.
+    A block keeps the orientation of its faces relative to those of the slot, unless it is turned.
 
     Parameters
     ----------
@@ -250,6 +260,8 @@ def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
     table : BlockTable
     places : ndarray of int, shape (rows,)
         New slot of each block, counted from 0, ring by ring.
+    turned : ndarray, shape (rows, 3, 3), optional
+        Rotation of each block in its own axes.
 
     Returns
     -------
@@ -258,7 +270,7 @@ def as_mounted(magnet: Magnet, table: BlockTable, places: Ints) -> Floats:
     index = _block_of_rows(as_meant(magnet), table)
     own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ shape_axes(block)
                     for block in magnet.blocks])  # axes of the shape in those of the place
-    turns = own[places] @ own[index].transpose(0, 2, 1)
+    turns = own[places] @ (np.eye(3) if turned is None else turned) @ own[index].transpose(0, 2, 1)
     return np.einsum("nij,nj->ni", turns, table.moment)
 
 
@@ -346,39 +358,58 @@ def _conversions(
 ) -> Floats:
     """Return the matrices (rows, 3, 3) from measured moments in A m^2 to M in A/m.
 
-    M is along the array's axes. In 2D blocks get the length of the rings or of their volume.
+    M is along the array's axes. A block of the study gets the measured moment, which is what its
+    field is made of, and M is therefore the moment per volume of the study's block even where the
+    real volume differs a little. In 2D blocks get the length of the rings, or else the median of
+    those that follow from their volumes.
     """
+    flat = magnet.dimension == 2
+    length = magnet.array.ring_length_m
+    if flat and not length:
+        unknown = np.flatnonzero(np.isnan(table.volume))
+        if len(unknown):
+            raise MeasurementError(must_be(
+                f"volume_m3 of block {table.serial[unknown[0]]}", table.source,
+                "given for a 2D study without array.ring_length_m", "an empty cell"))
+        length = float(np.median(table.volume / [blocks[number].area for number in index]))
     real = []
     for row, number in enumerate(index):
         block, volume = blocks[number], table.volume[row]
-        if magnet.dimension == 2:
-            length = magnet.array.ring_length_m or volume / block.area
-            if np.isnan(length):
-                raise MeasurementError(must_be(
-                    f"volume_m3 of block {table.serial[row]}", table.source,
-                    "given for a 2D study without array.ring_length_m", "an empty cell"))
+        if flat and length:
             block = replace(block, z_min=-length / 2, z_max=length / 2)
-        if not np.isnan(volume) and not 0.5 < volume / block.volume < 2:
+        if abs(volume / block.volume - 1) > VOLUME_TOLERANCE:  # False for NaN, an unknown volume
             raise MeasurementError(must_be(
                 f"volume_m3 of block {table.serial[row]}", table.source,
-                f"near the study's, {block.volume:.4g} m^3", f"{volume:g}",
-                "Check units, radii and ring length."))
+                f"near the study's, within {100 * VOLUME_TOLERANCE:g} % of the "
+                f"{block.volume:.4g} m^3 of its block {block.name}", f"{volume:.4g} m^3",
+                "Check its unit, and the sizes of the study's blocks."))
         real.append(block)
-    volumes = np.where(np.isnan(table.volume), [block.volume for block in real], table.volume)
     tensors = demagnetizing_tensors(real)
     return np.array([
-        _of_block(block, tensor) @ rotation_about_z(np.radians(block.angle_deg)) / volume
-        for block, tensor, volume in zip(real, tensors, volumes, strict=True)])
+        _of_block(block, tensor) @ rotation_about_z(np.radians(block.angle_deg)) / block.volume
+        for block, tensor in zip(real, tensors, strict=True)])
 
 
 def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
     """Return the moments (rows, 3) in A m^2 at the study's reference temperature.
 
     They are not changed if the study has no temperature coefficient.
+
+    Raises
+    ------
+    MeasurementError
+        If a temperature is missing, or if temperatures differ and the study has no coefficient.
     """
     coefficient = magnet.study.prior.temperature_coefficient_per_K
     reference = magnet.study.prior.reference_temperature_C
     if coefficient is None or reference is None:  # the study has both or neither
+        known = table.temperature[~np.isnan(table.temperature)]
+        if len(known) and np.ptp(known) > SAME_TEMPERATURE_K:
+            raise MeasurementError(must_be(
+                "temperature_C", table.source, f"the same for all blocks, to {SAME_TEMPERATURE_K:g}"
+                " K, since the study has no temperature coefficient",
+                f"{known.min():g} to {known.max():g} °C", "Add temperature_coefficient_per_K and "
+                "reference_temperature_C to [prior] of the study, or convert the moments."))
         return table.moment
     for serial, temperature in zip(table.serial, table.temperature, strict=True):
         if np.isnan(temperature):

@@ -26,6 +26,7 @@ from halbach_fe.inference.instrument_fit import (
 from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
 from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
+from halbach_fe.inference.same_magnet import distribution_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.instrument import turn_of
@@ -91,8 +92,8 @@ def infer(
     StudyError
         If the study does not describe the noise of the readings.
     MeasurementError
-        If a map or the blocks do not fit the study, or points of a map are not in air within the
-        meshed region.
+        If a map, the blocks or the prior do not fit the study, or points of a map are not in air
+        within the meshed region.
     GetDPError
         If GetDP fails, or its answer does not pass verification.
 
@@ -111,6 +112,8 @@ def infer(
     True
     """
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
+    if prior is not None:
+        prior = distribution_of(magnet, prior, "prior")
     maps = maps_of(magnet.study, data, validation_map)
     open_terms = OpenTerms.of(maps)
     total = np.zeros(len(open_terms))

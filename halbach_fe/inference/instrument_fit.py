@@ -15,8 +15,9 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.inference.readings import Readings
-from halbach_fe.measurement.campaign import Map, with_pivots
+from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
@@ -124,12 +125,23 @@ class OpenTerms:
 
         Raises
         ------
-        StudyError
+        MeasurementError
             If the terms become larger than an instrument may have.
         """
         found = []
         for one, effect, shift in zip(maps, self.effects, self.shifts, strict=True):
-            instrument = with_terms(one.study.instrument, one.pivot_m, effect @ changes)
+            try:
+                instrument = with_terms(one.study.instrument, one.pivot_m, effect @ changes)
+            except StudyError:
+                own = np.flatnonzero(effect.any(axis=0))
+                worst = own[np.argmax(np.abs(changes / self.sd)[own])]
+                where = one.name if one.name == ONLY_MAP else f"map {one.name}"
+                raise MeasurementError(must_be(
+                    "readings", where, "those of an instrument that is roughly known",
+                    f"readings for which {self.names[worst]} changes by {changes[worst]:.3g}, "
+                    f"{abs(changes[worst]) / self.sd[worst]:.0f} standard deviations",
+                    "Are they in another unit, or of another magnet? See halbach-fe check and "
+                    "register.")) from None
             own = turn_of(instrument).apply(shift @ changes)
             x, y, z = (own + instrument.translation_m).tolist()
             found.append(replace(one, study=one.study.with_(

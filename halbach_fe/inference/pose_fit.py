@@ -103,6 +103,10 @@ OFFSETS = slice(9, 12)
 PART_OF_SD = 0.1
 """Step of the finite differences by open keys, in prior standard deviations."""
 
+NO_EFFECT = 1e-6
+"""Largest change of a reading by a standard deviation of an open key, in units of the noise, that
+counts as none."""
+
 
 @dataclass(frozen=True)
 class PoseFit:
@@ -156,8 +160,7 @@ class PoseFit:
         if magnet.dimension == 2:
             raise StudyError(must_be("`dimension`", f"study {study.name}", "3, to register a map",
                                      "2"))
-        for each in open_keys:
-            each.value(study)
+        _check_open_keys(magnet, open_keys)
         base = study.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
         data = in_si_and_magnet_axes(base, data)
         points = points_of(data)
@@ -256,6 +259,7 @@ class PoseFit:
         self.derivatives.clear()  # those of another pose belong to other places
         columns = self._columns(pose, values)
         state = self._state(pose, values, columns)
+        self._check_effects(state)
         for blurred in self._blur(state):
             # noise of positions grows with the gradient: a fit would look for one, so it is held
             sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
@@ -306,6 +310,16 @@ class PoseFit:
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
             log_evidence, at_rest, _probe_sd(sd[6:6 + PROBE]),
             self._blocks(columns.directions, mean, covariance))
+
+    def _check_effects(self, state: _State) -> None:
+        """Raise a StudyError if an open key changes no reading that is fitted."""
+        for number, each in enumerate(self.open, start=6 + PROBE):
+            effect = each.sd * state.by_parameter[..., number][self.training]
+            if np.abs(effect).max(initial=0.0) < NO_EFFECT * self.smallest_sigma:
+                raise StudyError(must_be(
+                    f"`{each.key}`", f"study {self.magnet.name}",
+                    "a number on which the readings depend, to be fitted", "one without effect",
+                    "Leave it out of --fit and --alternative."))
 
     def _blocks(self, directions: Floats, mean: Floats, covariance: Floats) -> Gaussian:
         """Return the updated blocks from mean (k,) and covariance (k, k) of their combinations."""
@@ -545,6 +559,28 @@ class _State:
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
             np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
                 factor, np.eye(len(inner)))[:count, :count]
+
+
+def _check_open_keys(magnet: Magnet, open_keys: Sequence[OpenKey]) -> None:
+    """Raise a StudyError for a key that is open twice, or that no step can change."""
+    study = magnet.study
+    for number, each in enumerate(open_keys):
+        if any(each.key == other.key for other in open_keys[:number]):
+            raise StudyError(must_be(f"`{each.key}`", f"study {study.name}", "open once", "twice"))
+        value, refused = each.value(study), None
+        step = SMALL if each.of_instrument else each.sd * PART_OF_SD
+        for changed in (value + step, value - step):
+            try:
+                magnet.with_study(each.apply(study, changed))
+                break
+            except HalbachError as error:
+                refused = error
+        else:
+            raise StudyError(must_be(
+                f"{each.key}={each.sd:g}", "--fit or --alternative", "a number that may change by "
+                f"{PART_OF_SD:g} of its standard deviation, from {value:g} to {changed:g}",
+                f"'{refused}'", "A whole number cannot be fitted; otherwise make the standard "
+                "deviation smaller."))
 
 
 def _probe_sd(sd: Floats) -> ProbePrior:

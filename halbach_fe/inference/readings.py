@@ -14,7 +14,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
-from halbach_fe.measurement.campaign import Map
+from halbach_fe.measurement.campaign import SAME_PLACE_M, SAME_READING, SHARED, Map, repeated
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, remove_nonlinear_part
 from halbach_fe.measurement.observation import (
@@ -27,11 +27,11 @@ from halbach_fe.measurement.observation import (
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
+from halbach_fe.study.types import MIN_SIGMA_T
 
-ROUNDED = 12
-"""Decimals, in m and T, to which readings are compared: two ways of adding up the same readings
-differ in the last bits."""
-
+BY_CHANCE = 0.15
+"""Share of a held-out map's readings that may equal those that update the model: more than readings
+at the same points do by chance."""
 
 MOVED_M = 1e-4
 """Largest move of a reading for which its noise stays the same. The noise of uncertain positions
@@ -116,30 +116,32 @@ def check_validation_map(readings: Readings, study: Study) -> None:
     Raises
     ------
     MeasurementError
-        If all of its readings are in the map that updates the model, unless the study holds
-        them all out.
+        If many of its readings are in the map that updates the model, unless the study holds
+        all of these out.
 
     Warns
     -----
     HalbachWarning
         If some are.
     """
-    observation = readings.observation
-    places = np.column_stack([observation.positions, readings.values]).round(ROUNDED)
-    rows = list(zip(observation.labels, map(tuple, places.tolist()), strict=True))
-    training = {row for row, part in zip(rows, readings.parts, strict=True) if part == TRAINING}
-    own = [row for row, part in zip(rows, readings.parts, strict=True) if part == HELD_OUT_MAP]
-    others = {row for row, part in zip(rows, readings.parts, strict=True) if part != HELD_OUT_MAP}
-    shared = sum(row in training for row in own)
-    if shared and others.issuperset(own):
+    observation, parts = readings.observation, np.array(readings.parts)
+    noise = [region.sigma_T for region in study.noise.regions] if study.noise else []
+    sigma = min([float(readings.noise.sd.min()), *noise])  # without that of positions, if stated
+    numbers = np.unique(observation.labels, return_inverse=True)[1]
+    rows = np.column_stack([numbers, observation.positions, readings.values])
+    tolerance = np.array([0.5, *[SAME_PLACE_M] * 3, max(SAME_READING * sigma, MIN_SIGMA_T)])
+    own = rows[parts == HELD_OUT_MAP]
+    shared = int(repeated(own, rows[parts == TRAINING], tolerance).sum())
+    if shared <= BY_CHANCE * len(own):
+        return
+    if repeated(own, rows[parts != HELD_OUT_MAP], tolerance).sum() > SHARED * len(own):
         raise MeasurementError(must_be(
             "--held-out", f"study {study.name}", "a map of other readings than those that update "
             "the model", "the same readings", "Hold back readings before the "
             "update (`inference.held_out`), or leave --held-out out."))
-    if shared:
-        warnings.warn(
-            f"{shared} of {len(own)} readings of the held-out map update the model too: their "
-            "predictions are no test.", HalbachWarning, stacklevel=2)
+    warnings.warn(
+        f"{shared} of {len(own)} readings of the held-out map update the model too: their "
+        "predictions are no test.", HalbachWarning, stacklevel=2)
 
 
 def _read(
@@ -147,11 +149,16 @@ def _read(
 ) -> Readings:
     """Return the readings of a map; ``several`` puts its name into error messages and regions."""
     study, where = one.study, one.name if one.is_validation or not several else f"map {one.name}"
+    called = where if several else f"the {where}"
     magnet = magnet.with_study(study)
     data = in_si_and_magnet_axes(study.instrument, one.data)
     measured = ~np.isnan(data["B_T"].values)
     if not one.is_validation:
-        measured &= ~excluded_components(study, data.sizes["point"])
+        measured &= ~excluded_components(study, data.sizes["point"], where)
+    if not measured.any():
+        raise MeasurementError(must_be(
+            "readings", where, "some that the study does not exclude", "none",
+            "Correct `inference.excluded_readings`."))
     if not np.any(data["B_T"].values[measured]):
         raise MeasurementError(must_be(
             "flux densities", where, "those of a magnet", "zero at all points",
@@ -172,21 +179,22 @@ def _read(
     if one.is_validation:
         parts = (HELD_OUT_MAP,) * len(observation)
     else:
-        held_out = held_out_readings(study, observation)
+        held_out = held_out_readings(study, observation, where)
         parts = tuple(np.where(held_out, HELD_OUT, TRAINING).tolist())
     regions = (ALL_READINGS,) * len(observation)
     if study.noise is not None and study.noise.regions:
         names = [region.name for region in study.noise.regions]
         regions = tuple(names[i] for i in noise_regions(
-            study.noise, observation.positions[:, 2], observation.components))
+            study.noise, observation.positions[:, 2], observation.components, called))
     if several:
         single = len(set(regions)) == 1
         regions = tuple(one.name if single else f"{one.name}: {region}" for region in regions)
     values = observation.read(np.nan_to_num(remove_nonlinear_part(study.instrument, data)))
-    points = noises[one.name][0] if one.name in noises else np.inf
-    if np.abs(observation.points - points).max() > MOVED_M:
+    there = noises[one.name][0] if one.name in noises else np.empty((0, 3))
+    if there.shape != observation.points.shape or (
+            np.abs(observation.points - there).max() > MOVED_M):  # sensors apart are more points
         noises[one.name] = observation.points, reading_noise(
-            replace(magnet, blocks=tuple(blocks)), observation, data)
+            replace(magnet, blocks=tuple(blocks)), observation, data, called)
     return Readings(observation, values, noises[one.name][1], parts, regions,
                     (one.name,) * len(observation))
 

@@ -27,6 +27,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses
+from halbach_fe.measurement.field_map import checked_map
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
@@ -79,10 +80,11 @@ def register(
     ------
     MeasurementError
         If no pose puts the map's points in air, no pose explains half of its field, or none is
-        turned as it is known to be.
+        turned as it is known to be; or if the map holds what none does.
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
     """
+    data = checked_map(data, "`data`")
     prior = pose or PosePrior()
     fits = [PoseFit.of(magnet, data, session, probe or ProbePrior(), tuple(keys), prior,
                     blocks)
@@ -144,6 +146,19 @@ def odds(found: Sequence[Registration]) -> Floats:
     logs = np.array([each.log_evidence for each in found])
     weights = np.exp(logs - logs.max())
     return np.asarray(weights / weights.sum())
+
+
+def turn_from_axes(instrument: Instrument) -> Floats:
+    """Return the rotation vector (3,) in rad, in the magnet's axes, that remains after the map's
+    axes were put along those of `axes_of_map`.
+    """
+    matrix = Rotation.from_rotvec(instrument.rotation_rad).as_matrix()
+    nearest = np.zeros((3, 3))
+    for number, axis in enumerate(axes_of_map(instrument).values()):
+        nearest[COMPONENTS.index(axis[-1]), number] = -1.0 if axis.startswith("-") else 1.0
+    if not np.linalg.det(nearest) > 0:  # two axes of the map are nearest to the same one
+        return np.array(instrument.rotation_rad)
+    return np.asarray(Rotation.from_matrix(matrix @ nearest.T).as_rotvec())
 
 
 def axes_of_map(instrument: Instrument) -> dict[str, str]:

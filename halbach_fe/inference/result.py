@@ -49,9 +49,9 @@ TOO_NEAR = 0.1
 three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
 
 
-TOO_FAR = 25.0
-"""chi-squared per held-out reading beyond which noise or model are wrong: five standard deviations
-even if all predictions err alike, as they do where one combination of parameters is uncertain."""
+TOO_FAR = 1.3
+"""chi-squared per held-out reading, with the covariance of the predictions, up to which there is no
+word however many readings there are: error bars are then too small by a seventh."""
 
 FEWEST_LEFT = 20
 """Readings beyond the parameters learnt from which their noise is judged. chi-squared of 20 is
@@ -178,6 +178,8 @@ class RegionScore:
         Noise region and part (training, held out, held-out map) of the readings.
     readings : int
         Number of readings.
+    rms_error_prior_T, rms_error_posterior_T : float
+        Root mean square of measured minus predicted.
     median_relative_error_prior, median_relative_error_posterior : float or None
         Median of ``|measured - predicted| / |measured|`` over the readings that are not 0.
     rms_standardized_prior, rms_standardized_posterior : float
@@ -195,6 +197,8 @@ class RegionScore:
     region: str
     part: str
     readings: int
+    rms_error_prior_T: float
+    rms_error_posterior_T: float
     median_relative_error_prior: float | None
     median_relative_error_posterior: float | None
     rms_standardized_prior: float
@@ -426,14 +430,19 @@ class InferenceResult(ShownInNotebook):
     @property
     def _held_out_conflict(self) -> str:
         """A sentence if held-out readings are far from their predictions, else nothing."""
-        if not self.held_out.any():
-            return ""
-        chi2 = float(np.mean(self.standardized(self.prediction_posterior)[self.held_out]**2))
-        if chi2 <= TOO_FAR:
-            return ""
-        return (f"Held-out readings are {np.sqrt(chi2):.3g} times farther from their predictions "
-                "than these and the noise allow: sigma_T is too small, or an effect is missing "
-                "from the model, so that its error bars are too small.")
+        for part, words in ((HELD_OUT, ""), (HELD_OUT_MAP, " of the held-out map")):
+            of_part = [score for score in self.scores if score.part == part]
+            count = sum(score.readings for score in of_part)
+            if not count:
+                continue
+            chi2 = sum(score.readings * float(score.chi2_posterior or 0.0)
+                       for score in of_part) / count
+            if chi2 > max(TOO_FAR, 1 + 5 * np.sqrt(2 / count)):
+                return (f"Held-out readings{words} are {np.sqrt(chi2):.3g} times farther from "
+                        "their predictions than these and the noise allow (chi² per reading is "
+                        f"{chi2:.3g}): sigma_T is too small, an effect is missing from the model, "
+                        "or these readings are not of this magnet.")
+        return ""
 
     @property
     def _conflict(self) -> str:
@@ -525,7 +534,9 @@ class InferenceResult(ShownInNotebook):
             finite = relative[chosen & ~np.isnan(relative)]
             residuals = np.abs(standardized[chosen])
             unseen = part != TRAINING
+            error = (self.readings - prediction.mean)[chosen]
             figures |= {
+                f"rms_error_{name}_T": float(np.sqrt(np.mean(error**2))),
                 f"median_relative_error_{name}": float(np.median(finite)) if len(finite) else None,
                 f"rms_standardized_{name}": float(np.sqrt(np.mean(residuals**2))),
                 f"coverage95_{name}": float(np.mean(residuals <= COVERAGE_Z)) if unseen else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from halbach_fe.core.errors import MeasurementError, must_be
@@ -12,15 +13,21 @@ COLUMN = "block"
 """The column of the names; any other column is ignored."""
 
 
-def read_order(path: str | Path) -> tuple[str, ...]:
+def read_order(path: str | Path, blocks: Sequence[str]) -> tuple[str, ...]:
     """Read the names of blocks, one per row, from the column ``block`` of a CSV file.
 
     forces.csv, with its rows in another order, is such a table.
 
+    Parameters
+    ----------
+    path : str or Path
+    blocks : sequence of str
+        Names of all blocks, each of which the table has to name once.
+
     Raises
     ------
     MeasurementError
-        If the table is invalid.
+        If the table is invalid, or does not name every block once.
     """
     path = as_path(path)
     where = f"order of assembly {path}"
@@ -29,4 +36,21 @@ def read_order(path: str | Path) -> tuple[str, ...]:
     if COLUMN not in header:
         raise MeasurementError(must_be("header", where, f"a table with the column {COLUMN}",
                                        ",".join(header)))
-    return tuple(cells[header.index(COLUMN)] for _, cells in rows)
+    known, lines = set(blocks), dict[str, int]()
+    for number, cells in rows:
+        name = cells[header.index(COLUMN)]
+        if name not in known:
+            raise MeasurementError(must_be(
+                f"{COLUMN} in line {number}", where, "one of the blocks of the magnet",
+                f"'{name}'", f"Their names are like {blocks[0]}."))
+        if name in lines:
+            raise MeasurementError(must_be(
+                f"{COLUMN} in line {number}", where, "a block of its own",
+                f"{name}, which is in line {lines[name]} too", "Remove a row."))
+        lines[name] = number
+    missing = [name for name in blocks if name not in lines]
+    if missing:
+        raise MeasurementError(must_be(
+            "content", where, f"all {len(blocks)} blocks of the magnet",
+            f"{len(lines)}, without {missing[0]}"))
+    return tuple(lines)

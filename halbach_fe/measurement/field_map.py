@@ -166,16 +166,49 @@ def _read_hdf5(path: Path) -> xr.Dataset:
     except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
                                        f"'{error}'")) from None
+    return _labelled(data, where)
+
+
+def checked_map(data: object, name: str) -> xr.Dataset:
+    """Return a map that a user made or changed, after the checks that a file of it undergoes.
+
+    Parameters
+    ----------
+    data : object
+        It should be a Dataset, see `read_map`.
+    name : str
+        Name of the map in error messages, unless it was read from a file.
+
+    Raises
+    ------
+    MeasurementError
+        If it is none, or holds what no map does.
+    """
+    if not isinstance(data, xr.Dataset):
+        raise MeasurementError(must_be(
+            "data", f"map {name}", "a Dataset", f"a {type(data).__name__}",
+            "Read the file by read_map, and the maps that a study lists by read_maps."))
+    name = str(data.encoding.get("source", name))
+    data = _labelled(data, f"map {name}")
+    check_readings(data, name)
+    return data
+
+
+def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
+    """Return a map, with sigma_T by point and component; MeasurementError if labels are wrong."""
     for name in ("B_T", *POSITION_COLUMNS):
         if name not in data.variables:
-            raise MeasurementError(must_be("variable", where, f"`{name}`", "a file without it"))
-    if data["B_T"].dims != ("point", "component") or list(
-            data.get("component", xr.DataArray([])).values) != list(COMPONENTS):
-        raise MeasurementError(must_be("`B_T`", where, "labelled (point, component = x, y, z)",
-                                       f"dimensions {data['B_T'].dims}"))
+            raise MeasurementError(must_be("variable", where, f"`{name}`", "none of that name"))
+    labels = list(data["component"].values) if "component" in data.coords else []
+    if data["B_T"].dims != ("point", "component") or labels != list(COMPONENTS):
+        raise MeasurementError(must_be(
+            "`B_T`", where, "labelled (point, component = x, y, z)",
+            f"dimensions {data['B_T'].dims}, components {', '.join(map(str, labels)) or 'unnamed'}",
+            "In Python, data.transpose('point', 'component').sel(component=['x', 'y', 'z']) "
+            "arranges all three."))
     if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
-        data["sigma_T"] = data["sigma_T"].broadcast_like(data["B_T"]).transpose(
-            "point", "component")
+        data = data.assign(sigma_T=data["sigma_T"].broadcast_like(data["B_T"]).transpose(
+            "point", "component"))
     by_point: tuple[str, ...] = ("point",)
     expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), by_point)
     expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
@@ -185,7 +218,7 @@ def _read_hdf5(path: Path) -> xr.Dataset:
         numeric = name == "scan" or np.issubdtype(data[name].dtype, np.floating) or (
             np.issubdtype(data[name].dtype, np.integer))
         if name == "scan" and data[name].dtype.kind in "OST":
-            data[name] = data[name].astype(str)
+            data = data.assign(scan=data[name].astype(str))
         if data[name].dims != dims or not numeric:
             raise MeasurementError(must_be(f"`{name}`", where, f"numbers labelled {dims}",
                                            f"{data[name].dtype} labelled {data[name].dims}"))
@@ -259,7 +292,7 @@ def _number(cell: str, name: str, number: int, where: str) -> float:
     return finite(cell, f"{name} in line {number}", where, "Leave a missing component empty.")
 
 
-def check_readings(data: xr.Dataset, path: Path) -> None:
+def check_readings(data: xr.Dataset, path: Path | str) -> None:
     """Check points and values of a map; raise MeasurementError for the first invalid reading."""
     where = f"map {path}"
     if not data.sizes["point"]:
@@ -278,6 +311,9 @@ def check_readings(data: xr.Dataset, path: Path) -> None:
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
             raise MeasurementError(must_be("sigma", where, "positive for every reading",
                                            "a zero, negative or missing value"))
+    if "time_s" in data and not np.isfinite(data["time_s"].values).all():
+        raise MeasurementError(must_be("`time_s`", where, "finite numbers",
+                                       "an infinite or missing value"))
     if "scan" in data:
         _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)
@@ -294,14 +330,15 @@ def check_magnitudes(data: xr.Dataset) -> None:
     if farthest > 10 * MAX_LENGTH_M:
         raise MeasurementError(must_be(
             "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
-            "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study."))
+            "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study, or "
+            "convert the map by halbach-fe import-map."))
     largest = float(np.nanmax(np.abs(data["B_T"].values)))
     if largest > MAX_FIELD_T:
         unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
         raise MeasurementError(must_be(
             "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            "study."))
+            "study, or convert the map by halbach-fe import-map."))
     if "sigma_T" in data:
         sigma = data["sigma_T"].values[~np.isnan(data["B_T"].values)]
         for extreme in (sigma.max(), sigma.min()):

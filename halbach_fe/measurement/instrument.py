@@ -67,7 +67,8 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
                                for axis, name in enumerate(POSITION_COLUMNS)})
     read = read.assign(B_T=data["B_T"].copy(data=field))
     if "sigma_T" in data:
-        sigma = np.abs(to_magnet_axes(instrument.field_axes, data["sigma_T"].values)) * unit
+        sigma = to_magnet_axes(instrument.field_axes, data["sigma_T"].values) * unit
+        sigma *= to_magnet_axes(instrument.field_axes, np.ones(sigma.shape))  # axes have signs
         read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
     check_magnitudes(read)
     return read

@@ -49,8 +49,12 @@ gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
 
 
 def prior_sd(settings: InstrumentSd) -> Floats:
-    """Return the prior standard deviations (30,) of all terms."""
-    return np.repeat([settings.translation_m, settings.rotation_rad, settings.crosstalk,
+    """Return the prior standard deviations (30,) of all terms.
+
+    What three uncertain places of sensors have in common adds to the shift of the map.
+    """
+    shift = np.hypot(settings.translation_m, settings.sensor_position_m / np.sqrt(3))
+    return np.repeat([shift, settings.rotation_rad, settings.crosstalk,
                       settings.gain, settings.offset_T, settings.sensor_position_m,
                       settings.drift_T], [3, 3, 6, 3, 3, 9, 3])
 

@@ -25,14 +25,16 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
     GAINS,
     LAG,
+    MIXING,
     NEXT_ITERATIONS,
     OFFSETS,
+    SENSORS,
     TURNS,
     ProbeFit,
     ProbeModel,
@@ -78,8 +80,9 @@ PREDICTS = 1.02
 """Factor by which the error of lines that are left out must grow without a change of the instrument
 for it to be kept. Without any drift it changed by -2 % to +1.3 % in four maps of 315 points."""
 
-CHANGING = (GAINS, OFFSETS, TURNS)
-"""Parameters that change during the scan."""
+GROUPS = (slice(None), GAINS, OFFSETS, TURNS, SENSORS, MIXING)
+"""Parameters that must help to predict: all together, those that change during the scan, places of
+the sensors, and their directions and gains."""
 
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
@@ -244,8 +247,8 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     Raises
     ------
     MeasurementError
-        If fewer than `FEWEST_POINTS` points have all three components and are not broken, or if
-        they lie on a line.
+        If fewer than `FEWEST_POINTS` points have all three components and are not broken, if they
+        lie on a line, or if the map holds what none does in m and T.
 
     Examples
     --------
@@ -257,6 +260,8 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     >>> hf.check_map(field_map(points, field)).suffices
     True
     """
+    data = checked_map(data, "`data`")
+    check_magnitudes(data)
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     broken = broken_rows(points, field)
@@ -319,6 +324,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
         whole = fit_probe(model, chosen, fit, train)
     floor = turned[held_out] - model.readings(train, held_out)
     residual = turned - model.readings(whole)
+    beyond = _rms(floor * model.weights[held_out]) / _rms(residual[chosen] * model.weights[chosen])
     noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes),
                                 residual[chosen])
     (as_given,) = fit_fields(charges, places, [readings])
@@ -328,7 +334,8 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
         size_T=float(np.linalg.norm(field[usable], axis=1).max()),
         orientation=_named(matrix), alike=alike,
         rms_as_given_T=_rms(given), rms_T=_rms(residual[chosen] @ np.abs(matrix)),
-        floor_T=_rms(floor @ np.abs(matrix)), terms=_terms(whole), broken=broken,
+        floor_T=_rms(floor @ np.abs(matrix)),
+        terms=_terms(whole, max(float(beyond.max()), 1.0)), broken=broken,
         windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
         noise_T=noise, position_noise_m=displaced,
         structure=_structure(points[chosen], residual[chosen]),
@@ -426,8 +433,8 @@ def _gap(
     """Return the distance in m of the charges, where the sensors are, and the fit of the field.
 
     The distance is that from where sensors at (3, 3) in m read the field at points (n, 3) in m. The
-    instrument is first fitted with some points and charges that are neither near nor far: those of
-    a map near edges of magnets, fitted by far charges, gave sensors that were 10 mm off.
+    instrument is perfect, or is first fitted with some points and charges that are neither near nor
+    far: those of a map near edges of magnets, fitted by far charges, gave sensors 10 mm off.
     """
     every = np.ones(len(points), bool)
     some = _some_points(points)
@@ -435,16 +442,19 @@ def _gap(
                        time[some], directions[some])
     (perfect,) = fit_fields(start.charges, points[some], [field[some]])
     instrument = fit_probe(start, np.ones(len(some), bool), perfect)
-    read_at = _read_at(points, instrument.sensors_m)
-    fitted = {}
-    for gap in GAPS:
-        near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
-        if near or gap == GAPS[-1]:
-            model = ProbeModel(Charges.around(read_at, gap * spacing), points, field, time,
-                               directions)
-            fitted[gap] = model.fit(instrument, every)
-    gap = max(fitted, key=lambda each: fitted[each].log_evidence)
-    return gap * spacing, instrument.sensors_m, fitted[gap]
+    found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
+    for probe in (instrument, start.start(perfect)):
+        read_at = _read_at(points, probe.sensors_m)
+        for gap in GAPS:
+            near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
+            if near or gap == GAPS[-1]:
+                model = ProbeModel(Charges.around(read_at, gap * spacing), points, field, time,
+                                   directions)
+                fit = model.fit(probe, every)
+                evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
+                found.append((evidence, gap, probe, fit))
+    _, gap, probe, fit = max(found, key=lambda each: each[0])
+    return gap * spacing, probe.sensors_m, fit
 
 
 def _some_points(points: Floats) -> Ints:
@@ -461,7 +471,7 @@ def _confirmed(
     model: ProbeModel, rows: NDArray[np.bool_], left_out: NDArray[np.bool_], fit: HarmonicFit,
     start: ProbeFit,
 ) -> tuple[ProbeModel, ProbeFit]:
-    """Return the model without the changes that do not help to predict some of the rows.
+    """Return the model without the parameters that do not help to predict some of the rows.
 
     What is left of a field that is steeper than the charges, and positions that are off together
     along a line, is no white noise. Slow functions of time take to it with certainty, and fail
@@ -474,11 +484,13 @@ def _confirmed(
         return float(np.linalg.norm(_rms(off))), fitted
 
     error, start = predicted(model)
-    for group in CHANGING:
+    for group in GROUPS:
         trial = model.without(group)
         other, fitted = predicted(trial)
         if other <= error * PREDICTS:
             error, model, start = other, trial, fitted
+        if not model.prior_sd.any():
+            break
     return model, start
 
 
@@ -487,15 +499,19 @@ CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
 """Differences of the Legendre polynomials 1 to 4 between times of the scan."""
 
 
-def _terms(fitted: ProbeFit) -> tuple[InstrumentTerm, ...]:
-    """Return the parameters of the instrument in the units of people."""
+def _terms(fitted: ProbeFit, beyond: float) -> tuple[InstrumentTerm, ...]:
+    """Return the parameters of the instrument in the units of people.
+
+    ``beyond`` is how many times farther off held-out lines are than fitted ones. What the charges
+    cannot follow is no white noise: it moves the parameters by as much more.
+    """
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
 
     def add(name: str, unit: str, factor: float, weights: dict[int, float]) -> None:
         row = np.zeros(len(value))
         row[list(weights)] = factor * np.array(list(weights.values()))
-        sd = float(np.sqrt(row @ scaled @ row))
+        sd = beyond * float(np.sqrt(row @ scaled @ row))
         prior = float(np.linalg.norm(row * fitted.prior_sd))
         found.append(InstrumentTerm(name, unit, float(row @ value), sd, sd < DETERMINED * prior,
                                     abs(float(row @ value)) <= PLAUSIBLE * prior, prior > 0))

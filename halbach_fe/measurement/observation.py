@@ -303,8 +303,10 @@ def fourier_analysis(
     return matrix, tuple(labels), np.array(positions)
 
 
-def excluded_components(study: Study, count: int) -> NDArray[np.bool_]:
+def excluded_components(study: Study, count: int, where: str = "map") -> NDArray[np.bool_]:
     """Return which components (count, 3) of a map with ``count`` rows the study excludes.
+
+    Error messages call the map ``where``.
 
     Raises
     ------
@@ -315,16 +317,19 @@ def excluded_components(study: Study, count: int) -> NDArray[np.bool_]:
     for reading in study.inference.excluded_readings:
         if reading.row > count:
             raise MeasurementError(must_be(
-                "rows", "map", f"at least the {reading.row} that inference.excluded_readings names",
+                "rows", where, f"at least the {reading.row} that inference.excluded_readings names",
                 f"{count}", "Is it another map?"))
         found[reading.row - 1, [COMPONENTS.index(name) for name in reading.components]] = True
     return found
 
 
-def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool_]:
+def held_out_readings(
+    study: Study, observation: Observation, where: str = "map"
+) -> NDArray[np.bool_]:
     """Return which readings (readings,) the study holds out of the update.
 
-    A reading is held out if any key of the study's ``inference.held_out`` selects it.
+    A reading is held out if any key of the study's ``inference.held_out`` selects it. Error
+    messages call the map ``where``.
 
     Raises
     ------
@@ -341,7 +346,7 @@ def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool
         chosen = (rank // settings.window) % settings.every == settings.every - 1
         if not chosen.any():
             raise MeasurementError(must_be(
-                "readings", "map", "at enough z positions for the study to hold some out",
+                "readings", where, "at enough z positions for the study to hold some out",
                 f"{rank.max() + 1} positions",
                 "Remove inference.held_out, or make its window smaller."))
     named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, RADIUS_M)
@@ -353,7 +358,7 @@ def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool
     if settings.scan_lines_every is not None:
         if study.observation.quantity != "flux_density":
             raise MeasurementError(must_be(
-                "readings", "map", "flux densities, to hold out lines of the scan by "
+                "readings", where, "flux densities, to hold out lines of the scan by "
                 "`inference.held_out.scan_lines_every`", "Fourier coefficients"))
         apart = held_out_lines(scan_lines(observation.map_points), settings.scan_lines_every)
         named[f"scan_lines_every = {settings.scan_lines_every}"] = apart[
@@ -361,11 +366,13 @@ def held_out_readings(study: Study, observation: Observation) -> NDArray[np.bool
     for name, mask in named.items():
         if not mask.any():
             raise MeasurementError(must_be(
-                "readings", "map", f"such that `inference.held_out.{name}` holds some of them out",
-                "none", "Correct or remove this key."))
+                "readings", where, f"such that `inference.held_out.{name}` holds some of them out",
+                f"none, at radii from {observation.radii.min():g} to {observation.radii.max():g} m "
+                f"and z from {z.min():g} to {z.max():g} m", "Correct or remove this key. Or are "
+                "they in mm? Then set `instrument.length_unit_m`."))
         chosen = chosen | mask
     if chosen.all():
         raise MeasurementError(must_be(
-            "readings", "map", "enough for the study to leave some for the update",
+            "readings", where, "enough for the study to leave some for the update",
             f"{len(chosen)}, all held out", "Change inference.held_out."))
     return chosen

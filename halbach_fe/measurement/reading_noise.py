@@ -24,7 +24,7 @@ circle that cancel exactly leave rounding errors of 1e-15."""
 
 
 def noise_regions(
-    noise: NoiseSettings, z: Floats, components: Sequence[str]
+    noise: NoiseSettings, z: Floats, components: Sequence[str], where: str = "the map"
 ) -> NDArray[np.int64]:
     """Return for each reading the index of the first noise region of the study that contains it.
 
@@ -36,6 +36,8 @@ def noise_regions(
     components : sequence of str
         Component of each reading, x, y or z; empty for a Fourier coefficient, which a region
         contains whatever its components.
+    where : str
+        What error messages call the map.
 
     Raises
     ------
@@ -51,12 +53,14 @@ def noise_regions(
         first = int(np.argmin(region))
         which = f", component {components[first]}," if components[first] else ""
         raise StudyError(
-            f"Input `noise.regions` of study must cover every reading; instead z = "
+            f"Input `noise.regions` of study must cover every reading of {where}; instead z = "
             f"{z[first]:g} m{which} is in none. Add a last region without limits.")
     return region
 
 
-def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) -> NoiseCovariance:
+def reading_noise(
+    magnet: Magnet, observation: Observation, data: xr.Dataset, where: str = "the map"
+) -> NoiseCovariance:
     """Return the noise covariance of the readings of a map.
 
     If the map states the noise of its points (``sigma_T``), it is propagated to the readings;
@@ -64,7 +68,8 @@ def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) ->
     of uncertain positions is added.
 
     For Fourier coefficients, noise that differs along a circle leaves the coefficients of this
-    circle correlated. A region's sigma is that of the coefficients, not that of the points.
+    circle correlated. A region's sigma is that of the coefficients, not that of the points. Error
+    messages call the map ``where``.
 
     Raises
     ------
@@ -78,12 +83,12 @@ def reading_noise(magnet: Magnet, observation: Observation, data: xr.Dataset) ->
         covariance = analysis @ sparse.diags_array(points) @ analysis.T
     elif settings is None or not settings.regions:
         raise StudyError(
-            f"Input `noise` of study {magnet.name} must say how noisy the readings are, since the "
-            "map has no sigma_T; instead it is missing. Add [[noise.regions]] to the study, or "
-            "sigma_T to the map.")
+            f"Input `noise` of study {magnet.name} must say how noisy the readings are, since "
+            f"{where} has no sigma_T; instead it is missing. Add [[noise.regions]] to the study, "
+            "or sigma_T to the map.")
     else:
         sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
-            settings, observation.positions[:, 2], observation.components)]
+            settings, observation.positions[:, 2], observation.components, where)]
         covariance = sparse.diags_array(sigma**2)
     if settings is not None and settings.position_sd_m is not None:
         moved = readings_per_displacement(

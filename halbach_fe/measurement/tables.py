@@ -11,6 +11,7 @@ import numpy as np
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import parse_number as number_in
+from halbach_fe.core.tables import WITH_COMMAS, other_separator
 
 
 def csv_table(
@@ -57,6 +58,10 @@ def csv_table(
             if comment[1]:
                 attributes[comment[1]] = comment[2].strip()
         elif line.strip():
+            if not rows and (separator := other_separator(line)) is not None:
+                raise MeasurementError(must_be("header", where, "names that commas separate",
+                                               f"names that {separator} separate",
+                                               hint or WITH_COMMAS))
             rows.append((number, _cells(line, number, where)))
     if not rows:
         raise MeasurementError(must_be("content", where, "a table with a header", "only comments"))

@@ -4,18 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Ints
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import counted, fraction, p_value
 from halbach_fe.stats.sbc import BINS
+
+CONTROL = "control: "
+"""Beginning of the name of a posterior that is wrong on purpose."""
+
+PANELS_IN_A_ROW = 3
+"""More would be unreadable on a narrow screen."""
+
+
+def answer(results: Mapping[str, Mapping[str, Any]]) -> Answer:
+    """Say whether the error bars of the posteriors hold, and whether the test can tell."""
+    tested = {name: row for name, row in results.items() if not name.startswith(CONTROL)}
+    controls = {name: row for name, row in results.items() if name.startswith(CONTROL)}
+    off = [name for name, row in tested.items() if not row["as_expected"]]
+    passed = [name.removeprefix(CONTROL) for name, row in controls.items()
+              if not row["as_expected"]]
+    shown = "; ".join(
+        f"{name}: p = {p_value(row['p_value'])} of {counted(row['repeats'], 'magnet')}"
+        for name, row in tested.items())
+    said = ("Yes: the true magnetizations lie among the draws of the posterior as often as they "
+            f"should ({shown})." if not off else "No: the true magnetizations do not lie among the "
+            f"draws as they should for {' and '.join(off)} ({shown}).")
+    trust = (f"Yes: {counted(len(controls), 'control')} with a wrong posterior had to fail the "
+             "same test, and did. A smaller error may go unnoticed; more magnets sharpen "
+             "the test." if not passed else "No: a wrong posterior passes the test as well "
+             f"({'; '.join(passed)}), so that it can tell too little. Draw more magnets.")
+    return Answer(
+        "Are the error bars of the inferred magnetizations as wide as they should be?", said, trust,
+        "Find out why before any error bar is believed." if off else
+        "Update a magnet with its map.",
+        "" if off else "halbach-fe infer STUDY --measurements MAP -o DIR", not off and not passed)
 
 
 @own_style
 def write_calibration(
-    ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, object]],
+    ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, Any]],
     folder: Path,
 ) -> None:
     """Write calibration.html and ranks.png.
@@ -31,16 +65,30 @@ def write_calibration(
         Rows of the page's table by kind of posterior.
     folder : Path
     """
-    figure = Figure(figsize=(3.6 * len(ranks), 3.2), layout="constrained")
-    for axis, (name, case_ranks) in zip(figure.subplots(1, len(ranks), squeeze=False)[0],
-                                   ranks.items(), strict=True):
+    columns = min(PANELS_IN_A_ROW, len(ranks))
+    rows = -(-len(ranks) // columns)
+    figure = Figure(figsize=(3.2 * columns, 2.8 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[len(ranks):]:
+        axis.remove()
+    for axis, (name, case_ranks) in zip(axes, ranks.items(), strict=False):
         edges = np.linspace(0, draws + 1, BINS + 1)
         axis.hist(case_ranks.ravel(), edges, density=True, color=POSTERIOR)
         axis.axhline(1 / (draws + 1), color=PUBLISHED)
-        axis.set(title=name, xlabel="rank of the true value", yticks=[])
+        axis.set(title="\n".join(wrap(name, 32)), xlabel="rank of the true value", yticks=[])
         axis.title.set_fontsize(9)
     pictures = save({"ranks.png": (figure, "Ranks of the true parameters among draws of the "
                                    "posterior, all parameters together; a calibrated posterior "
                                    "gives the horizontal line")},
                     folder)
-    write_page(folder / "calibration.html", "calibration.html.j2", pictures, results=results)
+    write_page(folder / "calibration.html", "calibration.html.j2", pictures, answer=answer(results),
+               rows=calibration_rows(results))
+
+
+def calibration_rows(results: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return a row of text for each posterior."""
+    return [{"posterior": name, "magnets": str(row["repeats"]),
+             "model's stated error, of the noise": fraction(row["model_error_over_noise"]),
+             "p-value": p_value(row["p_value"]),
+             "as expected": "yes" if row["as_expected"] else "no"}
+            for name, row in results.items()]

@@ -16,23 +16,45 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
-    axis_of_points,
     geometry_figure,
     own_style,
     save,
     stacked_axes,
     write_page,
 )
+from halbach_fe.report.point_maps import curve, maps_figure
+from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.simulate import observed_components, point_noise
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
+
+
+def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: int) -> Answer:
+    """Say what was simulated, and what to do with it."""
+    fields, more = np.abs(readings["B_T"].values), ""
+    if held_out is not None:
+        more = f", {counted(held_out.sizes['point'], 'held-out point')}"
+    sigma = _noise(study, readings)
+    return Answer(
+        "What would a measurement of this magnet give?",
+        f"map.csv has {counted(readings.sizes['point'], 'point')}{more}; blocks.csv has "
+        f"{counted(blocks, 'single block')}. The largest reading is "
+        f"{flux_density(float(np.nanmax(fields)), 4)}, the noise is "
+        f"{flux_density(float(np.nanmin(sigma)), 2)} at least.",
+        "This magnet was never built: its blocks were drawn at random, and its field was computed "
+        "with programs other than halbach-fe. A campaign may contain a hidden error, also of the "
+        "positions that the map states.",
+        "Update the magnet with the map, as if it were measured, then compare with the truth.",
+        "halbach-fe infer STUDY --measurements DIR/map.csv --blocks DIR/blocks.csv"
+        + (" --held-out DIR/held-out.csv" if held_out is not None else "") + " -o DIR")
 
 
 @own_style
@@ -57,8 +79,7 @@ def write_campaign_page(
     points = points_of(readings)
     figures = {
         "campaign_field.png": (
-            _field_figure(study, maps), "Readings at the points of the map (dots) and at the "
-            "held-out points (crosses), and the standard deviation of their noise"),
+            _field_figure(study, maps), "The readings of the map"),
         "campaign_geometry.png": (
             geometry_figure(build_magnet(study), points,
                             None if held_out is None else points_of(held_out)),
@@ -68,11 +89,20 @@ def write_campaign_page(
     write_page(
         folder / "campaign.html", "campaign.html.j2", save(figures, folder), study=study,
         provenance={"source": "simulated", "SHA-256 of the truth": readings.attrs["truth_sha256"]},
-        rows=[_map_row(study, name, data) for name, data in maps.items()], blocks=len(blocks),
+        answer=answer(study, readings, held_out, len(blocks)),
+        rows=campaign_table(study, readings, held_out), blocks=len(blocks),
         files=files, view=view_of_nominal_magnet(build_magnet(study), ViewPoints(
-            points, magnitude, "points of the map", "magnitude of the<br>readings in T",
-            "magnitude of the readings %{customdata:.5g} T",
-            (float(magnitude.min()), float(magnitude.max())))))
+            points, 1e3 * magnitude, "points of the map", "magnitude of the<br>readings in mT",
+            "magnitude of the readings %{customdata:.5g} mT",
+            (1e3 * float(magnitude.min()), 1e3 * float(magnitude.max())))))
+
+
+def campaign_table(
+    study: Study, readings: xr.Dataset, held_out: xr.Dataset | None
+) -> list[dict[str, str]]:
+    """Return a row of text for the map, and one for the held-out points if there are any."""
+    maps = {"map": readings} | ({} if held_out is None else {"held out": held_out})
+    return [_map_row(study, name, data) for name, data in maps.items()]
 
 
 def _map_row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:
@@ -81,10 +111,10 @@ def _map_row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:
     sigma = _noise(study, data)
     return {"points of": name, "number": str(len(z)),
             "components": ", ".join(f"B{name}" for name in observed_components(study)),
-            "z in m": " to ".join(dict.fromkeys(f"{end:g}" for end in (z.min(), z.max()))),
-            "largest reading in T": f"{np.nanmax(np.abs(fields)):.5g}",
-            "sd of the noise in T": " to ".join(dict.fromkeys(
-                f"{end:.1e}" for end in (np.nanmin(sigma), np.nanmax(sigma))))}
+            "z in mm": " to ".join(dict.fromkeys(f"{1e3 * end:g}" for end in (z.min(), z.max()))),
+            "largest reading": flux_density(float(np.nanmax(np.abs(fields))), 5),
+            "sd of the noise": " to ".join(dict.fromkeys(
+                flux_density(float(end), 2) for end in (np.nanmin(sigma), np.nanmax(sigma))))}
 
 
 def _noise(study: Study, data: xr.Dataset) -> Floats:
@@ -93,18 +123,21 @@ def _noise(study: Study, data: xr.Dataset) -> Floats:
 
 
 def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
-    """Draw the readings of all maps, and the standard deviations of their noise below."""
-    figure, (top, bottom) = stacked_axes(2, [3, 1])
+    """Draw the readings of all maps along a line or circle, or those of the map as a map."""
+    if any(curve(points_of(data)) is None for data in maps.values()):
+        (data, *_) = maps.values()
+        return maps_figure(points_of(data), {
+            f"B{name}": 1e3 * data["B_T"].values[:, COMPONENTS.index(name)]
+            for name in observed_components(study)}, "mT")
+    figure, (axis,) = stacked_axes(1)
+    figure.set_size_inches(8, 4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
-        place, label = axis_of_points(points_of(data))
+        place, label = curve(points_of(data)) or (np.zeros(0), "")
         for component in observed_components(study):
             number = COMPONENTS.index(component)
-            top.plot(place, data["B_T"].values[:, number], marker, ms=4, color=COLOURS[number],
-                     label=f"B{component}, {name}")
-            bottom.semilogy(place, _noise(study, data)[:, number], marker, ms=4,
-                            color=COLOURS[number])
-        bottom.set_xlabel(label)
-    top.set_ylabel("reading in T")
-    bottom.set_ylabel("sd of the noise in T")
+            axis.plot(place, 1e3 * data["B_T"].values[:, number], marker, ms=4,
+                      color=COLOURS[number], label=f"B{component}, {name}")
+        axis.set_xlabel(label)
+    axis.set_ylabel("reading in mT")
     figure.legend(loc="outside upper center", ncols=2 * len(maps), markerscale=2)
     return figure

@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
+from halbach_fe.diagnosis.summary import block_in_words
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
 from halbach_fe.report.page import (
     MEASURED,
@@ -27,6 +29,8 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import place_of
+from halbach_fe.study.model import is_nonlinear
 
 PAST = "#D55E00"
 """Colour of the knee and of cells past it."""
@@ -59,6 +63,36 @@ def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
     }
 
 
+def answer(found: DemagnetizationMap) -> Answer:
+    """Say whether blocks lose magnetization, at which temperature they begin to, and what next."""
+    temperature, lost = found.material.temperature_C, found.share_beyond_now
+    worst = int(np.argmin(found.margin))
+    block = place_of(found.blocks[found.cells.block[worst]])
+    start = (f"{100 * lost:.2g} % of the magnet's volume is past the knee of its demagnetization "
+             "curve and loses magnetization for good" if lost > 0 else
+             "no cell is past the knee of the demagnetization curve")
+    limits = "; ".join(
+        f"{'the first cell' if not share else f'{100 * share:g} % of the volume'} passes the knee "
+        f"at {limit:.0f} °C" if math.isfinite(limit) else
+        f"{'no cell' if not share else f'{100 * share:g} % of the volume'} "
+        f"{'ever' if not share else 'never'} passes the knee"
+        for share, limit in ((share, found.limit_temperature(share)) for share in SHARES))
+    nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
+                 if is_nonlinear(found.study) else "")
+    return Answer(
+        "Do the blocks keep their magnetization?",
+        f"At {temperature:g} °C {start}. The smallest margin is "
+        f"{1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
+        "As far as coercivity and coefficients of the study are right: data sheets state them "
+        "within some per cent. The very edges of blocks are worse than any cell (--across makes "
+        f"cells smaller); shares of the volume hardly depend on that.{nonlinear}",
+        *(("Choose a grade of a higher coercivity for these blocks (the table says which), or a "
+           "lower temperature. What is lost is found in a measurement.",
+           "halbach-fe diagnose STUDY --measurements MAP -o DIR") if lost > 0 else
+          ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
+           "halbach-fe forces STUDY -o DIR")))
+
+
 @own_style
 def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
     """Write demagnetization.json, .csv (a row per block), .vtu (cells), .html and the figures."""
@@ -82,13 +116,13 @@ def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
             "smallest value in any of its cells"),
     }, folder)
     write_page(folder / "demagnetization.html", "demagnetization.html.j2", pictures,
-               study=found.study, summary=summary, material=found.material,
+               study=found.study, summary=summary, material=found.material, answer=answer(found),
                rows=worst_block_table(rows), blocks=len(rows), view=_view(found, rows))
 
 
 def worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
-    return [{"block": row["block"], "ring": str(row["ring"]), "slot": str(row["slot"]),
+    return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",

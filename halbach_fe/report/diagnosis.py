@@ -2,49 +2,43 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
-from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.loo_residuals import DISCOVERIES, ResidualGroup
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
-    MAX_EFFECTS,
 )
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
     EMPTY_CELL,
-    PRESENT,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,
-    limits_in_words,
     main_field_T,
     other_findings,
     place_in_words,
-    position_in_words,
     region_scores,
     rivals,
 )
-from halbach_fe.inference.result import ALL_READINGS, TRAINING
+from halbach_fe.inference.result import ALL_READINGS
 from halbach_fe.report import diagnosis_figures as figures
+from halbach_fe.report.diagnosis_answer import (
+    answer,
+    catalogue_titles,
+    joined_by_or,
+    title_of,
+    titles_of_rivals,
+)
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.page import own_style, save, write_page
-from halbach_fe.report.unknown_cause import (
-    more_readings,
-    suspicion_sentences,
-    unknown_advice,
-    unknown_sentences,
-)
+from halbach_fe.report.unknown_cause import more_readings, unknown_advice
 from halbach_fe.report.words import flux_density, fraction
-
-UNUSUAL_AMPLITUDE = 20.0
-"""Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
-magnet that is built with care."""
 
 FIGURES = {
     "groups": (figures.groups, "Chi² per reading of groups of readings, each group predicted from "
@@ -64,122 +58,18 @@ FIGURES = {
 """Function that draws each figure of the page, and its caption."""
 
 
-def verdict(diagnosis: Diagnosis) -> list[str]:
-    """Describe the result of a diagnosis in sentences."""
-    titles = _catalogue_titles(diagnosis)
-    before, after, unknown = diagnosis.before, diagnosis.after, diagnosis.unknown
-    sentences = [finding.sentence for finding in other_findings(diagnosis)]
-    if diagnosis.uncompared is not None:
-        sentences.insert(0, _cut_in_words(diagnosis.uncompared, diagnosis.rounds))
-    if diagnosis.solver_error:
-        return sentences
-    if diagnosis.identified:
-        fits = diagnosis.converged and after.prior_conflict <= after.conflict_limit
-        start = f"{_maps(diagnosis)} explained by" if fits else (
-            "The best explanation from the catalogue is")
-        sentences.append(f"{start}: " + "; ".join(
-            _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
-        sentences += [
-            f"{_maps(diagnosis, 'do')} not tell {_title(effect.hypothesis.effect.name, titles)} "
-            f"from {_joined_by_or(_titles(effect, titles))}."
-            for effect in diagnosis.identified if rivals(effect)]
-        if diagnosis.positions:
-            sentences.append(
-                "The magnet is the same from several sides, so that the readings may be "
-                "displaced by "
-                f"{_joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
-                "first is used here.")
-        unusual = [f"{_title(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
-                   for effect in diagnosis.identified
-                   if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
-        if unusual:
-            sentences.append(
-                "Far larger than usual (relative to the prior's standard deviation): "
-                f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
-                "suspect another cause.")
-        if not diagnosis.converged and diagnosis.uncompared is None:
-            sentences.append(
-                f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
-                "their amplitudes still changed.")
-        if len(diagnosis.identified) == MAX_EFFECTS:
-            sentences.append(
-                f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
-                "many effects together are a fit rather than a diagnosis, and some of them take "
-                "the place of another cause.")
-    elif diagnosis.suspected:
-        sentences.append("Nothing can be named for certain.")
-    elif unknown is None and after.prior_conflict <= after.conflict_limit:
-        several = after.is_campaign
-        these = "these maps" if several else "this map"
-        start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
-                 f"Nothing else is missing that {these} can show: with that," if sentences
-                 else f"Nothing is missing that {these} can show:")
-        agree = "the maps agree" if several else "the map agrees"
-        return [*sentences, f"{start} {agree} with the study within noise (chi² per reading "
-                f"{after.prior_conflict:.3g}).", *([after.too_near] if after.too_near else []),
-                *([limits_in_words(diagnosis.limits)] if diagnosis.limits else [])]
-    if unknown is not None:
-        sentences += unknown_sentences(unknown, bool(diagnosis.identified))
-    elif not diagnosis.identified and not diagnosis.suspected:
-        disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
-        return [*sentences, f"{disagree} with the study (chi² per reading "
-                f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
-                "no effect of the catalogue explains the difference, nor does a smooth field or "
-                "sensor error. Check the noise of the study."]
-    for suspicion in diagnosis.suspected:
-        sentences += suspicion_sentences(suspicion, titles)
-    if diagnosis.identified:
-        held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
-                        for fit in [each for each in fits if each.part != TRAINING][:1])
-                for fits in (region_scores(before, diagnosis.loo_residuals_before),
-                              region_scores(after, diagnosis.loo_residuals_after))]
-        added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
-        sentences.append(
-            f"With {added} in the model, chi² per training reading is "
-            f"{after.prior_conflict:.3g}{held[1]} (before: {before.prior_conflict:.3g}{held[0]}).")
-        if after.prior_conflict > after.conflict_limit and unknown is None:
-            sentences.append("That is still too large: another cause is missing.")
-        sentences.append(f"{STUDY_FILE} is the study with {added}, for halbach-fe infer "
-                         "and all that follows.")
-    return sentences
-
-
-def _maps(diagnosis: Diagnosis, verb: str = "are") -> str:
-    """Return the map, or the maps, as the subject of a sentence with a verb."""
-    if diagnosis.after.is_campaign:
-        return f"The maps {verb}"
-    return f"The map {'is' if verb == 'are' else 'does'}"
-
-
-def _cut_in_words(uncompared: int, rounds: int) -> str:
-    """Say that the time limit cut the search."""
-    text = ("The time limit cut the search after "
-            f"{rounds} {'rounds' if rounds > 1 else 'round'}: this is what it had so far")
-    return f"{text}, with {uncompared} hypotheses not compared." if uncompared else f"{text}."
-
-
-def _over_prior_sd(identified: IdentifiedEffect) -> float:
-    """Return the largest ratio of an amplitude to its prior standard deviation.
-
-    Amplitudes that only say whether an effect is present are ignored.
-    """
-    effect = identified.hypothesis.effect
-    first = int(effect.is_binary or effect.applied_in_full)
-    return max((abs(value) / parameter.sd for value, parameter in zip(
-        identified.values[first:], identified.parameters[first:], strict=True)), default=0.0)
-
-
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Return the rows of a table of all findings, as text."""
-    found = [{"effect": finding.name, "place": finding.place, "amplitude": finding.amount,
+    titles = catalogue_titles(diagnosis)
+    found = [{"effect": finding.title, "place": finding.place, "amplitude": finding.amount,
               "log Bayes factor": finding.factor, "it could be": finding.instead}
              for finding in other_findings(diagnosis)]
     return found + [
-        {"effect": effect.selection.candidate.effect,
+        {"effect": title_of(effect.hypothesis.effect.name, titles),
          "place": place_in_words(effect.place),
          "amplitude": "; ".join(amounts(effect)),
-         "log Bayes factor": f"{effect.selection.log_bayes_factor:.1f}",
-         "it could be": ", ".join(rival.effect for rival, _ in rivals(effect)) or EMPTY_CELL}
+         "log Bayes factor": f"{effect.selection.log_bayes_factor:.3g}",
+         "it could be": ", ".join(titles_of_rivals(effect, titles)) or EMPTY_CELL}
         for effect in diagnosis.identified]
 
 
@@ -244,12 +134,12 @@ def write_diagnosis_report(
     """
     drawn = {name: (draw(diagnosis), text) for name, (draw, text) in FIGURES.items()}
     pictures = save({f"diagnosis_{name}.png": each for name, each in drawn.items()}, folder)
-    titles = _catalogue_titles(diagnosis)
+    titles = catalogue_titles(diagnosis)
     write_page(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
-        study=diagnosis.before.study, verdict=verdict(diagnosis), assumptions=assumptions,
+        study=diagnosis.before.study, answer=answer(diagnosis), assumptions=assumptions,
         shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(diagnosis.after),
-        found=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
+        rows=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
                 "log Bayes factor": finding.factor, "kind": finding.kind}
                for finding in other_findings(diagnosis)]
         + [_entry(effect, titles) for effect in diagnosis.identified],
@@ -258,7 +148,7 @@ def write_diagnosis_report(
             f"{state.when}: {_disagreement_summary(state.groups)}" for state in states(diagnosis)),
         states=[state.when for state in states(diagnosis)],
         classes=[f"{f'Map {error.map}' if error.map else 'The map'} would be the same with "
-                 f"{_joined_by_or(texts)}."
+                 f"{joined_by_or(texts)}."
                  for error in diagnosis.gross_errors
                  if (texts := [alternative.text for alternative in error.alternatives])]
         + [_equivalence_sentence(effect, titles)
@@ -267,7 +157,8 @@ def write_diagnosis_report(
         further=[_further_measurements(effect, own, titles) for effect in diagnosis.identified
                  if (own := [pair for pair in separations
                              if pair.identified == effect.hypothesis])],
-        ground={"found": DETECTION_LOG_ODDS, "alike": INDISTINGUISHABLE_LOG_EVIDENCE,
+        ground={"found": DETECTION_LOG_ODDS, "certain": math.exp(DETECTION_LOG_ODDS),
+                "alike": INDISTINGUISHABLE_LOG_EVIDENCE,
                 "odds": round(1 / EFFECT_PRIOR_ODDS), "enough": SEPARATING_GAIN,
                 "discoveries": DISCOVERIES},
         advice=unknown_advice(diagnosis.unknown) if diagnosis.unknown else
@@ -277,33 +168,6 @@ def write_diagnosis_report(
         "None of the candidate measurements would distinguish the effects from their alternatives."
         if any(rivals(effect) for effect in diagnosis.identified) else "",
         study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
-
-
-def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
-    """Describe an effect with its place and amplitudes."""
-    effect = identified.hypothesis.effect
-    parts = [_title(effect.name, titles), place_in_words(identified.place),
-             "; ".join(text for text in amounts(identified) if text != PRESENT)]
-    return ", ".join(part for part in parts if part)
-
-
-def _catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return the descriptions of all effects by name."""
-    return {effect.name: effect.title for effect in (
-        *catalogue(), *(identified.hypothesis.effect for identified in diagnosis.identified))}
-
-
-def _titles(identified: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
-    """Return the descriptions of an effect's rivals."""
-    return [_title(candidate.effect, titles) for candidate, _ in rivals(identified)]
-
-
-def _title(name: str, titles: dict[str, str]) -> str:
-    """Return the description of an effect, with its name if other effects have the same
-    description.
-    """
-    title = titles.get(name, name)
-    return f"{title} ({name})" if list(titles.values()).count(title) > 1 else title
 
 
 def _disagreement_summary(found: Sequence[ResidualGroup]) -> str:
@@ -320,8 +184,8 @@ def _equivalence_sentence(identified: IdentifiedEffect, titles: dict[str, str]) 
     """Name the effects that the readings cannot distinguish from an identified effect."""
     found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
              for title, (candidate, factor) in zip(
-                 _titles(identified, titles), rivals(identified), strict=True)]
-    name = _title(identified.hypothesis.effect.name, titles)
+                 titles_of_rivals(identified, titles), rivals(identified), strict=True)]
+    name = title_of(identified.hypothesis.effect.name, titles)
     return (f"Instead of {name} (log Bayes factor {identified.selection.log_bayes_factor:.1f}), "
             f"the cause may equally well be: {'; '.join(found)}.")
 
@@ -329,16 +193,11 @@ def _equivalence_sentence(identified: IdentifiedEffect, titles: dict[str, str]) 
 def _entry(identified: IdentifiedEffect, titles: dict[str, str]) -> dict[str, str]:
     """Return the row of an effect in the page's table of findings."""
     effect = identified.hypothesis.effect
-    return {"finding": _title(effect.name, titles),
+    return {"finding": title_of(effect.name, titles),
             "place": place_in_words(identified.place) or EMPTY_CELL,
             "amplitude": "; ".join(text.replace(" ", "\u00a0") for text in amounts(identified)),
             "log Bayes factor": f"{identified.selection.log_bayes_factor:.1f}",
             "kind": effect.kind}
-
-
-def _joined_by_or(parts: Sequence[str]) -> str:
-    """Join phrases by commas and a final "or"."""
-    return " or ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
 def _further_measurements(
@@ -347,8 +206,8 @@ def _further_measurements(
     """Return what the page shows on measurements that distinguish an effect from its rivals."""
     candidates = {candidate.name: candidate.title for pair in own for candidate in pair.candidates}
     return {
-        "what": _title(identified.hypothesis.effect.name, titles),
-        "advice": [(_title(pair.rival.effect.name, titles),
+        "what": title_of(identified.hypothesis.effect.name, titles),
+        "advice": [(title_of(pair.rival.effect.name, titles),
                     pair.recommended.title if pair.recommended else "") for pair in own],
         "rows": [{"measurement": title} | {
             f"against {pair.rival.effect.name}": _gain(pair.gains[name]) for pair in own}

@@ -161,21 +161,22 @@ def _residual_map(axis: Axes, update: InferenceResult, readings: Ints, values: F
         Whether the residuals are shown by colour.
     """
     observation = update.observation
-    x, y, z = (observation.places if update.is_campaign else observation.positions)[readings].T
+    x, y, z = 1e3 * (observation.places if update.is_campaign
+                     else observation.positions)[readings].T
     numbers = ["".join(c for c in update.observation.labels[reading] if c.isdigit())
                for reading in readings]
     up = np.degrees(np.arctan2(y, x)) % 360
     name = "angle in °"
     if all(numbers):
         up, name = np.array(numbers, float), "order"
-    axis.set_xlabel("z in m")
+    axis.set_xlabel("z in mm")
     if np.ptp(z) == 0 or len(np.unique(np.round(up))) < 3:
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.3, lw=0)
         axis.plot(up if np.ptp(z) == 0 else z, values, ".", color=MEASURED, ms=4)
-        axis.set_xlabel(name if np.ptp(z) == 0 else "z in m")
+        axis.set_xlabel(name if np.ptp(z) == 0 else "z in mm")
         axis.set_ylabel("residual")
         return False
-    columns, column = np.unique(np.round(z, 6), return_inverse=True)
+    columns, column = np.unique(np.round(z, 3), return_inverse=True)
     rows, row = np.unique(np.round(up, 3), return_inverse=True)
     limits: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -RESIDUAL_LIMIT, "vmax": RESIDUAL_LIMIT}
     if len(columns) * len(rows) <= 4 * len(values) and len(columns) > 1:
@@ -243,12 +244,13 @@ def profile(diagnosis: Diagnosis) -> Figure:
     held, measured = before.held_out[index], before.readings[index]
     for state in shown:
         mean, colour = state.update.prediction_posterior.mean, state.colour
-        top.plot(along, mean[index], color=colour, lw=1.2, label=f"predicted, {state.when}")
+        top.plot(along, 1e3 * mean[index], color=colour, lw=1.2, label=f"predicted, {state.when}")
         residual = 1e3 * (state.update.readings - mean)[index]
         bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
         bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
-    top.plot(along[~held], measured[~held], ".", color=MEASURED, ms=4, label="measured, training")
-    top.plot(along[held], measured[held], "o", mfc="none", color=MEASURED, ms=4,
+    top.plot(along[~held], 1e3 * measured[~held], ".", color=MEASURED, ms=4,
+             label="measured, training")
+    top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
              label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
@@ -258,7 +260,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     of_map = f" of map {before.maps[index[0]]}" if before.is_campaign else ""
     top.set_title(f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
-    top.set_ylabel(f"{label} in T")
+    top.set_ylabel(f"{label} in mT")
     top.legend(fontsize="small")
     bottom.set_ylabel("measured − predicted\nin mT")
     bottom.set_xlabel(name)

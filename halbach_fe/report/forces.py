@@ -18,6 +18,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.forces import STANDARD_GRAVITY, Forces, Loads
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -27,7 +28,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import place_of
+from halbach_fe.report.words import decimals, place_of, with_error
 from halbach_fe.study.types import COMPONENTS
 
 LISTED = 12
@@ -36,28 +37,40 @@ LISTED = 12
 MAIN = 0.9
 """Component of a direction beyond which a direction in words has no other part."""
 
+ROUGH = 0.1
+"""Error of a force, relative to it, above which the answer is not to be trusted."""
+
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
 
 
-def verdict(found: Forces) -> list[str]:
-    """Return the answer in sentences: the largest forces, the mass and the price."""
+def answer(found: Forces) -> Answer:
+    """Say how large the forces are in place and during the assembly, and what to do next."""
+    question = "Which forces act on the blocks?"
+    plan = ("Plan tools and glue for these forces; see what heat does to the blocks (the study's "
+            "[demagnetization]).", "halbach-fe demagnetization STUDY -o DIR")
     worst = int(np.argmax(found.in_place.magnitude))
     size = found.in_place.magnitude[worst]
     if size < NEGLIGIBLE:
-        return ["No block feels a force.", _mass(found)]
+        return Answer(question, f"No block feels a force. {_mass(found)}",
+                      "Yes: nothing else is there.", *plan)
     block = found.blocks[worst]
     text = [f"The largest force is {_newton(size)} (as heavy as {_heavy(size)}), on "
             f"{place_of(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."]
     if len(found.blocks) > 1:
         next_one = int(np.argmax(found.inserted.magnitude))
-        size, block = found.inserted.magnitude[next_one], found.blocks[next_one]
+        inserted, block = found.inserted.magnitude[next_one], found.blocks[next_one]
         text.append(
-            f"While the blocks are inserted the largest is {_newton(size)} ({_heavy(size)}), on "
-            f"{place_of(block)}, the {_ordinal(int(found.step[next_one]))} of "
-            f"{len(found.blocks)}, "
+            f"While the blocks are inserted the largest is {_newton(inserted)} "
+            f"({_heavy(inserted)}), on {place_of(block)}, the "
+            f"{_ordinal(int(found.step[next_one]))} of {len(found.blocks)}, "
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
-    return [*text, _mass(found)]
+    error = float(found.in_place.error_N[worst])
+    return Answer(
+        question, " ".join([*text, _mass(found)]),
+        f"To {_newton(error)} by the quadrature. The blocks are those of the study, at rest in "
+        "their places: a block that is 1 % stronger feels 1 % more, and one that comes nearer to "
+        "its neighbours than its place is may feel more.", *plan, sound=error <= ROUGH * size)
 
 
 def _mass(found: Forces) -> str:
@@ -68,7 +81,7 @@ def _mass(found: Forces) -> str:
 
 def _newton(size: float) -> str:
     """Return a force as text, without an exponent."""
-    return f"{size:.0f} N" if size >= 100 else f"{size:.3g} N"
+    return f"{size:.0f}\u00a0N" if size >= 100 else f"{decimals(size)}\u00a0N"
 
 
 def _heavy(size: float) -> str:
@@ -110,11 +123,12 @@ def force_rows(found: Forces) -> list[dict[str, str]]:
         block, size = found.blocks[number], found.in_place.magnitude[number]
         rows.append({
             "block": place_of(block),
-            "force": f"{size:.3g} ± {found.in_place.error_N[number]:.1g} N",
+            "force": with_error(size, float(found.in_place.error_N[number])) + "\u00a0N",
             "direction": (direction_in_words(block, found.in_place.force_N[number])
                           if size > NEGLIGIBLE else "none"),
-            "torque": f"{np.linalg.norm(found.in_place.torque_Nm[number]):.3g} Nm",
-            "inserted": f"{found.inserted.magnitude[number]:.3g} N",
+            "torque": decimals(float(np.linalg.norm(found.in_place.torque_Nm[number])))
+            + "\u00a0Nm",
+            "inserted": _newton(float(found.inserted.magnitude[number])),
             "inserted as": _ordinal(int(found.step[number]))})
     return rows
 
@@ -211,5 +225,5 @@ def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> 
         forces_figure(found), "Left: forces in place in the ring of the largest one; arrows show "
         "their part in the plane. Right: forces in the order of the assembly")}, folder)
     write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
-               provenance=provenance, verdict=verdict(found), rows=force_rows(found), found=found,
+               provenance=provenance, answer=answer(found), rows=force_rows(found), found=found,
                permeable=not found.magnet.is_vacuum)

@@ -13,15 +13,21 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from halbach_fe.api import HomogeneityResult
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
-from halbach_fe.response.homogeneity import PPM, Homogeneity, Slice
+from halbach_fe.report.words import decimals, ppm, with_error
+from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 
 CONVENTION = (
     "B_n = sum (r/R)^l P_lm(cos theta) (a_lm cos(m phi) + b_lm sin(m phi)) about the centre, B_n "
     "along the mean field, theta from the z axis, R the sphere's radius, P_lm semi-normalized "
     "(Schmidt) without the phase (-1)^m")
+
+SIZES = ("Deviations are those of |B| from its mean over the volume; the rms is over the volume, "
+         "peak to peak over all points of surface and volume.")
 
 ROUNDING = 1e-9
 """Size below which a harmonic is zero but for rounding, relative to the largest one."""
@@ -30,16 +36,42 @@ LISTED = 12
 """Number of the harmonics on the page and the terminal: the largest ones."""
 
 
-def verdict(found: HomogeneityResult) -> str:
-    """Return the answer in words, for the magnet that is known best."""
+LEAST_OF_SD = 5e-3
+"""Part of its standard deviation below which a number is 0 in tables."""
+
+DRAWN = 24
+"""Number of the harmonics in the figure: the largest ones, with names that can be read."""
+
+
+def answer(found: HomogeneityResult) -> Answer:
+    """Say how homogeneous the field of the best known magnet is, and what to do next."""
     name, best = list(found.by_name.items())[-1]
-    text = (f"In {found.model.region.text} the field is {_field(best)}; it deviates by "
-            f"{ppm(best.rms_ppm)} ppm rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
+    question = f"How homogeneous is the field in {found.model.region.text}?"
+    text = (f"The mean field is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
+            f"rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
     low, middle, high = map(ppm, best.rms_range_ppm)
+    trust, small = solver_error_text(found.model, best.rms_ppm)
     if name != "prior":
-        return f"{text} (95 % of what the {name} allows: {low} to {high} ppm rms)."
-    return (f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study says, "
-            f"half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.")
+        return Answer(
+            question, f"{text} (95 % of what the {name} allows: {low} to {high} ppm rms).",
+            f"Yes, as far as the update agrees with its map, which its own page says. {trust}",
+            "If that is too much, put [shim_tray] into the study and fill the tray with small "
+            "magnets.", "halbach-fe shim-tray STUDY --posterior DIR/posterior.h5 -o DIR", small)
+    return Answer(
+        question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
+        f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
+        f"As far as the study's tolerances are right: it is no measured magnet. {trust}",
+        "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
+        "halbach-fe infer STUDY --measurements MAP -o DIR", small)
+
+
+def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, bool]:
+    """Return a sentence about the solver's error beside an rms deviation, and if it is smaller."""
+    error = model.solver_error_ppm
+    small = error <= rms_ppm
+    return ("The field of given blocks is exact: no mesh is needed." if not error else
+            f"The solver's own error, {ppm(error)} ppm rms, is {'' if small else 'not '}below "
+            "that."), small
 
 
 def _known_as(name: str) -> str:
@@ -48,27 +80,32 @@ def _known_as(name: str) -> str:
         name, f"of the {name}")
 
 
-def ppm(value: float) -> str:
-    """Return a number of ppm as text, without an exponent."""
-    return f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000 else f"{value:.3g}"
-
-
 def _field(known: Homogeneity) -> str:
     """Return mean field and standard deviation as text, in mT."""
-    return f"{1e3 * known.mean_T:.6g} ± {1e3 * known.mean_sd_T:.2g} mT"
+    return f"{with_error(1e3 * known.mean_T, 1e3 * known.mean_sd_T)}\u00a0mT"
 
 
-def homogeneity_rows(found: HomogeneityResult) -> list[dict[str, str]]:
+def direction_in_words(unit: Floats, sd_rad: float) -> str:
+    """Return the axis next to a unit vector (3,), and its angle from that axis, which is left out
+    if it is 0 beside its standard deviation.
+    """
+    main = int(np.argmax(np.abs(unit)))
+    off = float(np.arctan2(np.linalg.norm(np.delete(unit, main)), abs(unit[main])))
+    angle = "" if off <= LEAST_OF_SD * sd_rad else f", {decimals(1e3 * off)}\u00a0mrad off it,"
+    return (f"along {'-' if unit[main] < 0 else '+'}{'xyz'[main]}{angle} ± "
+            f"{decimals(1e3 * sd_rad, 2)}\u00a0mrad")
+
+
+def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]:
     """Return a row of text per distribution of the magnetizations."""
     rows = []
-    for name, known in found.by_name.items():
-        direction = ", ".join(f"{value:+.5f}" for value in known.direction.round(5) + 0.0)
+    for name, known in by_name.items():
         ranges = {
             "rms, 95 % of magnets in ppm": known.rms_range_ppm,
             "peak to peak, 95 % of magnets in ppm": known.peak_to_peak_range_ppm}
         rows.append({
             "magnet": name, "mean field": _field(known),
-            "direction": f"({direction}) ± {1e3 * known.direction_sd_rad:.2g} mrad",
+            "direction": direction_in_words(known.direction, known.direction_sd_rad),
             "rms in ppm": ppm(known.rms_ppm),
             "peak to peak in ppm": ppm(known.peak_to_peak_ppm),
             **{key: f"{ppm(low)} to {ppm(high)}" for key, (low, _, high) in ranges.items()}})
@@ -88,10 +125,16 @@ def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
                "m": str(best[number].order)}
         for name in names:
             term = found.by_name[name].harmonics[number]
-            sign = "+" if term.ppm > 0 else ""
-            row[f"{name} in ppm"] = f"{sign}{ppm(term.ppm)} ± {ppm(term.sd_ppm)}"
+            value = term.ppm if abs(term.ppm) > LEAST_OF_SD * term.sd_ppm else 0.0
+            sign = "+" if value > 0 else ""
+            row[f"{name} in ppm"] = f"{sign}{ppm(value)} ± {ppm(term.sd_ppm)}"
         rows.append(row)
     return rows
+
+
+def plain_homogeneity(known: Homogeneity) -> dict[str, object]:
+    """Return a homogeneity as plain data for JSON."""
+    return asdict(known) | {"direction": known.direction.tolist()}
 
 
 def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
@@ -100,15 +143,20 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
         "study": found.magnet.name, "region": asdict(found.model.region),
         "solver_error_ppm": found.model.solver_error_ppm,
         "harmonics_convention": CONVENTION,
-        **{name: asdict(known) | {"direction": known.direction.tolist()}
-           for name, known in found.by_name.items()}}
+        **{name: plain_homogeneity(known) for name, known in found.by_name.items()}}
 
 
 def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
-    """Draw the deviation of |B| in three planes through the centre, in ppm."""
-    figure = Figure(figsize=(11, 3.7), layout="constrained")
+    """Draw the deviation of |B| in three planes through the centre, in ppm.
+
+    The colours span what lies in the ellipse within each slice: beyond it, in the corners, the
+    field of a homogeneous magnet deviates many times more.
+    """
+    figure = Figure(figsize=(8.4, 3.0), layout="constrained")
     deviations = [PPM * (each.size_T / mean_T - 1) for each in slices]
-    largest = max(float(np.nanquantile(np.abs(each), 0.98)) for each in deviations) or 1.0
+    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, len(slices[0].first_m))])
+    within = x**2 + y**2 <= 1
+    largest = max(float(np.nanquantile(np.abs(each[within]), 0.98)) for each in deviations) or 1.0
     levels = np.linspace(-largest, largest, 21)
     axes = figure.subplots(1, 3)
     for axis, each, deviation in zip(axes, slices, deviations, strict=True):
@@ -127,16 +175,19 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
 
 
 def harmonics_figure(known: Homogeneity) -> Figure:
-    """Draw the amplitudes of all harmonics, with error bars of two standard deviations."""
-    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    """Draw the largest harmonics by degree, with error bars of two standard deviations."""
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
     axis = figure.subplots()
-    place = np.arange(len(known.harmonics))
-    axis.bar(place, [each.ppm for each in known.harmonics], color=POSTERIOR, width=0.7)
-    axis.errorbar(place, [each.ppm for each in known.harmonics],
-                  2 * np.array([each.sd_ppm for each in known.harmonics]), fmt="none",
+    largest = sorted(sorted(range(len(known.harmonics)),
+                            key=lambda number: -abs(known.harmonics[number].ppm))[:DRAWN])
+    shown = [known.harmonics[number] for number in largest]
+    place = np.arange(len(shown))
+    axis.bar(place, [each.ppm for each in shown], color=POSTERIOR, width=0.7)
+    axis.errorbar(place, [each.ppm for each in shown],
+                  2 * np.array([each.sd_ppm for each in shown]), fmt="none",
                   color="black", capsize=2, lw=0.8)
     axis.axhline(0, color=PUBLISHED, lw=0.8)
-    axis.set_xticks(place, [each.name for each in known.harmonics], rotation=90, fontsize=7)
+    axis.set_xticks(place, [each.name for each in shown], rotation=90)
     axis.set_ylabel("ppm of the mean field")
     axis.grid(alpha=0.3, axis="y")
     axis.set_xlim(-1, len(place))
@@ -157,8 +208,8 @@ def write_homogeneity(
         f"{_known_as(name)}")}
     if best.harmonics:
         figures["harmonics.png"] = (
-            harmonics_figure(best), f"Spherical harmonics {_known_as(name)}; bars are two standard "
-            "deviations")
+            harmonics_figure(best), f"The largest spherical harmonics {_known_as(name)}, by "
+            "degree; bars are two standard deviations")
         with atomic(folder / "harmonics.csv") as temporary:
             write_csv({
                 "magnet": [own for own, known in found.by_name.items() for _ in known.harmonics],
@@ -167,7 +218,8 @@ def write_homogeneity(
                    for key in ("degree", "order", "letter", "ppm", "sd_ppm")}}, {
                 "study": found.magnet.name, "convention": CONVENTION}, temporary)
     write_page(folder / "homogeneity.html", "homogeneity.html.j2", save(figures, folder),
-               study=found.magnet.study, provenance=provenance, verdict=verdict(found),
-               region=found.model.region.text, rows=homogeneity_rows(found),
+               study=found.magnet.study, provenance=provenance, answer=answer(found),
+               region=found.model.region.text, rows=homogeneity_rows(found.by_name),
+               sizes=SIZES,
                harmonics=harmonic_rows(found), convention=CONVENTION,
                solver_error=f"{found.model.solver_error_ppm:.2g}")

@@ -19,11 +19,15 @@ from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_mul
 from halbach_fe.report.page import POSTERIOR, own_style, save, write_page
 from halbach_fe.report.prediction import (
     PublishedErrors,
+    has_profile,
     prediction_profile_figure,
     relative_error_figure,
+    residual_maps_figure,
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
+from halbach_fe.report.words import decimals, flux_density, ppm
+from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import circle_models
 
 NOTHING = "–"
@@ -33,14 +37,19 @@ NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 
 def score_table(result: InferenceResult,
                 published: PublishedErrors | None = None) -> list[dict[str, str]]:
-    """Return the rows, as text, of the table that compares prior and posterior predictions."""
-    rows = []
+    """Return the rows, as text, of the table that compares predictions before and after.
+
+    Beside published errors, which are medians of relative ones, there are such medians of ours.
+    """
+    rows, largest = [], float(np.abs(result.readings).max())
     for score in result.scores:
         row = {
             "region": score.region,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
-            "prior": _percent(score.median_relative_error_prior),
-            "posterior": _percent(score.median_relative_error_posterior),
+            "before, rms": flux_density(score.rms_error_prior_T),
+            "after, rms": flux_density(score.rms_error_posterior_T),
+            "of the largest reading": f"{ppm(PPM * score.rms_error_posterior_T / largest)}\u00a0ppm"
+            if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading": NOTHING if score.chi2_posterior is None
@@ -49,6 +58,8 @@ def score_table(result: InferenceResult,
         if published is not None:
             inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
                 result, score.region, score.part), 6))
+            row["median: prior"] = _percent(score.median_relative_error_prior)
+            row["median: posterior"] = _percent(score.median_relative_error_posterior)
             row[f"{published.label}: prior"] = _percent(float(np.median(published.prior[inside])))
             row[f"{published.label}: posterior"] = _percent(
                 float(np.median(published.posterior[inside])))
@@ -78,15 +89,22 @@ def write_inference_report(
               else "of the training readings for the prior (nothing was held out)")
     profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
                "posterior, along the line of the strongest reading")
-    profiles = {"profile.png": (prediction_profile_figure(result), profile)}
+    profiles = ({"profile.png": (prediction_profile_figure(result), profile)}
+                if has_profile(result) else {})
+    if (maps := residual_maps_figure(result)) is not None:
+        profiles["residual_maps.png"] = (
+            maps, "Measured less predicted over the map, before and after the update: what remains "
+            "should be noise, without a pattern")
     if result.is_campaign:
         profiles = {"maps.png": (maps_figure(result), "Where the maps lie in the magnet")}
         profiles |= {f"profile-{name}.png": (
             prediction_profile_figure(result, name), f"Map {name}. {profile}")
-            for name in dict.fromkeys(result.maps)}
+            for name in dict.fromkeys(result.maps) if has_profile(result, name)}
+    if published is not None:
+        profiles["relative_error.png"] = (
+            relative_error_figure(result, published), "Relative error of the predictions of prior "
+            "and posterior along the same line")
     figures = profiles | {
-        "relative_error.png": (relative_error_figure(result, published), "Relative error "
-                               "of the predictions of prior and posterior along the same line"),
         "residuals.png": (standardized_residuals_figure(result), "Standardized residuals of "
                           "all readings (divided by the standard deviation of prediction and "
                           "noise) for the prior (top) and the posterior (bottom). The grey band "
@@ -111,11 +129,27 @@ def write_inference_report(
     write_page(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
-        rows=score_table(result, published), assumptions=assumptions,
-        magnet_rows=magnet_rows(result.magnet), conflict=result.disagreement,
+        rows=score_table(result, published), published=published, assumptions=assumptions,
+        magnet_rows=magnet_rows(result.magnet),
         answer=answer(result),
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
+        noise=[flux_density(float(end), 2)
+               for end in (result.noise.sd.min(), result.noise.sd.max())],
+        position_sd=[f"{1e3 * sd:.3g}" for sd in (
+            result.study.noise.position_sd_m or () if result.study.noise else ())],
+        solver_error=_solver_error(result), superposition=ppm(
+            PPM * float(result.response.superposition_error)),
         view=view_of_inference(result))
+
+
+def _solver_error(result: InferenceResult) -> str:
+    """Say how far the finite elements may be off, beside the noise."""
+    error = result.response.error
+    if not error.any():
+        return "none: the blocks are in vacuum"
+    return (f"at most {flux_density(float(error.max()), 2)}, "
+            f"{decimals(float((error / result.noise.sd).max()), 2)} times the sd of the noise; "
+            "included in the error bars")
 
 
 def _percent(value: float | None) -> str:

@@ -6,12 +6,33 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.words import flux_density, fraction, place_of
 
 
-def answer(result: InferenceResult) -> list[str]:
+def answer(result: InferenceResult) -> Answer:
     """Say how well the updated magnet predicts, what its blocks are like, and what to do next."""
-    return [_prediction(result), _blocks(result), _next(result)]
+    said = f"{_prediction(result)} {_blocks(result)}"
+    question = "What is the measured magnet like?"
+    if result.disagreement:
+        return Answer(question, said,
+                      f"No. Model and measurement disagree. {result.disagreement}",
+                      "Look for what the study lacks.",
+                      "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
+    tested = "" if result.held_out.any() else (
+        " No reading was held out, so that this is no test of the predictions: hold some out by "
+        "[inference.held_out] or --held-out.")
+    at_rest = ("" if result.terms is None or result.terms.at_rest else
+               " The instruments have not come to rest: their error bars may be too small.")
+    flat = result.magnet.dimension == 2
+    return Answer(
+        question, said, "Yes. Model and readings agree: chi² per reading is "
+        f"{result.prior_conflict:.3g}, where 1 is expected and more than "
+        f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}",
+        f"See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
+        f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
+        f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
+        "-o DIR")
 
 
 def _prediction(result: InferenceResult) -> str:
@@ -23,8 +44,7 @@ def _prediction(result: InferenceResult) -> str:
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
         return (f"The updated magnet differs from the readings by {flux_density(after)} rms, "
-                f"{_before(result)} by {flux_density(before)}. No reading was held out, so that "
-                "this is no test: hold some out by [inference.held_out] or --held-out.")
+                f"{_before(result)} by {flux_density(before)}.")
     expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
     bands = [(score.readings, score.coverage95_posterior) for score in result.scores
              if score.part == part and score.coverage95_posterior is not None]
@@ -58,17 +78,6 @@ def _blocks(result: InferenceResult) -> str:
     return (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
             f"rms, the most {place_of(block)} by "
             f"{100 * mean[worst]:+.1f}\u00a0±\u00a0{100 * sd:.1f}\u00a0%.")
-
-
-def _next(result: InferenceResult) -> str:
-    """Say what to do next."""
-    if result.disagreement:
-        return "Run halbach-fe diagnose with the same files: it looks for what the study lacks."
-    homogeneity = ("" if result.magnet.dimension == 2
-                   else " halbach-fe homogeneity its homogeneity,")
-    return ("Model and readings agree. halbach-fe multipoles --posterior posterior.h5 gives the "
-            f"multipoles of the updated magnet,{homogeneity} and "
-            "halbach-fe shim the blocks to swap or turn.")
 
 
 def _rms(values: Floats) -> float:

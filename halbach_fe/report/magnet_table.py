@@ -15,15 +15,25 @@ def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
     array, blocks = magnet.array, magnet.blocks
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
             ("radius of the bore, outer radius",
-             f"{magnet.bore_radius:.6g} m, {magnet.array_outer_radius:.6g} m"),
+             f"{1e3 * magnet.bore_radius:.6g} mm, {1e3 * magnet.array_outer_radius:.6g} mm"),
             ("remanence", f"{_range((abs(block.remanence) for block in blocks), 4)} T"),
             ("recoil permeability along, across the easy axis",
              f"{_range((block.recoil_permeability for block in blocks), 3)}, "
              f"{_range((block.recoil_permeability_across for block in blocks), 3)}"),
             ("main multipole", str(array.multipole_order))]
     if magnet.dimension == 3:
-        rows.insert(3, ("length", f"{2 * magnet.array_half_length:.6g} m"))
+        rows.insert(3, ("length", f"{2e3 * magnet.array_half_length:.6g} mm"))
     return [*rows, ("iron", iron_description(magnet))]
+
+
+def in_one_line(magnet: Magnet) -> str:
+    """Return the magnet in a line: blocks, bore, length, remanence, iron."""
+    length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
+              else ", in cross-section")
+    iron = "without iron" if iron_of(magnet.study) is None else iron_description(magnet)
+    return (f"{layout(magnet)}{length}, bore {2e3 * magnet.bore_radius:.4g} mm, outer diameter "
+            f"{2e3 * magnet.array_outer_radius:.4g} mm, remanence "
+            f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")
 
 
 def layout(magnet: Magnet) -> str:
@@ -50,8 +60,10 @@ def iron_description(magnet: Magnet) -> str:
     bodies = []
     for body in magnet.iron:
         kind = "tube" if body.outline is None else "prism"
-        length = "" if np.isinf(body.z_max) else f", z {body.z_min:g} to {body.z_max:g} m"
-        bodies.append(f"{kind}, r {body.inner_radius:g} to {body.outer_radius:g} m{length}")
+        length = "" if np.isinf(body.z_max) else (
+            f", z {1e3 * body.z_min:g} to {1e3 * body.z_max:g} mm")
+        bodies.append(f"{kind}, r {1e3 * body.inner_radius:g} to "
+                      f"{1e3 * body.outer_radius:g} mm{length}")
     more = f" and {len(bodies) - 4} more" if len(bodies) > 4 else ""
     if iron.curve is None:
         material = f"relative permeability {iron.relative_permeability:g}"

@@ -17,13 +17,15 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import outline_contains
+from halbach_fe.geometry.outline import Edge, outline_contains
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.field_traces_3d import UNSIGNED, cut_trace, residuals_trace
 from halbach_fe.report.page import IRON, MEASURED
+from halbach_fe.study.types import COMPONENTS
 
 ARC_POINTS = 5
-SIGNED, UNSIGNED = "RdBu_r", "Cividis"
-"""Colour scales of signed and of unsigned numbers, readable with any colour vision."""
+SIGNED = "RdBu_r"
+"""Colour scale of signed numbers, readable with any colour vision."""
 
 ARROW, HEAD = 0.7, 0.35
 """Length of an arrow relative to the radial thickness of a block; length of the arrow's head
@@ -43,6 +45,29 @@ LARGE = 4.0
 """Upper end of the colour scale of standardized residuals."""
 
 CAMERA_2D, CAMERA_3D = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z": 1.2}
+
+DIAGONAL_2D, DIAGONAL_3D = 2.4, 1.5
+"""Diagonals of the drawn box, in plotly's own length, that these cameras see as a whole."""
+
+MOST_CONES = 2000
+"""Largest number of blocks whose arrows have heads; more would make the page slow."""
+
+SCRIPT = """
+var view = document.getElementById('{plot_id}');
+var owners = view.data[0].customdata, texts = view.data[0].meta;
+if (texts) Plotly.restyle(view, {text: [Array.from(owners, function(one) {
+    return texts[one]; })]}, [0]);
+var eye = view._fullLayout.scene.camera.eye, left = view._fullLayout._size, wide = left.w / left.h;
+if (wide < 1) Plotly.relayout(view, {'scene.camera.eye':
+    {x: eye.x / wide, y: eye.y / wide, z: eye.z / wide}});
+"""
+"""Runs when the view is there: gives the vertices the text of their block, which the page holds
+once, and takes the camera back where what the colour scales leave of the view is narrow."""
+
+MM = 1e3
+
+BELOW = -0.1
+"""Height at which the camera looks, in plotly's own length: axes have their names at the bottom."""
 
 IDENTITY = "magnet-view"
 """HTML id of the view."""
@@ -130,7 +155,8 @@ def residual_points(positions: Floats, standardized: Floats) -> ViewPoints:
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
     """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
     magnitude = np.linalg.norm(flux_density, axis=1)
-    return ViewPoints(positions, magnitude, "points", "|B| in T", "|B| = %{customdata:.5g} T",
+    magnitude *= 1e3
+    return ViewPoints(positions, magnitude, "points", "|B| in mT", "|B| = %{customdata:.5g} mT",
                       (float(magnitude.min()), float(magnitude.max())))
 
 
@@ -161,7 +187,23 @@ def view_of_inference(result: InferenceResult) -> Markup:
         for percent, error, magnetized in zip(change, sd, there, strict=True)]))
     scores = result.standardized(result.prediction_posterior)
     return magnet_view(
-        result.magnet, values, _worst_residuals(result.observation.positions, scores))
+        result.magnet, values, _worst_residuals(result.observation.positions, scores),
+        _residual_vectors(result))
+
+
+def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:
+    """Return points (n, 3) in m and what the posterior lacks there, B (n, 3) in T.
+
+    Components that were not read are zero. None if the readings are Fourier coefficients.
+    """
+    observation = result.observation
+    if not all(observation.components):
+        return None
+    points, number = np.unique(observation.places.round(9), axis=0, return_inverse=True)
+    lacking = np.zeros((len(points), 3))
+    column = [COMPONENTS.index(label[1]) for label in observation.labels]
+    lacking[number.ravel(), column] = result.readings - result.prediction_posterior.mean
+    return points, lacking
 
 
 def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
@@ -182,39 +224,62 @@ def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
     return residual_points(points, worst)
 
 
-def magnet_view(magnet: Magnet, values: BlockValues, points: ViewPoints | None = None) -> Markup:
-    """Return the view as HTML that includes all its scripts, to be placed in a page."""
+def magnet_view(
+    magnet: Magnet, values: BlockValues, points: ViewPoints | None = None,
+    residuals: tuple[Floats, Floats] | None = None,
+) -> Markup:
+    """Return the view as HTML that includes all its scripts, to be placed in a page.
+
+    ``residuals`` are points (n, 3) in m and what the model lacks there, B (n, 3) in T. They and the
+    plane with |B| are hidden until their names are clicked.
+    """
     blocks, values = _merge_rings(magnet, values)
-    figure = go.Figure([_blocks_trace(magnet, blocks, values),
-                        *_arrow_traces(magnet, blocks, values)])
+    bodies = [prism(block, _prism_height(magnet)) for block in blocks]
+    figure = go.Figure([_blocks_trace(magnet, blocks, values, bodies),
+                        *_arrow_traces(blocks, values, [corners for corners, _ in bodies])])
     for number, body in enumerate(magnet.iron):  # one entry of the legend for all of them
         figure.add_trace(_iron_trace(body, _prism_height(magnet)).update(showlegend=not number))
     if points is not None:
         figure.add_trace(_points_trace(points))
+    if residuals is not None:
+        figure.add_trace(residuals_trace(*residuals, magnet.bore_radius))
+    camera = _camera(figure, magnet.dimension)
+    figure.add_trace(cut_trace(magnet))
+    _to_mm(figure)
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
-        scene={"aspectmode": "data", "xaxis": {"title": {"text": "x in m"}},
-               "yaxis": {"title": {"text": "y in m"}}, "zaxis": {"title": {"text": "z in m"}},
-               "camera": {"eye": CAMERA_2D if magnet.dimension == 2 else _camera_3d(figure),
+        scene={"aspectmode": "data",
+               **{f"{axis}axis": {"title": {"text": f"{axis} in mm"}} for axis in "xyz"},
+               **({"zaxis": {"visible": False}} if magnet.dimension == 2 else {}),
+               "camera": {"eye": camera, "center": {"x": 0, "y": BELOW, "z": 0},
                           "up": {"x": 0, "y": 1, "z": 0}}})
     return Markup(plotly.io.to_html(
-        figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY,
-        config={"displaylogo": False, "responsive": True}))
+        figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY, post_script=SCRIPT,
+        config={"displaylogo": False, "responsive": True, "toImageButtonOptions": {
+            "filename": magnet.name, "scale": 2}}))
 
 
-def _camera_3d(figure: go.Figure) -> dict[str, float]:
+def _to_mm(figure: go.Figure) -> None:
+    """Scale all that is drawn from m to mm, in place and in its own precision."""
+    for trace in figure.data:
+        for key in "xyzuvw":
+            if key in trace and trace[key] is not None:
+                trace[key] = np.asarray(trace[key]) * np.float32(MM)
+
+
+def _camera(figure: go.Figure, dimension: int) -> dict[str, float]:
     """Return the place of a camera that sees all that is drawn.
 
     plotly divides lengths by the geometric mean of the three sides of the drawn box, so that long
-    magnets need a camera farther off.
+    and flat magnets need a camera farther off.
     """
     drawn = [np.array([np.ravel(trace[axis]) for axis in "xyz"], float) for trace in figure.data
              if trace.x is not None and len(trace.x)]
     sides = np.nanmax(np.hstack(drawn), axis=1) - np.nanmin(np.hstack(drawn), axis=1)
     sides = np.maximum(sides, 1e-3 * sides.max())
     diagonal = float(np.linalg.norm(sides / np.cbrt(sides.prod())))
-    farther = max(1.0, diagonal / np.sqrt(3))  # a cube has the diagonal sqrt(3)
-    return {axis: farther * value for axis, value in CAMERA_3D.items()}
+    place, whole = ((CAMERA_2D, DIAGONAL_2D) if dimension == 2 else (CAMERA_3D, DIAGONAL_3D))
+    return {axis: max(1.0, diagonal / whole) * value for axis, value in place.items()}
 
 
 def _rings_per_prism(magnet: Magnet) -> int:
@@ -257,21 +322,22 @@ def _merge_rings(
 
 
 def _blocks_trace(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], values: BlockValues
+    magnet: Magnet, blocks: Sequence[MagnetBlock], values: BlockValues,
+    bodies: Sequence[tuple[Floats, Ints]],
 ) -> go.Mesh3d:
-    """Return all blocks as a single surface mesh.
+    """Return all blocks as a single surface mesh of their bodies, see `prism`.
 
     No two blocks share vertices, because the text of a block is attached to its vertices.
     """
     vertices, triangles, owner = [], [], []
     first = 0
-    for number, block in enumerate(blocks):
-        corners, faces = prism(block, _prism_height(magnet))
+    for number, (corners, faces) in enumerate(bodies):
         vertices.append(corners)
         triangles.append(faces + first)
         owner += [number] * len(corners)
         first += len(corners)
-    points, faces = np.vstack(vertices), np.vstack(triangles)
+    points = np.vstack(vertices).astype(np.float32)  # half the bytes, and exact enough to look at
+    faces = np.vstack(triangles).astype(np.int32)
     more = _rings_per_prism(magnet) - 1
     texts = [_hover_text(block, min(more, magnet.array.rings - block.ring), values, number)
              for number, block in enumerate(blocks)]
@@ -286,8 +352,9 @@ def _blocks_trace(
                     "title": {"text": colours.title}, "len": 0.45, "y": 0.7}}
     return go.Mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=faces[:, 0], j=faces[:, 1],
-        k=faces[:, 2], text=[texts[number] for number in owner], hoverinfo="text", flatshading=True,
-        name="blocks", showlegend=True, lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
+        k=faces[:, 2], customdata=owner, meta=texts, hoverinfo="text",
+        flatshading=True, name="blocks", showlegend=True,
+        lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
 
 
 def _hover_text(block: MagnetBlock, more: int, values: BlockValues, number: int) -> str:
@@ -319,8 +386,7 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     flat = np.vstack([edge.at(np.linspace(0, 1, ARC_POINTS)[:-1] if edge.arc else np.zeros(1))[0]
                       for edge in block.outline])
     count = len(flat)
-    inside = Delaunay(flat).simplices
-    face = inside[outline_contains(block.outline, flat[inside].mean(axis=1))]
+    face = _triangles(block.outline, flat)
     low, high = (block.z_min, block.z_max) if np.isfinite(block.z_max) else (
         -height / 2, height / 2)
     ring = np.arange(count)
@@ -331,17 +397,29 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     return block.from_frame(corners), np.vstack([face, face + count, sides])
 
 
+def _triangles(outline: tuple[Edge, ...], flat: Floats) -> Ints:
+    """Return triangles (m, 3) that fill the polygon of the points (n, 2) of an outline."""
+    edges = np.roll(flat, -1, axis=0) - flat
+    ahead = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
+    if (turns > 0).all() or (turns < 0).all():  # of a convex polygon, all from its first corner
+        corner = np.arange(1, len(flat) - 1)
+        return np.column_stack([0 * corner, corner, corner + 1])
+    inside = Delaunay(flat).simplices
+    return np.asarray(inside[outline_contains(outline, flat[inside].mean(axis=1))])
+
+
 def _prism_height(magnet: Magnet) -> float:
     """Return the drawn height in m of blocks of infinite length."""
     return FLAT * magnet.array_outer_radius
 
 
 def _arrow_traces(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], values: BlockValues
+    blocks: Sequence[MagnetBlock], values: BlockValues, corners: Sequence[Floats]
 ) -> list[go.Scatter3d | go.Cone]:
-    """Return arrows of the magnetization on the upper faces of the blocks."""
-    middles = np.array([[*(block.middle + block.displacement_m)[:2],
-                         prism(block, _prism_height(magnet))[0][:, 2].max()] for block in blocks])
+    """Return arrows of the magnetization on the upper faces of the blocks with these corners."""
+    middles = np.array([[*(block.middle + block.displacement_m)[:2], own[:, 2].max()]
+                        for block, own in zip(blocks, corners, strict=True)])
     vectors = np.zeros((len(blocks), 3))
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
     size = np.median([np.ptp(prism(block, 0.0)[0], axis=0).max() for block in blocks[:100]])
@@ -350,6 +428,8 @@ def _arrow_traces(
     x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
     shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
                           name="magnetization", legendgroup="arrows", hoverinfo="skip")
+    if len(blocks) > MOST_CONES:
+        return [shafts]
     (x, y, z), (u, v, w) = (middles + vectors / 2).T, (HEAD * vectors).T
     heads = go.Cone(
         x=x, y=y, z=z, u=u, v=v, w=w, sizemode="raw", anchor="tip", showscale=False,
@@ -383,7 +463,7 @@ def _points_trace(points: ViewPoints) -> go.Scatter3d:
     low, high = points.limits
     return go.Scatter3d(
         x=x, y=y, z=z, mode="markers", name=points.name, customdata=points.values,
-        hovertemplate=f"(%{{x:.4f}}, %{{y:.4f}}, %{{z:.4f}}) m<br>{points.words}<extra></extra>",
+        hovertemplate=f"(%{{x:.1f}}, %{{y:.1f}}, %{{z:.1f}}) mm<br>{points.words}<extra></extra>",
         marker={"size": 2.5, "color": np.abs(points.values), "colorscale": UNSIGNED, "cmin": low,
                 "cmax": high, "colorbar": {"title": {"text": points.title}, "len": 0.45,
                                            "y": 0.23}})

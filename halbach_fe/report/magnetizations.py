@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.words import decimals, fraction
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -22,6 +24,43 @@ def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
     return {"largest_error_A_per_m": float(np.abs(error).max()),
             "rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
             "z_rms": float(np.sqrt(np.mean((error[free] / sd[free]) ** 2)))}
+
+
+def expected_spread(magnetizations: Gaussian) -> float:
+    """Return the standard deviation of the rms of error over sd that the posterior foretells.
+
+    It is larger than that of independent errors, 1 / sqrt(2 n), because what readings leave open
+    are few combinations of magnetizations.
+    """
+    free = magnetizations.sd > 0
+    sd = magnetizations.sd[free]
+    correlation = magnetizations.covariance[np.ix_(free, free)] / np.outer(sd, sd)
+    return float(np.linalg.norm(correlation) / np.sqrt(2) / free.sum())
+
+
+def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answer:
+    """Say how near the inferred magnetizations are to the true ones; the last of ``known`` counts.
+
+    Error bars hold if the rms of error over standard deviation is within three of its standard
+    deviations of 1.
+    """
+    (before, *_), (name, best) = known.values(), list(known.items())[-1]
+    size = float(np.sqrt(np.mean(truth**2) * magnet.dimension))
+    _, left, ratio = error_summary(best, truth).values()
+    first = error_summary(before, truth)["rms_error_A_per_m"]
+    spread = expected_spread(best)
+    sound = abs(ratio - 1) <= 3 * spread
+    return Answer(
+        "How near are the inferred magnetizations to the true ones?",
+        f"{name[0].upper()}{name[1:]}: {1e-3 * left:.2g} kA/m rms in each component, "
+        f"{fraction(left / size)} of a block's magnetization. Before the readings it was "
+        f"{1e-3 * first:.2g} kA/m.",
+        ("Yes: the" if sound else "No: the") + f" errors are {decimals(ratio, 2)} times the stated "
+        f"standard deviations, where 1 ± {decimals(spread, 2)} is expected. The field of the truth "
+        "was computed by another program than the one that is tested.",
+        "Update a magnet of your own with its map." if sound else
+        "Find out what the model lacks before its error bars are believed.",
+        f"halbach-fe {'infer' if sound else 'diagnose'} STUDY --measurements MAP -o DIR", sound)
 
 
 @own_style
@@ -50,10 +89,15 @@ def write_magnetizations(
         _magnetizations_figure(magnet, known, truth, ring), f"Deviation of the "
         f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are standard "
         "deviations")}, folder)
-    rows = [(name, *error_summary(distribution, truth).values())
-            for name, distribution in known.items()]
+    rows = []
+    for name, distribution in known.items():
+        largest, rms, ratio = error_summary(distribution, truth).values()
+        rows.append({"": name, "largest error in kA/m": decimals(1e-3 * largest),
+                     "rms error in kA/m": decimals(1e-3 * rms),
+                     "rms of error / sd": f"{ratio:.2f}"})
     write_page(folder / "magnetizations.html", "magnetizations.html.j2", pictures,
-               study=magnet.study, rows=rows, figures=figures or {}, what=what, machine_files=files)
+               study=magnet.study, rows=rows, figures=figures or {}, what=what, machine_files=files,
+               answer=answer(magnet, known, truth))
 
 
 def _magnetizations_figure(

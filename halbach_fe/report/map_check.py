@@ -15,7 +15,10 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import MapCheck
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.point_maps import draw, panels
+from halbach_fe.report.words import decimals, flux_density
 from halbach_fe.study.types import COMPONENTS
 
 VIOLATED = 0.02
@@ -24,13 +27,49 @@ VIOLATED = 0.02
 REMAINS = 0.3
 """Correlation of neighbouring residuals from which they are no noise."""
 
+ZERO = 1e-6
+"""Part of the largest reading below which a column holds nothing, and is not drawn."""
+
 ROWS_NAMED = 10
 """Number of broken rows that are listed by number."""
 
 
+def answer(check: MapCheck) -> Answer:
+    """Say whether the map obeys Maxwell's equations, and what to do next."""
+    question = "Does the map obey Maxwell's equations?"
+    if not check.suffices:
+        return Answer(
+            question, verdict(check), "Nothing on this page tests the map: too many numbers were "
+            "fitted to too few readings.", "Measure in a volume, with a smaller spacing, and check "
+            "that map.", "halbach-fe check MAP -o DIR", sound=False)
+    better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
+    noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
+    if check.position_noise_m * 1e6 >= 1:
+        noise += (", and where the field is steep, readings scatter like positions that are "
+                  f"{check.position_noise_m * 1e6:.0f} µm off")
+    trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. A map "
+             "cannot show everything, though: see below.")
+    if _violates(check):
+        return Answer(
+            question, f"{verdict(check)} {noise}.", "Nothing that the probe may plausibly be "
+            "explains this map: do not update a magnet with it.", "Look for rows, axes and units "
+            "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
+            sound=False)
+    if check.structure > REMAINS:
+        trust = (f"Nearly: what remains is no noise, as neighbouring residuals have a correlation "
+                 f"of {check.structure:.2f}. Something that this check does not know, such as a "
+                 "probe that moves in its holder, is still in the map.")
+    used = "DIR/oriented_map.csv" if better else "MAP"
+    return Answer(
+        question, f"{verdict(check)} {noise}: that belongs into the study as sigma_T.", trust,
+        "Update the magnet with " + ("oriented_map.csv, which has the right axes and no broken "
+                                     "rows." if better else "this map."),
+        f"halbach-fe infer STUDY --measurements {used} -o DIR")
+
+
 def sentences(check: MapCheck) -> list[str]:
-    """Return what the check found, the answer first."""
-    found = [verdict(check)]
+    """Return what else the check found."""
+    found = []
     if check.is_reoriented:
         shown = ", ".join(f"column B{column} is {_component(name)}"
                           for column, name in zip(COMPONENTS, check.orientation, strict=True))
@@ -49,15 +88,6 @@ def sentences(check: MapCheck) -> list[str]:
              for term in check.terms if term.found]
     if terms:
         found.append("The instrument is not what the map assumes: " + "; ".join(terms) + ".")
-    noise = f"The noise of a reading is {_field(check.noise_T)}"
-    if check.position_noise_m * 1e6 >= 1:
-        noise += (", and where the field is steep, readings scatter like positions that are "
-                  f"{check.position_noise_m * 1e6:.0f} µm off")
-    found.append(noise + ".")
-    if check.structure > REMAINS:
-        found.append(f"What remains is no noise: neighbouring residuals have a correlation of "
-                     f"{check.structure:.2f}. Something that this check does not know, such as a "
-                     "probe that moves in its holder, is still in the map.")
     return found
 
 
@@ -72,28 +102,32 @@ def verdict(check: MapCheck) -> str:
         return (f"The map cannot tell: {1 - check.redundancy:.0%} of its readings are needed to "
                 "describe any field in its region. Measure in a volume, with a smaller spacing.")
     share = check.floor_rms_T / check.size_T
-    size = (f"{_field(check.floor_rms_T)} rms on scan lines that were held out, "
-            f"{_share(share)} of the largest field ({_field(check.size_T)})")
+    size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
+            f"{_share(share)} of the largest field ({flux_density(check.size_T)})")
     if share > VIOLATED:
         return f"The map does not obey div B = 0 and curl B = 0: they leave {size}."
-    wrong = [term.name for term in check.terms if term.determined and not term.plausible]
+    wrong = _impossible(check)
     if wrong:
         return (f"The map does not obey div B = 0 and curl B = 0 with any likely instrument: it "
                 f"would take an impossible one ({wrong[0]}"
                 f"{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}), which leaves {size}.")
-    return (f"The map obeys div B = 0 and curl B = 0 to {size}. No model of the magnet can explain "
-            "it any better.")
+    return (f"The map obeys div B = 0 and curl B = 0 to {size}. A model of the magnet can "
+            "explain it better only near edges of the magnet.")
+
+
+def _impossible(check: MapCheck) -> list[str]:
+    """Return the names of the parameters of a probe that no probe has."""
+    return [term.name for term in check.terms if term.determined and not term.plausible]
+
+
+def _violates(check: MapCheck) -> bool:
+    """Whether the map does not obey Maxwell's equations with any likely probe."""
+    return check.floor_rms_T > VIOLATED * check.size_T or bool(_impossible(check))
 
 
 def _component(name: str) -> str:
     """Return the name of a component with its sign, -Bz of ``-z``."""
     return f"{name[:-1].replace('-', '−')}B{name[-1]}"
-
-
-def _field(value: float) -> str:
-    """Return a flux density with a unit that suits it."""
-    return f"{value:.3g} T" if value >= 0.1 else (
-        f"{value * 1e3:.2g} mT" if value >= 1e-4 else f"{value * 1e6:.2g} µT")
 
 
 def _share(value: float) -> str:
@@ -102,20 +136,30 @@ def _share(value: float) -> str:
 
 
 def instrument_table(check: MapCheck) -> list[dict[str, str]]:
-    """Return rows of text: every parameter of the instrument with its uncertainty."""
+    """Return rows of text: the parameters of the instrument that the map determines."""
     return [{"parameter": term.name,
-             "value": f"{term.value:.2f} ± {term.sd:.2f} {term.unit}" if term.determined else "–",
-             "": "found" if term.found else "" if term.determined
-             else "this map cannot tell" if term.predictive
-             else "left out: scan lines are predicted as well without it"}
-            for term in check.terms]
+             "value": f"{term.value:.2f} ± {term.sd:.2f} {term.unit}",
+             "": "found" if term.found else ""}
+            for term in check.terms if term.determined]
+
+
+def undetermined(check: MapCheck) -> str:
+    """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
+    said = []
+    for words, predictive in (("Left out, because scan lines are predicted as well without them",
+                               False), ("What this map cannot tell", True)):
+        names = [term.name for term in check.terms
+                 if not term.determined and term.predictive == predictive]
+        if names:
+            said.append(f"{words}: {'; '.join(names)}.")
+    return " ".join(said)
 
 
 def residual_table(check: MapCheck) -> list[dict[str, str]]:
-    """Return rows of text: rms residuals of the columns in mT, and by region."""
+    """Return rows of text: rms residuals of the columns in µT, and by region."""
     def row(name: str, values: Floats | tuple[float, float, float]) -> dict[str, str]:
-        return {"rms residual in mT": name} | {
-            f"B{column}": f"{1e3 * value:.3g}" for column, value in zip(
+        return {"rms residual in µT": name} | {
+            f"B{column}": decimals(1e6 * value) for column, value in zip(
                 COMPONENTS, values, strict=True)}
 
     axis, windows = check.windows
@@ -149,16 +193,17 @@ def write_map_check(
         write_map(corrected(data, check), folder / "corrected_map.csv")
         files.append("corrected_map.csv")
     figures = {
-        "check_slices.png": (_slices(points, np.asarray(data["B_T"].values), check), (
-            "A slice through the middle of the map: every column as it was measured, and its "
-            "residual from the field that obeys Maxwell's equations. Crosses are rows that were "
-            "left out")),
+        "check_maps.png": (_maps(points, np.asarray(data["B_T"].values), check), (
+            "The map: every column as it was measured, and its residual from the field that obeys "
+            "Maxwell's equations. Crosses are rows that were left out")),
         "check_readings.png": (_readings(check), (
             "Residuals in the order of the map: noise is the same everywhere, a probe that moves "
             "makes steps and waves"))}
     write_page(folder / "check.html", "map_check.html.j2", save(figures, folder),
-               provenance=provenance, check=check, found=sentences(check), files=", ".join(files),
-               instrument=instrument_table(check), residuals=residual_table(check))
+               provenance=provenance, check=check, answer=answer(check),
+               found=sentences(check), files=", ".join(files),
+               undetermined=undetermined(check), instrument=instrument_table(check),
+               rows=residual_table(check))
 
 
 def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:
@@ -189,30 +234,31 @@ def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
     return turned
 
 
-def _slices(points: Floats, field: Floats, check: MapCheck) -> Figure:
-    """Draw the columns and their residuals in the plane of the two longest axes."""
-    first, second, third = np.argsort(-np.ptp(points, axis=0))
-    middle = points[np.argmin(np.abs(points[:, third] - np.median(points[:, third]))), third]
-    plane = np.abs(points[:, third] - middle) <= 0.5 * check.spacing_m
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    axes = figure.subplots(3, 2, sharex=True, sharey=True)
-    where = 1e3 * points[plane][:, [first, second]].T
-    out = check.excluded[plane]
-    for column, row in enumerate(axes):
-        residual = np.where(check.excluded, np.nan, check.residual_T[:, column])[plane]
+def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
+    """Draw every column as it was measured, and its residual, over the points of the map."""
+    panel = panels(points)[0]
+    out = np.flatnonzero(check.excluded[panel.points])
+    largest = float(np.nanmax(np.abs(field)))
+    shown = [number for number in range(3)
+             if np.nanmax(np.abs(field[:, number]), initial=0.0) > ZERO * largest]
+    figure = Figure(figsize=(10, 0.6 + 2.4 * len(shown)), layout="constrained")
+    for column, row in zip(shown, figure.subplots(len(shown), 2, sharex=True, sharey=True,
+                                                  squeeze=False), strict=True):
+        residual = 1e6 * np.where(check.excluded, np.nan, check.residual_T[:, column])[panel.points]
         limit = float(np.nanquantile(np.abs(residual), 0.98)) if np.isfinite(
             residual).any() else 1.0
-        for axis, values, colours, name in (
-                (row[0], 1e3 * field[plane, column], {"cmap": "viridis"}, "in mT"),
-                (row[1], 1e6 * residual, {"cmap": "RdBu_r", "vmin": -1e6 * limit,
-                                          "vmax": 1e6 * limit}, "residual in µT")):
-            drawn = axis.scatter(*where, c=values, s=18, marker="s", **colours)
-            axis.plot(*where[:, out], "x", color=MEASURED, ms=4)
-            figure.colorbar(drawn, ax=axis, label=f"B{COMPONENTS[column]} {name}")
-        row[0].set_ylabel(f"{COMPONENTS[second]} in mm")
-    for axis in axes[-1]:
-        axis.set_xlabel(f"{COMPONENTS[first]} in mm")
-    figure.suptitle(f"{COMPONENTS[third]} = {1e3 * middle:.1f} mm")
+        name = f"B{COMPONENTS[column]}"
+        for axis, values, colours, words in (
+                (row[0], 1e3 * field[panel.points, column], {"cmap": "cividis"}, f"{name} in mT"),
+                (row[1], residual, {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit},
+                 f"residual of\n{name} in µT")):
+            drawn = draw(axis, panel, values, **colours)
+            axis.plot(panel.first[out], panel.second[out], "x", color=MEASURED, ms=4)
+            figure.colorbar(drawn, ax=axis, label=words)
+            if column != shown[-1]:
+                axis.set_xlabel("")
+        row[1].set_ylabel("")
+    figure.suptitle(panel.title)
     return figure
 
 

@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, own_style, save, write_page
+from halbach_fe.report.words import probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
 
@@ -106,9 +108,7 @@ def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:
         return {}
     model, magnets = min(tables, key=lambda table: (
         abs(table[0].z or 0.0), -table[0].radius))
-    mains = "; ".join(f"{name} {known.main:.6g}" + (
-        f" ± {known.main_sd:.2g}" if known.main_sd else "") + f" {model.unit}"
-        for name, known in magnets.items())
+    mains = "; ".join(f"{name} {main_in_words(model, known)}" for name, known in magnets.items())
     return {"reference": reference_text(model), "mains": mains, "rows": text_table(**magnets),
             "circles": len(tables)}
 
@@ -130,18 +130,53 @@ def _probability_within(known: Multipoles, limit: float) -> float:
     return met(known.sizes_of(normals), limit)
 
 
-def multipoles_verdict(table: MultipoleTable, limit: float | None) -> str:
-    """Return sentences about the last magnet of a table, which is the best known of them."""
+def answer(tables: Sequence[MultipoleTable], limit: float | None) -> Answer:
+    """Say how large the unwanted multipoles of the best known magnet are, and what to do next."""
+    measured = "posterior" in tables[0][1]
+    said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
+    question = "Which unwanted multipoles does the field have?"
+    if not measured:
+        return Answer(
+            question, said, "This is the magnet as ordered, not as it was built: ± is what the "
+            "tolerances of its blocks (the study's prior) and the solver leave open.",
+            "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
+            "halbach-fe infer STUDY --measurements MAP -o DIR")
+    return Answer(
+        question, said, "Yes, as far as the update agrees with its map, which its own page says: ± "
+        "is what map, prior and solver leave open.",
+        "If that is too much, look for blocks to swap or to turn.",
+        "halbach-fe shim STUDY --measurements MAP -o DIR")
+
+
+def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
+    """Describe the last magnet of a table, which is the best known of them, in sentences."""
     model, magnets = table
-    name, known = list(magnets.items())[-1]
-    worst = int(np.argmax(known.sizes))
-    text = (f"{name.capitalize()}: the main multipole is {known.main:.6g} ± {known.main_sd:.2g} "
-            f"{model.unit}; the largest unwanted multipole is that of order {known.orders[worst]} "
-            f"with {known.sizes[worst]:.3g} units.")
+    known = list(magnets.values())[-1]
+    spread = np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2)
+    worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
+    sd = float(spread[worst])
+    where = "" if alone else (
+        "Of the field integrated along z, " if model.integrated else f"On {place_of(model)}, ")
+    start = f"{where}the largest unwanted multipole is "
+    text = (f"{start[0].upper()}{start[1:]}of order {known.orders[worst]} with "
+            f"{with_error(float(known.sizes[worst]), sd)} units of 1e-4; the main one is "
+            f"{main_in_words(model, known)}.")
     if limit is not None:
         text += (f" All unwanted multipoles are within {limit:g} units with a probability of "
-                 f"{100 * _probability_within(known, limit):.3g} %.")
+                 f"{probability(_probability_within(known, limit))}.")
     return text
+
+
+def place_of(model: MultipoleModel) -> str:
+    """Return the circle of a reference in words."""
+    where = ("" if model.z is None  # the middle of a magnet is 0 to rounding
+             else f" at z = {1e3 * round(model.z, 9):.4g} mm")
+    return f"the circle of {1e3 * model.radius:.4g} mm{where}"
+
+
+def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
+    """Return the main multipole and its standard deviation in mT, or mT m if integrated."""
+    return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
 
 
 @own_style
@@ -158,10 +193,9 @@ def write_multipoles(
             multipole_figure(magnets, limit), "Unwanted multipoles, normal (left) and "
             "skew (right); bars are two standard deviations")
         for model, magnets in tables}, folder)
+    parts = [{"title": _location(model), "reference": reference_text(model),
+              "rows": text_table(**magnets), "picture": picture}
+             for (model, magnets), picture in zip(tables, pictures, strict=True)]
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, parts=[
-                   {"title": _location(model),
-                    "verdict": multipoles_verdict((model, magnets), limit),
-                    "reference": reference_text(model), "rows": text_table(**magnets),
-                    "picture": picture}
-                   for (model, magnets), picture in zip(tables, pictures, strict=True)])
+               provenance=provenance, answer=answer(tables, limit), parts=parts,
+               rows=text_table(**tables[0][1]))

@@ -11,31 +11,36 @@ from functools import singledispatch
 from matplotlib.figure import Figure
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
+from halbach_fe.design.assembly import Assembly
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.design.ring_design import Designed
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
-from halbach_fe.design.tolerance import Tolerance
+from halbach_fe.design.tolerance import HomogeneityTolerance, Tolerance
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report import shim_tray
+from halbach_fe.report import assembly, ring_design, shim_tray
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.demagnetization import worst_block_table
-from halbach_fe.report.diagnosis import change_table, found_table, verdict
+from halbach_fe.report.diagnosis import change_table, found_table
+from halbach_fe.report.diagnosis_answer import answer as answer_of_diagnosis
 from halbach_fe.report.forces import force_rows
 from halbach_fe.report.homogeneity import homogeneity_rows
 from halbach_fe.report.multipoles import multipole_figure
 from halbach_fe.report.page import geometry_figure, own_style
-from halbach_fe.report.plan import plan_summary
+from halbach_fe.report.plan import plan_table
 from halbach_fe.report.prediction import prediction_profile_figure
 from halbach_fe.report.shimming import move_table
 from halbach_fe.report.solution import field_figure
 from halbach_fe.report.sorting import order_table
 from halbach_fe.report.tolerance import quantile_table
+from halbach_fe.report.verification import answer as answer_of_verification
 from halbach_fe.report.verification import difference_table
 from halbach_fe.response.mesh_convergence import Verification
 from halbach_fe.response.solution import Solution
@@ -82,8 +87,8 @@ def _(result: InferenceResult) -> str:
 
 @_html_of.register
 def _(diagnosis: Diagnosis) -> str:
-    words = f"<p>{html.escape(' '.join(verdict(diagnosis)))}</p>"
-    return words + table(found_table(diagnosis)) + table(change_table(diagnosis))
+    return (words(answer_of_diagnosis(diagnosis)) + table(found_table(diagnosis))
+            + table(change_table(diagnosis)))
 
 
 @_html_of.register
@@ -94,12 +99,22 @@ def _(result: MultipoleTables) -> str:
 
 @_html_of.register
 def _(result: HomogeneityResult) -> str:
-    return table(homogeneity_rows(result))
+    return table(homogeneity_rows(result.by_name))
 
 
 @_html_of.register
 def _(result: Forces) -> str:
     return table(force_rows(result))
+
+
+@_html_of.register
+def _(result: Assembly) -> str:
+    return table(assembly.kind_rows(result)) + table(assembly.plate_rows(result))
+
+
+@_html_of.register
+def _(result: Designed) -> str:
+    return table(ring_design.design_rows(result)) + table(ring_design.ring_rows(result))
 
 
 @_html_of.register
@@ -109,13 +124,12 @@ def _(result: FilledTray) -> str:
 
 @_html_of.register
 def _(verification: Verification) -> str:
-    return table(difference_table(verification))
+    return words(answer_of_verification(verification)) + table(difference_table(verification))
 
 
 @_html_of.register
 def _(plan: MeasurementPlan) -> str:
-    return table([{"quantity": name, "value": str(value)}
-                  for name, value in plan_summary(plan).items()])
+    return table(plan_table(plan))
 
 
 @_html_of.register
@@ -129,7 +143,7 @@ def _(assignment: SortedBlocks) -> str:
 
 
 @_html_of.register
-def _(tolerance: Tolerance) -> str:
+def _(tolerance: Tolerance | HomogeneityTolerance) -> str:
     return table(quantile_table(tolerance))
 
 
@@ -143,6 +157,11 @@ def _(campaign: SimulatedCampaign) -> str:
     points = points_of(campaign.readings)
     return table([{"study": campaign.study.name, "points": str(len(points)),
                    "blocks": str(len(campaign.blocks))}])
+
+
+def words(answer: Answer) -> str:
+    """Return an answer as a paragraph."""
+    return f"<p>{html.escape(' '.join(answer.sentences))}</p>"
 
 
 def picture(figure: Figure, text: str) -> str:

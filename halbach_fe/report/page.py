@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -21,6 +23,8 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.page_record import Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -35,10 +39,6 @@ own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
 
-Picture = tuple[str, str]
-"""A figure in a page: the PNG in base64, and its caption."""
-
-
 def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
 
@@ -49,19 +49,26 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
     """
     pictures = []
     for name, (figure, caption) in figures.items():
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=130)
+        png = png_of(figure)
         with atomic(folder / name) as temporary:
-            temporary.write_bytes(buffer.getvalue())
-        pictures.append((base64.b64encode(buffer.getvalue()).decode(), caption))
+            temporary.write_bytes(png)
+        pictures.append(Picture(base64.b64encode(png).decode(), caption, name))
     return pictures
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as the content of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return buffer.getvalue()
 
 
 def write_page(
     path: Path, template: str, pictures: Sequence[Picture], study: Study | None = None,
-    provenance: Mapping[str, str] | None = None, **data: object,
+    provenance: Mapping[str, str] | None = None, answer: Answer | None = None,
+    rows: Sequence[Mapping[str, str]] = (), **data: object,
 ) -> None:
-    """Write a self-contained HTML page from a template of this folder.
+    """Write a self-contained HTML page from a template of this folder, and page.json beside it.
 
     The page ends with its provenance: the entries of ``provenance``, the versions of the programs,
     and the text of the study file as it was read.
@@ -76,19 +83,37 @@ def write_page(
         Figures from `save`.
     provenance : mapping, optional
         Text by name of the entry.
+    answer : Answer, optional
+        What the page says first; every page of a command has one.
+    rows : sequence of mapping of str to str
+        The main table of the page, which page.json has too.
     **data
         Variables of the template.
     """
-    versions = [f"{name} {metadata.version(name)}" for name in PROGRAMS]
+    provenance = {**(provenance or {}), "programs": programs()}
+    text = rendered(template, pictures=pictures, study=study, answer=answer, rows=rows,
+                    provenance=provenance, **data)
+    write_text(path, text)
+    title = re.search("<title>(.*?)</title>", text, re.S)
+    write_record(path, html.unescape(title[1]) if title else "", answer, pictures, rows,
+                 provenance, study)
+
+
+def programs() -> str:
+    """Return the names and versions of the programs that a page is made with."""
+    return ", ".join([*(f"{name} {metadata.version(name)}" for name in PROGRAMS),
+                      f"Python {platform.python_version()}"])
+
+
+def rendered(template: str, study: Study | None = None, **data: object) -> str:
+    """Return the HTML of a template of this folder; all texts in ``data`` are escaped."""
     text = None if study is None else tomlkit.dumps(_without_empty_cells(
         study.model_dump(mode="json", exclude_unset=True, exclude_none=True)))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["is_nonlinear"] = is_nonlinear
-    write_text(path, environment.get_template(template).render(
-        pictures=pictures, study=study, study_text=text, provenance={**(provenance or {}),
-            "programs": ", ".join([*versions, f"Python {platform.python_version()}"])}, **data))
+    return environment.get_template(template).render(study=study, study_text=text, **data)
 
 
 def _without_empty_cells(value: Any) -> Any:

@@ -17,6 +17,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
@@ -26,6 +27,8 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import counted, fraction
+from halbach_fe.study.model import is_nonlinear
 
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
@@ -40,6 +43,24 @@ def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
         "rms_sd_prior": _rms(plan.prior_sd), "rms_sd_plan": _rms(plan.planned_sd),
         "rms_sd_study_with_as_many_points": _rms(plan.baseline_sd),
     }
+
+
+def answer(plan: MeasurementPlan) -> Answer:
+    """Say how much the plan tells beside the study's positions, and what to do next."""
+    left, of_study = (_rms(sd) / _rms(plan.prior_sd) for sd in (plan.planned_sd, plan.baseline_sd))
+    points, same = len(plan.points), plan.same_information
+    said = (f"At the {counted(points, 'position')} of plan.csv. They leave {fraction(left)} of the "
+            f"blocks' prior uncertainty, as many of the study's positions {fraction(of_study)}. ")
+    said += (f"{counted(same, 'position')} of the plan tell as much as all {len(plan.baseline)} of "
+             f"the study." if same else f"All {len(plan.baseline)} positions of the study together "
+             "tell more: plan more points for that.")
+    return Answer(
+        "Where should the magnet be measured?", said,
+        "As far as the study's prior and noise are right: the readings themselves do not matter. "
+        "Chosen one after another, the positions are nearly the best ones."
+        + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
+           else ""),
+        "Measure there, and update the blocks.", "halbach-fe infer STUDY --measurements MAP -o DIR")
 
 
 @own_style
@@ -66,7 +87,22 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
             "study"),
     }, folder)
     write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
-               summary=summary)
+               summary=summary, answer=answer(plan), rows=plan_table(plan))
+
+
+def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
+    """Return rows of text that compare the plan with the positions of the study."""
+    prior, same = _rms(plan.prior_sd), plan.same_information
+    return [
+        {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
+        {"": "positions that tell as much as all of the study's",
+         "plan": str(same) if same else f"more than {len(plan.points)}",
+         "the study's": str(len(plan.baseline))},
+        {"": "uncertainty that remains of a block, with equally many positions",
+         "plan": fraction(_rms(plan.planned_sd) / prior),
+         "the study's": fraction(_rms(plan.baseline_sd) / prior)},
+        {"": "mean uncertainty of all patterns of blocks, with equally many", "plan":
+         f"{fraction(plan.volume_ratio)} of the study's", "the study's": ""}]
 
 
 def _rms(values: Floats) -> float:
@@ -86,8 +122,8 @@ def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
              ylabel="y in mm")
     for axis in others:
         shown = _draw_points(axis, plan, lambda points: np.column_stack(
-            [points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
-        axis.set(xlabel="z in m", ylabel="angle in degrees")
+            [1e3 * points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
+        axis.set(xlabel="z in mm", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
     return figure
 

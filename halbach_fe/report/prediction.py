@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.inference.result import (
@@ -23,6 +23,7 @@ from halbach_fe.inference.result import (
 )
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, stacked_axes
+from halbach_fe.report.point_maps import curve, residual_figure, unit_for
 
 MARKERS: dict[str, dict[str, Any]] = {
     TRAINING: {"marker": ".", "ms": 4}, HELD_OUT: {"marker": "o", "mfc": "none", "ms": 4},
@@ -31,6 +32,9 @@ MARKERS: dict[str, dict[str, Any]] = {
 
 FAR = 12.0
 """Largest standardized residual for which the axis of residuals is linear."""
+
+FEWEST_ON_A_LINE = 5
+"""Fewest readings of a profile."""
 
 CROWD = 3000
 """Number of readings from which smaller, transparent markers are used."""
@@ -90,11 +94,20 @@ def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:
     """
     x, y, z = (result.observation.places if result.is_campaign
                else result.observation.positions).T
+    if (along := _line_of_all(result)) is not None:
+        return along
     if np.ptp(z) > 0:
-        return z, "z in m"
+        return 1e3 * z, "z in mm"
     if any(result.observation.components):
         return np.degrees(np.arctan2(y, x)) % 360, "angle in degrees"
     return np.array([float(label[1:]) for label in result.observation.labels]), "harmonic"
+
+
+def _line_of_all(result: InferenceResult) -> tuple[Floats, str] | None:
+    """Return abscissae and label if all readings lie on a line or circle, see `curve`."""
+    if result.is_campaign or not any(result.observation.components):
+        return None
+    return curve(result.observation.positions)
 
 
 def main_line(result: InferenceResult, name: str | None = None) -> ReadingLine:
@@ -112,7 +125,7 @@ def main_line(result: InferenceResult, name: str | None = None) -> ReadingLine:
     if axis == "harmonic":
         labels, what = np.array([label[0] for label in labels]), what[0]
     radii, positions = result.observation.radii, result.observation.positions
-    near = np.isclose(radii, radii[strongest], 0, 1e-4)
+    near = np.isclose(radii, radii[strongest], 0, 1e-4) | (_line_of_all(result) is not None)
     if result.is_campaign:  # stages may be inclined, so that lines are not at one radius
         mine = maps == maps[strongest]
         spacing = point_spacing(np.unique(positions[mine], axis=0))
@@ -133,23 +146,62 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
     index = line.index
     figure, (top, bottom) = stacked_axes(2, [2, 1])
     measured = result.readings[index]
-    top.plot(line.place, result.prediction_prior.mean[index], color=PRIOR, label="prior", lw=1.2)
-    top.plot(line.place, result.prediction_posterior.mean[index], color=POSTERIOR,
-             label="posterior", lw=1.2)
-    residual = 1e3 * (measured - result.prediction_posterior.mean[index])
-    band = 1e3 * COVERAGE_Z * np.hypot(result.prediction_posterior.sd, result.sigma)[index]
+    top.plot(line.place, 1e3 * result.prediction_prior.mean[index], color=PRIOR,
+             label="predicted before the update", lw=1.2)
+    top.plot(line.place, 1e3 * result.prediction_posterior.mean[index], color=POSTERIOR,
+             label="predicted after it", lw=1.2)
+    difference = measured - result.prediction_posterior.mean[index]
+    band = COVERAGE_Z * np.hypot(result.prediction_posterior.sd, result.sigma)[index]
+    factor, unit = unit_for(float(max(np.abs(difference).max(), band.max())))
+    residual, band = factor * difference, factor * band
     bottom.fill_between(line.place, -band, band, color=POSTERIOR, alpha=0.2, lw=0, step="mid",
                         label="95 % band (prediction and noise)")
     for part, mask in _parts(result, index):
-        for axis, values in ((top, measured), (bottom, residual)):
+        for axis, values in ((top, 1e3 * measured), (bottom, residual)):
             axis.plot(line.place[mask], values[mask], ls="none", color=MEASURED, **MARKERS[part],
                       label=f"measured, {part}" if axis is top else None)
-    top.set_ylabel(f"{line.what} in T")
+    top.set_ylabel(f"{line.what} in mT")
     top.legend()
-    bottom.set_ylabel("measured − posterior\nin mT")
+    bottom.set_ylabel(f"measured − predicted\nin {unit}")
     bottom.set_xlabel(line.axis)
     bottom.legend(loc="lower center")
     return figure
+
+
+def has_profile(result: InferenceResult, name: str | None = None) -> bool:
+    """Whether enough readings lie on the line of the strongest one to draw a profile."""
+    return len(main_line(result, name).index) >= FEWEST_ON_A_LINE
+
+
+def residual_maps_figure(result: InferenceResult) -> Figure | None:
+    """Draw measured less predicted, before and after the update, over the points of the map.
+
+    Returns
+    -------
+    Figure, or None
+        None if there is no such picture: the readings are Fourier coefficients, of several maps, or
+        on a line or circle, where the profile shows them.
+    """
+    observation = result.observation
+    if result.is_campaign or not all(observation.components):
+        return None
+    points, number = np.unique(observation.positions.round(9), axis=0, return_inverse=True)
+    if len(points) < FEWEST_ON_A_LINE or curve(points) is not None:
+        return None
+    before, after = result.readings - np.array(
+        [result.prediction_prior.mean, result.prediction_posterior.mean])
+    factor, unit = unit_for(float(np.abs(before).max()))
+    labels = np.array(observation.labels)
+
+    def at_points(label: str, residual: Floats) -> Floats:
+        values = np.full(len(points), np.nan)
+        mine = labels == label
+        values[number.ravel()[mine]] = factor * residual[mine]
+        return values
+
+    return residual_figure(points, {label: {
+        "before": at_points(label, before), "after": at_points(label, after)}
+        for label in dict.fromkeys(observation.labels)}, unit)
 
 
 def relative_error_figure(result: InferenceResult, published: PublishedErrors | None) -> Figure:
@@ -158,9 +210,9 @@ def relative_error_figure(result: InferenceResult, published: PublishedErrors | 
     figure, (axis,) = stacked_axes(1)
     figure.set_size_inches(8, 4.5)
     if published is not None:
-        axis.semilogy(published.z, published.prior, ":", color=PUBLISHED, lw=1,
+        axis.semilogy(1e3 * published.z, published.prior, ":", color=PUBLISHED, lw=1,
                       label=f"{published.label}, prior")
-        axis.semilogy(published.z, published.posterior, "-", color=PUBLISHED, lw=1,
+        axis.semilogy(1e3 * published.z, published.posterior, "-", color=PUBLISHED, lw=1,
                       label=f"{published.label}, posterior")
     for name, prediction, colour in _predictions(result):
         error = result.relative_error(prediction)[line.index]
@@ -207,9 +259,9 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     chosen = result.held_out if unseen else ~result.held_out
     count = int(chosen.sum())
     rank = np.unique(np.linspace(1, count, min(count, DRAWN_QUANTILES)).round().astype(int))
-    normal = stats.norm.ppf((rank - 0.5) / count)
-    axis.fill_between(normal, *stats.norm.ppf(
-        [stats.beta.ppf(p, rank, count - rank + 1) for p in (0.025, 0.975)]),
+    normal = special.ndtri((rank - 0.5) / count)
+    axis.fill_between(normal, *special.ndtri(
+        [special.betaincinv(rank, count - rank + 1, p) for p in (0.025, 0.975)]),
         color=PUBLISHED, alpha=0.3, lw=0,
         label="95 % band of each quantile,\nif the model is right")
     axis.axline((0, 0), slope=1, color=PUBLISHED, lw=0.8)

@@ -6,16 +6,18 @@ import json
 from pathlib import Path
 
 import numpy as np
-import scipy.stats as stats
 import xarray as xr
 from matplotlib.figure import Figure
+from scipy import special
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import counted, fraction
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -30,9 +32,9 @@ def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
     """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values."""
     return [
         {"type": samples.label, "n": str(len(samples.deviations)),
-         **{f"{name} in {unit}": f"{mean:+.2f} ± {sd}" for name, unit, mean, sd in zip(
+         **{f"{name} in {unit}": f"{mean:+.2f}{sd}" for name, unit, mean, sd in zip(
              DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
-             [NOTHING if np.isnan(sd) else f"{sd:.2f}" for sd in _sd_of_type(samples)],
+             ["" if np.isnan(sd) else f" ± {sd:.2f}" for sd in _sd_of_type(samples)],
              strict=False)},
          **{f"p {name}": NOTHING if np.isnan(p) else f"{p:.2g}"
             for name, p in zip(DIRECTIONS, samples.p, strict=False)}}
@@ -61,6 +63,35 @@ def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     }
 
 
+def answer(prior: MeasuredPrior) -> Answer:
+    """Say how the measured blocks deviate from the study, and what to do next."""
+    size = np.sqrt(np.mean(prior.nominal**2))
+    spread = float(np.sqrt(np.mean(prior.gaussian.sd**2))) / size
+    shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
+    said = (f"The {counted(prior.count, 'measured block')} deviate from the study's magnetization "
+            f"by {fraction(shift)} rms, and each is now known to {fraction(spread)}. " + (
+                "Ring and slot of every block are known: each has its own measurement."
+                if prior.placed else "Which block is in which slot is not known: all blocks of a "
+                "type have its mean and spread."))
+    odd = [samples.label for samples in prior.types if not samples.normal]
+    tested = any(not np.isnan(samples.p).all() for samples in prior.types)
+    trust = ("Yes: it is what the table says. No type has enough blocks to test whether their "
+             "deviations are distributed normally"
+             + (", which does not matter where each block is known." if prior.placed else ".")
+             if not tested else
+             "Yes: the deviations are distributed normally, as the prior assumes, as far as so "
+             "many blocks can tell." if not odd else
+             f"Not normal: the deviations of type {', '.join(odd)} are unlikely to be distributed "
+             f"normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's correction)."
+             + ("" if prior.placed else " The prior treats them as normal nevertheless."))
+    return Answer(
+        "What do the measured blocks say about the magnet?", said, trust,
+        "Update the magnet with these blocks and a field map." if not odd or prior.placed else
+        "Add ring and slot of every block to the table: then the distribution does not matter.",
+        "halbach-fe infer STUDY --measurements MAP --blocks BLOCKS -o DIR",
+        prior.placed or not odd)
+
+
 @own_style
 def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
     """Write prior.h5, prior.json, prior.html and its figure."""
@@ -75,12 +106,17 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
     write_hdf5(data, folder / "prior.h5")
     summary = prior_summary(magnet, prior)
     write_text(folder / "prior.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    testable = any(len(samples.deviations) > 2 for samples in prior.types)
     pictures = save({"prior_qq.png": (
         _standardized_deviations_figure(prior), "Quantiles of the standardized deviations of all "
         "blocks from the mean of their type against normal quantiles. The dashed lines are the "
-        "95 % band of each quantile for normally distributed samples of the same sizes")}, folder)
+        "95 % band of each quantile for normally distributed samples of the same "
+        "sizes")} if testable else {
+        "prior_blocks.png": (
+            _deviations_figure(prior), "Deviation of each block from the study's magnetization: "
+            "along it, and across it")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
-               summary=summary, rows=type_table(prior), level=NOT_NORMAL)
+               summary=summary, rows=type_table(prior), answer=answer(prior))
 
 
 def _mean_of_type(samples: TypeSamples) -> Floats:
@@ -108,6 +144,22 @@ def _standardized(samples: Floats) -> Floats:
     return np.asarray((samples - samples.mean(axis=0)) / np.where(spread > 0, spread, 1.0))
 
 
+def _deviations_figure(prior: MeasuredPrior) -> Figure:
+    """Draw the deviations of all blocks, in the order of their types."""
+    deviations = np.vstack([samples.deviations for samples in prior.types])
+    figure = Figure(figsize=(8, 1 + 1.8 * deviations.shape[1]), layout="constrained")
+    axes = figure.subplots(deviations.shape[1], 1, sharex=True, squeeze=False)[:, 0]
+    for axis, name, unit, factor, values in zip(axes, DIRECTIONS, ("%", "°", "°"), UNITS,
+                                                deviations.T, strict=False):
+        axis.axhline(0, color=PUBLISHED, lw=0.8)
+        axis.plot(np.arange(1, len(values) + 1), factor * values, "o", color=MEASURED, ms=4)
+        axis.set_ylabel(f"{name} in {unit}")
+        axis.grid(alpha=0.3)
+    axes[-1].set_xlabel("block, by type")
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    return figure
+
+
 def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     """Draw the quantiles of all blocks, each standardized with the mean and sd of its type.
 
@@ -116,12 +168,8 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
     figure = Figure(figsize=(10, 3.9), layout="constrained")
     axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
-    if not groups:
-        axes[0].text(0.5, 0.5, "fewer than three blocks of every type", ha="center",
-                     transform=axes[0].transAxes)
-        return figure
     count = sum(len(group) for group in groups)
-    expected = stats.norm.ppf((np.arange(count) + 0.5) / count)
+    expected = special.ndtri((np.arange(count) + 0.5) / count)
     generator = np.random.default_rng(1)
     simulated = np.sort(np.concatenate([
         _standardized(generator.standard_normal((len(group), SIMULATIONS))) for group in groups

@@ -12,11 +12,13 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
 from halbach_fe.inference.pose_result import Registration
-from halbach_fe.inference.registration import axes_of_map, odds
+from halbach_fe.inference.registration import axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.words import counted, flux_density, with_error
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -35,47 +37,71 @@ UPDATED = "magnet as the maps before have updated it"
 """What the readings are compared with before they update the blocks."""
 
 
-def sentences(found: Sequence[Registration], before: str = NOMINAL) -> list[str]:
-    """Return what was found, the answer first."""
+def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "") -> Answer:
+    """Say where the map lies, how sure that is, and what to do next.
+
+    ``name`` is that of a map that the study lists, so that no option has to say which it is.
+    """
     best, probability = found[0], odds(found)
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
                       axes_of_map(best.instrument).items())
-    place = ", ".join(f"{1e3 * value:.3f} ± {1e3 * sd:.3f}" for value, sd in zip(
+    place = ", ".join(with_error(1e3 * value, 1e3 * sd) for value, sd in zip(
         best.middle_m, best.translation_sd_m, strict=True))
-    answer = [f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
-              "magnet."]
-    if not best.explains:
-        answer.insert(0, (
-            "This magnet does not explain the map: even in the best pose and with updated blocks, "
-            f"chi² is {best.chi2:.3g} per reading, where about 1 is expected. The map is of "
-            "another magnet, its noise is larger than the study says, or the study lacks "
-            "something; see halbach-fe diagnose. The least bad answer follows."))
+    said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
+            "magnet.")
+    trust = []
     others = [100 * value for value in probability[1:] if value > EQUALLY_GOOD]
     if others:
-        answer.append(
-            f"{len(others)} other answer{'s' if len(others) > 1 else ''} cannot be ruled out, with "
-            f"odds of {', '.join(f'{value:.0f}' for value in others)} % beside "
-            f"{100 * probability[0]:.0f} %: the magnet looks the same from there.")
+        trust.append(
+            "Only up to a symmetry: the magnet looks the same from "
+            f"{counted(len(others), 'other pose')}, with a probability of "
+            f"{', '.join(f'{value:.0f}' for value in others)} % beside "
+            f"{100 * probability[0]:.0f} % of this one.")
+    if not best.at_rest:
+        trust.append("The fit has not come to rest: its error bars may be too small.")
+    trust.append(_fit(best, before))
+    sound = best.explains and best.at_rest
+    maps = "" if name else " --measurements MAP"
+    if not best.explains:
+        said = ("This magnet does not explain the map. The least bad answer: "
+                f"{said[0].lower()}{said[1:]}")
+        trust.insert(0, (
+            f"Even in the best pose and with updated blocks chi² is {best.chi2:.3g} per reading, "
+            "where about 1 is expected: the map is of another magnet, its noise is larger than the "
+            "study says, or the study lacks something."))
+    return Answer(
+        f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
+        " ".join(trust), *(
+            ("Update the blocks with the map in this pose.",
+             f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR") if sound else
+            ("Look for what the model lacks.",
+             f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound)
+
+
+def _fit(best: Registration, before: str) -> str:
+    """Say how far the magnet in the best pose is from the readings."""
+    fitted, updated, held_out, predicted = map(_rms_in_words, (
+        best.nominal_rms_T, best.rms_T, best.held_out_nominal_rms_T, best.held_out_rms_T))
+    tested = (f"; the lines that were held out are {held_out} and {predicted} off"
+              if np.isfinite(best.held_out_rms_T).any() else "")
+    return (f"The {before} is there {fitted} off the readings that were fitted, with updated "
+            f"blocks {updated}{tested}.")
+
+
+def sentences(found: Sequence[Registration]) -> list[str]:
+    """Return what else was found."""
+    best, said = found[0], []
     if best.undetermined:
-        answer.append(
+        said.append(
             f"The map by itself does not determine the {', '.join(best.undetermined)}: what was "
             "known before (the prior, or another map on the same stage) holds "
             f"{'it' if len(best.undetermined) == 1 else 'them'}, with the standard deviations of "
             "the table.")
     if len(by_hypothesis(found)) > 1:
-        answer.append("Odds of what is open: " + "; ".join(
+        said.append("Odds of what is open: " + "; ".join(
             f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
-    answer.append(
-        f"The {before} is there {_mT(best.nominal_rms_T)} off the readings that were fitted, "
-        f"with updated blocks {_mT(best.rms_T)}"
-        + (f"; the lines that were held out are {_mT(best.held_out_nominal_rms_T)} and "
-           f"{_mT(best.held_out_rms_T)} off." if np.isfinite(best.held_out_rms_T).any() else "."))
-    for key, (value, sd) in best.open_keys.items():
-        answer.append(f"{key} is {value:.5g} ± {sd:.1g}.")
-    if not best.at_rest:
-        answer.append("The fit has not come to rest: its error bars may be too small. Look for "
-                      "what the model lacks with halbach-fe diagnose.")
-    return answer
+    return said + [f"{key} is {value:.5g} ± {sd:.1g}."
+                   for key, (value, sd) in best.open_keys.items()]
 
 
 def hypothesis(one: Registration) -> str:
@@ -91,9 +117,11 @@ def by_hypothesis(found: Sequence[Registration]) -> dict[str, float]:
     return total
 
 
-def _mT(rms: np.ndarray) -> str:  # noqa: N802 - a unit
-    """Return the rms over the components in mT."""
-    return f"{1e3 * float(np.sqrt(np.nanmean(rms**2))):.3g} mT rms"
+def _rms_in_words(rms: np.ndarray) -> str:
+    """Return the rms over the components; nothing if it is not known."""
+    if np.isnan(rms).all():
+        return ""
+    return f"{flux_density(float(np.sqrt(np.nanmean(rms**2))))} rms"
 
 
 def pose_table(
@@ -108,11 +136,11 @@ def pose_table(
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
             "middle in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.middle_m),
             "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
-            "rotation in mrad": ", ".join(f"{1e3 * value:.2f}" for value in
-                                          each.instrument.rotation_rad),
+            "rotation from these in mrad": ", ".join(
+                f"{1e3 * value:.2f}" for value in turn_from_axes(each.instrument)),
             "sd in mrad": ", ".join(f"{1e3 * value:.2f}" for value in each.rotation_sd_rad),
-            "nominal" if before == NOMINAL else "before": _mT(each.nominal_rms_T),
-            "updated": _mT(each.rms_T), "chi²/reading": f"{each.chi2:.3g}"})
+            "nominal" if before == NOMINAL else "before": _rms_in_words(each.nominal_rms_T),
+            "updated": _rms_in_words(each.rms_T), "chi²/reading": f"{each.chi2:.3g}"})
     return rows
 
 
@@ -197,7 +225,8 @@ def _write_page(
         "The readings along the magnet's axis and in its cross-section, where the registration "
         "puts them"))}
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, found=sentences(found, before), poses=pose_table(found, before),
+               provenance, answer=answer(found, before, name),
+               found=sentences(found), rows=pose_table(found, before),
                name=study.name, probe=probe_table(best.instrument), map=name)
 
 
@@ -210,9 +239,9 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
                                     (SECOND, POSTERIOR, MEASURED), strict=True):
-        along.plot(points[:, 2], values, ".", ms=2, color=colour, label=f"B{name} of the map")
+        along.plot(points[:, 2], 1e3 * values, ".", ms=2, color=colour, label=f"B{name} of the map")
     along.set_xlabel("z in the magnet in mm")
-    along.set_ylabel("B in T")
+    along.set_ylabel("B in mT")
     along.grid(alpha=0.3)
     along.legend(markerscale=4)
     across.plot(points[:, 0], points[:, 1], ".", ms=3, color=POSTERIOR)

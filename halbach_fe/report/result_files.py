@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import singledispatch
 from importlib import metadata
+from operator import attrgetter
 from pathlib import Path
 
 import tomlkit
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
-from halbach_fe.core.result_folder import locked_folder
+from halbach_fe.core.result_folder import result_folder
+from halbach_fe.design.assembly import Assembly
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
+from halbach_fe.design.ring_design import Designed
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.design.shimming import Shim
 from halbach_fe.design.sorting import SortedBlocks
-from halbach_fe.design.tolerance import Tolerance
+from halbach_fe.design.tolerance import HomogeneityTolerance, Tolerance
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import write_study, write_summary
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
+from halbach_fe.report.assembly import write_assembly
 from halbach_fe.report.campaign import write_campaign_page
 from halbach_fe.report.demagnetization import write_demagnetization
 from halbach_fe.report.diagnosis import write_diagnosis_report
@@ -31,6 +35,7 @@ from halbach_fe.report.homogeneity import write_homogeneity
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.multipoles import write_multipoles
 from halbach_fe.report.plan import write_plan
+from halbach_fe.report.ring_design import write_design
 from halbach_fe.report.shim_tray import write_shim_tray
 from halbach_fe.report.shimming import write_shim
 from halbach_fe.report.solution import write_solution_report
@@ -41,6 +46,20 @@ from halbach_fe.response.mesh_convergence import Verification
 from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.simulate import SimulatedCampaign, write_campaign
+
+OWNERS: dict[type, tuple[str, str]] = {
+    Solution: ("solve", "magnet.study"), InferenceResult: ("infer", "study"),
+    Diagnosis: ("diagnose", "corrected_study"), Verification: ("verify", "magnet.study"),
+    MultipoleTables: ("multipoles", "magnet.study"),
+    HomogeneityResult: ("homogeneity", "magnet.study"), Forces: ("forces", "magnet.study"),
+    FilledTray: ("shim-tray", "magnet.study"), Designed: ("design", "study"),
+    Assembly: ("cad", "magnet.study"),
+    MeasurementPlan: ("plan", "magnet.study"), Shim: ("shim", "result.study"),
+    SortedBlocks: ("sort", "study"), Tolerance: ("tolerance", "study"),
+    HomogeneityTolerance: ("tolerance", "study"),
+    DemagnetizationMap: ("demagnetization", "magnet.study"),
+    SimulatedCampaign: ("simulate-measurement", "study")}
+"""The command that writes each result too, and where the result has its study."""
 
 
 def provenance(getdp: str | None = None) -> dict[str, str]:
@@ -55,11 +74,12 @@ def write_report(result: object, folder: str | Path) -> Path:
     Parameters
     ----------
     result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
-HomogeneityResult, Forces, MeasurementPlan, FilledTray, Shim, SortedBlocks, \
-Tolerance, DemagnetizationMap or SimulatedCampaign
+HomogeneityResult, Forces, MeasurementPlan, FilledTray, Shim, SortedBlocks, Assembly, \
+Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path
-        Folder for the files; it is made if it does not exist.
+        Folder for the files; it is made if it does not exist. As on the command line, it belongs to
+        one command and one study: results that it holds of these are replaced.
 
     Returns
     -------
@@ -69,7 +89,8 @@ Tolerance, DemagnetizationMap or SimulatedCampaign
     Raises
     ------
     OutputError
-        If a file cannot be written, or another run is using the folder.
+        If a file cannot be written, another run is using the folder, or it holds results of
+        another command or study.
     TypeError
         If ``result`` is of any other type.
 
@@ -78,10 +99,14 @@ Tolerance, DemagnetizationMap or SimulatedCampaign
     >>> import halbach_fe as hf
     >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
     >>> solution = hf.solve(magnet, hf.Session.open("results"))
-    >>> hf.write_report(solution, "results").name
+    >>> hf.write_report(solution, "field").name
     'report.html'
     """
-    with locked_folder(Path(folder)):
+    owner = next((OWNERS[kind] for kind in type(result).__mro__ if kind in OWNERS), None)
+    if owner is None:
+        raise TypeError(f"there is no report for a {type(result).__name__}")
+    command, study = owner
+    with result_folder(Path(folder), f"halbach-fe {command}", attrgetter(study)(result).name):
         return _write(result, folder)
 
 
@@ -143,6 +168,19 @@ def _(result: FilledTray, folder: str | Path) -> Path:
 
 
 @_write.register
+def _(result: Assembly, folder: str | Path) -> Path:
+    write_assembly(result, Path(folder), provenance())
+    return Path(folder) / "assembly.html"
+
+
+@_write.register
+def _(result: Designed, folder: str | Path) -> Path:
+    text = tomlkit.dumps(result.study.model_dump(mode="json", exclude_defaults=True))
+    write_design(result, text, Path(folder), provenance())
+    return Path(folder) / "design.html"
+
+
+@_write.register
 def _(result: MeasurementPlan, folder: str | Path) -> Path:
     write_plan(result.magnet, result, Path(folder))
     return Path(folder) / "plan.html"
@@ -162,7 +200,7 @@ def _(result: SortedBlocks, folder: str | Path) -> Path:
 
 
 @_write.register
-def _(result: Tolerance, folder: str | Path) -> Path:
+def _(result: Tolerance | HomogeneityTolerance, folder: str | Path) -> Path:
     write_tolerance(result, Path(folder))
     return Path(folder) / "tolerance.html"
 

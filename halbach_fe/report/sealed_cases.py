@@ -12,13 +12,86 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy import stats
 
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.summary import EMPTY_CELL
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import fraction
 from halbach_fe.study.model import Study
 
 Confusion = Mapping[tuple[str, tuple[str, ...]], int]
 """Number of cases by the effect that was hidden alone, and by the names of an identified effect and
 its alternatives."""
+
+RATES = {
+    "hidden alone, and named": ("naming_rate_single", "single_cases"),
+    "both of a pair named": ("naming_rate_pairs", "pair_cases"),
+    "clean campaigns with a false name": ("false_alarm_rate", "clean_cases"),
+    "causes outside the catalogue noticed": ("unknown_rate", "outside_cases"),
+    "held-out readings explained afterwards": ("heldout_recovered_rate", "recovered_of"),
+    "control: named with shuffled labels": ("control_naming_rate_shuffled_labels", ""),
+    "control: false alarms without tolerances of the blocks":
+        ("control_false_alarm_rate_without_blocks", "")}
+"""Rates in words, with their own names and those of the numbers of cases."""
+
+LEAST_SHUFFLED, LEAST_ALARMS = 0.2, 0.5
+"""A scoring that calls more shuffled labels right, and cases that alarm a detector without
+tolerances less often, can tell nothing."""
+
+WANTED, FALSE = 0.9, 0.1
+"""Least share of effects that a diagnosis must name to be used, and most false names."""
+
+
+def answer(rates: Mapping[str, float]) -> Answer:
+    """Say how often hidden effects were named, how sure that is, and whether the controls fail."""
+    def share(name: str) -> str:
+        rate, cases = (rates[key] for key in RATES[name])
+        if not cases:
+            return "none tried"
+        low, high = (stats.binomtest(round(rate * cases), round(cases))
+                     .proportion_ci(method="exact"))
+        return (f"{fraction(rate)} of {cases:.0f} (95 % interval {fraction(low)} to "
+                f"{fraction(high)})")
+
+    shuffled, alarms = (rates[RATES[name][0]] for name in list(RATES)[-2:])
+    untried = [name for name, rate in (("shuffled labels", shuffled), (
+        "a detector without tolerances of the blocks", alarms)) if np.isnan(rate)]
+    fooled = shuffled > LEAST_SHUFFLED or alarms < LEAST_ALARMS
+    trust = ("No: a control that must fail does not." if fooled else
+             f"Not wholly: too few cases to try {' and '.join(untried)}, which must fail."
+             if untried else
+             f"Yes: shuffled labels count as named in {fraction(shuffled)} of the cases, and a "
+             f"detector that takes the blocks for perfect raises {fraction(alarms)} false alarms, "
+             "as these controls must.")
+    good = (not rates["naming_rate_single"] < WANTED and not rates["false_alarm_rate"] > FALSE)
+    return Answer(
+        "Does the diagnosis find what is hidden, and only that?",
+        f"Of the effects that were hidden alone and can be detected at all it names "
+        f"{share('hidden alone, and named')}; it names something false in "
+        f"{share('clean campaigns with a false name')} clean campaigns.",
+        f"{trust} The fields are those of other programs than the one that explains them.",
+        "Diagnose a map of your own.", "halbach-fe diagnose STUDY --measurements MAP -o DIR",
+        sound=good and not fooled and not untried)
+
+
+def rate_rows(rates: Mapping[str, float]) -> list[dict[str, str]]:
+    """Return a row of text for each rate."""
+    return [{"what": what,
+             "share": EMPTY_CELL if np.isnan(rates[rate]) else fraction(rates[rate]),
+             "of cases": f"{rates[cases]:.0f}" if cases else EMPTY_CELL}
+            for what, (rate, cases) in RATES.items()]
+
+
+def title_of_hidden(name: str) -> str:
+    """Return an effect in words, with the sensor if it is of one: gain_x is one of Bx."""
+    for effect in catalogue():
+        if effect.name == name:
+            return effect.title + (f" (B{name[-1]})" if name[-2:] in ("_x", "_y", "_z") else "")
+        if effect.name[:-2] == name:
+            return effect.title
+    return name.replace("_", " ")
 
 
 @own_style
@@ -33,7 +106,8 @@ def write_sealed_cases(
     ----------
     study : Study
     results : sequence of mapping
-        Result of each case, with the keys case, named, unknown, chi2_before and chi2_after.
+        Result of each case, with the keys hidden, outside, named, unknown, chi2_before and
+        chi2_after.
     rates : mapping
         Success rates by name.
     reliability : sequence of mapping
@@ -59,12 +133,15 @@ def write_sealed_cases(
             _gap(results), "Chi² per held-out reading of every case, before and after the "
             "diagnosis; the band is 0.9 to 1.1")}
     write_page(folder / "sealed_cases.html", "sealed_cases.html.j2", save(drawn, folder),
-               study=study, cases=len(results),
-               rates=[{"figure": name.replace("_", " "), "value": f"{value:.3g}"}
-                      for name, value in rates.items()],
-               rows=[{"case": case["case"], "identified": ", ".join(
-                   " or ".join(names) for names in case["named"]) or "nothing",
-                   "unknown": case["unknown"] or "", "chi² before": f"{case['chi2_before']:.3g}",
+               study=study, cases=len(results), answer=answer(rates), rates=rate_rows(rates),
+               rows=[{
+                   "hidden": " and ".join(map(title_of_hidden, case["hidden"])) or (
+                       f"outside the catalogue: {case['outside']}" if case["outside"]
+                       else "nothing"),
+                   "named": "; ".join(" or ".join(map(title_of_hidden, names))
+                                      for names in case["named"])
+                   or ("something unknown" if case["unknown"] else "nothing"),
+                   "chi² before": f"{case['chi2_before']:.3g}",
                    "after": f"{case['chi2_after']:.3g}"} for case in results])
 
 
@@ -81,7 +158,7 @@ def _confusion(confusion: Confusion) -> Figure:
     counts = np.zeros((len(hidden), len(columns)))
     for ((truth, _), count), base in zip(confusion.items(), bases, strict=True):
         counts[hidden.index(truth), columns.index(base)] += count
-    figure = Figure(figsize=(3 + 0.22 * len(columns), 2.5 + 0.2 * len(hidden)),
+    figure = Figure(figsize=(4.5 + 0.22 * len(columns), 3.5 + 0.2 * len(hidden)),
                     layout="constrained")
     axis = figure.subplots()
     axis.imshow(np.where(counts, counts, np.nan), cmap="Blues", vmin=0, vmax=counts.max())
@@ -89,8 +166,8 @@ def _confusion(confusion: Confusion) -> Figure:
         axis.text(column, row, f"{counts[row, column]:.0f}", ha="center", va="center", fontsize=7,
                   color="white" if counts[row, column] > counts.max() / 2 else "black")
     axis.set(xlabel="identified", ylabel="hidden")
-    axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
-    axis.set_yticks(range(len(hidden)), hidden, fontsize=7)
+    axis.set_xticks(range(len(columns)), map(title_of_hidden, columns), rotation=90, fontsize=7)
+    axis.set_yticks(range(len(hidden)), map(title_of_hidden, hidden), fontsize=7)
     return figure
 
 

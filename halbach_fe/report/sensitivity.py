@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     IRON,
     POSTERIOR,
@@ -26,6 +28,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import flux_density, fraction
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,28 @@ class Sensitivity:
     information: Mapping[str, tuple[Ints, Floats]]
 
 
+def answer(found: Sensitivity, plans: Mapping[str, Mapping[str, Any]]) -> Answer:
+    """Say how much a reading changes with a block, and which plan of the measurement is best."""
+    name, best = min(plans.items(), key=lambda plan: float(
+        plan[1]["mean_sd_over_study_with_as_many_points"]))
+    same = best["points_with_the_study_information"]
+    said = (f"If a block has 1 % more magnetization, a reading on the circle changes by up to "
+            f"{flux_density(float(found.along.max()))}; if it is turned by 1°, by up to "
+            f"{flux_density(float(found.across.max()))}. The best plan is to measure {name}: "
+            f"{best['points']} positions leave "
+            f"{fraction(float(best['mean_sd_over_study_with_as_many_points']))} of the uncertainty "
+            "that as many on the study's circle leave"
+            + (f", and {same} tell as much as the whole circle." if same else "."))
+    return Answer(
+        "How much does the field tell about the blocks, and where should it be measured?", said,
+        "As far as the study's prior and noise are right, for small changes: the iron is "
+        "linearized about the nominal magnet.",
+        "Plan the measurement of your own magnet.", "halbach-fe plan STUDY -o DIR")
+
+
 @own_style
 def write_sensitivity(
-    magnet: Magnet, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, object]],
+    magnet: Magnet, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Write sensitivity.html, its figures, sensitivity.json and readings.csv.
 
@@ -98,7 +120,7 @@ def write_sensitivity(
             "against the number of points"),
     }, folder)
     write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=magnet.study,
-               found=found, plans=plans)
+               found=found, plans=plans, answer=answer(found, plans))
 
 
 def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:

@@ -14,9 +14,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.homogeneity import ppm, slices_figure
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import plain_homogeneity, slices_figure
 from halbach_fe.report.page import PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
+from halbach_fe.study.shim_tray import ShimTray
 
 LISTED = 12
 """Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
@@ -27,29 +30,44 @@ FEW = 1.2
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 
 
-def verdict(found: FilledTray) -> list[str]:
-    """Return the answer in sentences: what the tray does, with how many magnets, and what next."""
-    region = found.model.region.text
+def answer(found: FilledTray) -> Answer:
+    """Say what the tray does, with how many magnets, and what to do next."""
+    region, tray = found.model.region.text, found.magnet.study.shim_tray
+    question = f"Which magnets in the tray make the field in {region} homogeneous?"
+    measured = "halbach-fe infer STUDY --measurements MAP -o DIR"
     if not found.filled:
-        return [f"Leave the tray empty: none of its magnets makes the field in {region} more "
-                f"homogeneous than {ppm(found.before.rms_range_ppm[1])} ppm rms."]
+        return Answer(
+            question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
+            f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(tray),
+            "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
+            "comes from: its harmonics tell.",
+            "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
-    text = [f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
-            f"the field in {region} deviates by {ppm(after)} ppm rms (95 %: "
-            f"{low} to {high}) in place of {ppm(before)}."]
-    used_up = [name for name, count in found.left.items() if not count]
-    if len(used_up) == len(found.left):
-        text.append("The whole inventory is used: more magnets may do better.")
+    text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
+            f"the field deviates by {ppm(after)} ppm rms (95 %: {low} to {high}) in place of "
+            f"{ppm(before)}.")
+    if all(not count for count in found.left.values()):
+        text += " The whole inventory is used: more magnets may do better."
     if before < FEW * after:
-        text.append("That is hardly less: take larger magnets or more places, or look for what the "
-                    "deviation comes from (halbach-fe homogeneity lists its harmonics).")
-    elif after > 2 * found.after.rms_ppm:
-        text.append("What remains is mostly what the measurement and the strength of the shims "
-                    "leave open: measure again with the tray filled, and fill a second one.")
-    else:
-        text.append("Fill it from shim_tray.csv, then measure again.")
-    return text
+        return Answer(
+            question, f"{text} That is hardly less.", _ranges(tray),
+            "Take larger magnets or more places, or look for what the deviation comes from: its "
+            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
+    if after > 2 * found.after.rms_ppm:
+        return Answer(
+            question, text, "What remains is mostly what the measurement and the strength of the "
+            f"shims leave open. {_ranges(tray)}", "Fill the tray from shim_tray.csv, measure again "
+            "with it, update, and fill a second one.", measured)
+    return Answer(question, text, _ranges(tray),
+                  "Fill the tray from shim_tray.csv, then measure again and update.", measured)
+
+
+def _ranges(tray: ShimTray | None) -> str:
+    """Say what the ranges contain."""
+    shims = (f"{100 * tray.strength_sd:g} % of each shim's strength and {100 * tray.common_sd:g} % "
+             "that all shims share" if tray else "the strength of the shims")
+    return f"As far as the update is right: ranges contain what it leaves open, and {shims}."
 
 
 def rows(found: FilledTray) -> list[dict[str, str]]:
@@ -76,12 +94,9 @@ def homogeneity_rows(found: FilledTray) -> list[dict[str, str]]:
 
 def shim_tray_summary(found: FilledTray) -> dict[str, object]:
     """Return the content of shim_tray.json."""
-    def plain(known: Homogeneity) -> dict[str, object]:
-        return asdict(known) | {"direction": known.direction.tolist()}
-
     return {"study": found.magnet.name, "region": asdict(found.model.region),
             "places": len(found.places_m), "magnets": len(found.filled), "left": found.left,
-            "before": plain(found.before), "after": plain(found.after),
+            "before": plain_homogeneity(found.before), "after": plain_homogeneity(found.after),
             "filled": [{"place": one.place, "position_m": one.position_m,
                         "magnet": one.magnet.name, "from_radius_deg": one.from_radius_deg,
                         "direction_deg": one.direction_deg} for one in found.filled]}
@@ -145,5 +160,5 @@ def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, st
         "after.png": (slices_figure(after, found.after.mean_T), text.format("the filled tray"))},
         folder)
     write_page(folder / "shim_tray.html", "shim_tray.html.j2", pictures, study=found.magnet.study,
-               provenance=provenance, verdict=verdict(found), rows=rows(found),
+               provenance=provenance, answer=answer(found), rows=rows(found),
                fields=homogeneity_rows(found), tray=found.magnet.study.shim_tray)

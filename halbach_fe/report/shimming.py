@@ -14,7 +14,13 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.multipoles import (
+    main_in_words,
+    multipole_figure,
+    reference_summary,
+    reference_text,
+)
 from halbach_fe.report.page import (
     POSTERIOR,
     PUBLISHED,
@@ -24,6 +30,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import counted, probability
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
 
@@ -102,6 +109,36 @@ def _place_text(shim: Shim, number: int) -> str:
     return block.label or f"ring {block.ring} slot {block.slot}"
 
 
+def answer(shim: Shim, result: InferenceResult) -> Answer:
+    """Say which moves are worthwhile and what they gain, and what to do next."""
+    question = "Which blocks should be swapped, turned or replaced?"
+    before, after = (float(np.sqrt(known.expected_square / len(known.orders)))
+                     for known in (shim.before, shim.after))
+    if shim.steps:
+        said = (f"{counted(len(shim.steps), 'move')}: the unwanted multipoles are expected to fall "
+                f"from {before:.3g} to {after:.3g} units of 1e-4 rms, including their uncertainty.")
+    else:
+        said = (f"No move is worthwhile. Leave it as it is: {before:.3g} units of 1e-4 rms, "
+                "including their uncertainty.")
+    if shim.within is not None and shim.limit is not None:
+        first, last = map(probability, shim.within)
+        said += (f" All unwanted multipoles are within {shim.limit:g} units with a probability of "
+                 f"{first} before and {last} after.")
+    ended = f"The search ended because {STOPS[shim.stop]}."
+    if result.disagreement:
+        return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",
+                      "Find out what the study lacks before any block is moved.",
+                      "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
+    return Answer(
+        question, said, f"Yes. Model and map agree. {ended}", *(
+            ("Make the moves in their order, measure again, and update study.shimmed.toml."
+             if shim.shimmed_study else "Make the moves in their order, and measure again.",
+             f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
+             "--measurements MAP -o DIR") if shim.steps else
+            ("See the multipoles of the magnet as it is.",
+             "halbach-fe multipoles STUDY --posterior DIR/posterior.h5 -o DIR")))
+
+
 @own_style
 def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> None:
     """Write shim.json, shim.html and its figures, and study.shimmed.toml.
@@ -130,8 +167,9 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
                 _gain_figure(shim), "Root mean square of the unwanted multipoles after each move, "
                 "including their uncertainty")}
     write_page(folder / "shim.html", "shim.html.j2", save(figures, folder), study=shim.study,
-               shim=shim, summary=summary, moves=move_table(shim), stop=STOPS[shim.stop],
-               reference=reference_text(shim.model), conflict=result.disagreement,
+               shim=shim, summary=summary, moves=move_table(shim), answer=answer(shim, result),
+               reference=reference_text(shim.model),
+               mains=[main_in_words(shim.model, known) for known in (shim.before, shim.after)],
                rows=text_table(before=shim.before, after=shim.after))
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.core.arrays import Floats
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
@@ -16,18 +18,65 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
-    axis_of_points,
     geometry_figure,
     own_style,
     save,
     stacked_axes,
     write_page,
 )
+from halbach_fe.report.point_maps import curve, maps_figure
+from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, ppm
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
 from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
+
+ROUGH = 1e-3
+"""Error of the solver relative to the field above which a solution is not to be used."""
+
+
+def answer(solution: Solution) -> Answer:
+    """Say how strong the field is, how far the solver may be off, and what to do next."""
+    size = np.linalg.norm(solution.flux_density, axis=1)
+    low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
+    equal = flux_density(low, 4) == flux_density(high, 4)
+    said = (f"At the study's {counted(len(size), 'position')} the nominal magnet makes "
+            f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.")
+    of_blocks = ("That is of the magnet as the study states it: what the tolerances of its blocks "
+                 "change is not in it.")
+    if error <= ROUNDING * high:
+        return Answer("How strong is the field?", f"{said} In vacuum that is exact.",
+                      f"Yes: it is a closed form, without a mesh. {of_blocks}",
+                      *_after_an_exact_field(solution))
+    sigma = _smallest_noise(solution)
+    fine = error <= (sigma or ROUGH * high)
+    compared = ("" if not sigma else "Yes: the error is below the noise of the readings, "
+                f"{flux_density(sigma)}. " if fine else
+                f"The error is {decimals(error / sigma, 2)} times the noise of the readings, "
+                f"{flux_density(sigma)}; error bars of what follows include it. ")
+    return Answer(
+        "How strong is the field?",
+        f"{said} Mesh and boundary make a reading wrong by {flux_density(error)} at most "
+        f"({ppm(1e6 * error / high)} ppm), by estimate.", f"{compared}{of_blocks}",
+        "Test that estimate with more meshes." if fine else
+        "See how the error falls with the mesh, then refine mesh.block_size_m.",
+        "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
+
+
+def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
+    """Return the next step, and its command."""
+    if solution.magnet.dimension == 2:
+        return ("See its multipoles, with what the tolerances of the blocks make of them.",
+                "halbach-fe multipoles STUDY -o DIR")
+    return ("See how homogeneous it is, with what the tolerances of the blocks make of it.",
+            "halbach-fe homogeneity STUDY -o DIR")
+
+
+def _smallest_noise(solution: Solution) -> float:
+    """Return the smallest standard deviation of a reading in T; 0 if the study states none."""
+    noise = solution.magnet.study.noise
+    return min((region.sigma_T for region in noise.regions), default=0.0) if noise else 0.0
 
 
 @own_style
@@ -44,8 +93,9 @@ def write_solution_report(
                          "with their magnetization, the iron if there is any, and the study's "
                          "positions"),
         "field.png": (field_figure(solution),
-                      "The field at the study's positions, and the solver's "
-                      "error bar of each reading")}
+                      "The field at the study's positions"
+                      + (", and the solver's error bar of each reading"
+                         if solution.errors.any() and curve(solution.points) else ""))}
     multipoles: list[MultipoleTable] = [
         (model, {"nominal": known}) for model, known in solved_circles(
             solution.magnet, solution.points, solution.flux_density, solution.errors)]
@@ -56,26 +106,52 @@ def write_solution_report(
         study=solution.magnet.study,
         magnet_rows=magnet_rows(solution.magnet),
         multipoles=middle_table(multipoles), provenance=provenance,
-        strongest=float(np.linalg.norm(solution.flux_density, axis=1).max()),
-        error=float(solution.errors.max()),
+        answer=answer(solution), rows=field_table(solution),
         view=view_of_nominal_magnet(
             solution.magnet, field_points(solution.points, solution.flux_density)))
 
 
-def field_figure(solution: Solution) -> Figure:
-    """Components along z, or around the circle, or by number of the point; errors below."""
-    place, label = axis_of_points(solution.points)
-    seen, _ = axis_of_points(solution.observation.positions)
-    figure, (top, bottom) = stacked_axes(2, [2, 1])
-    order = np.argsort(place, kind="stable")
-    for component, colour, column in zip(COMPONENTS, COLOURS, solution.flux_density.T, strict=True):
-        top.plot(place[order], column[order], ".", ms=3, color=colour, label=f"B{component}")
-    top.set_ylabel("B in T")
-    top.legend(ncols=3)
-    bottom.plot(seen, solution.errors, ".", ms=3, color=MEASURED)
-    if solution.errors.any():  # blocks in vacuum have none
-        bottom.set_yscale("log")
-    bottom.set_ylabel("error bar in T")
-    bottom.set_xlabel(label)
-    return figure
+def field_table(solution: Solution) -> list[dict[str, str]]:
+    """Return rows of text: where the field is strongest and weakest, its mean, and its error."""
+    size = np.linalg.norm(solution.flux_density, axis=1)
+    nothing = max(float(solution.errors.max()), ROUNDING * float(size.max()))
+    components = COMPONENTS[:solution.magnet.dimension]
 
+    def row(what: str, field: Floats, where: str = "") -> dict[str, str]:
+        seen = np.where(np.abs(field) > nothing, field, 0.0)
+        return {"B": what, "|B|": flux_density(float(np.linalg.norm(seen)), 5)} | {
+            f"B{name}": flux_density(float(value), 5)
+            for name, value in zip(components, seen, strict=False)} | {"at": where}
+
+    def at(number: int) -> str:
+        point = 1e3 * solution.points[number].round(9) + 0.0
+        return "({}) mm".format(", ".join(f"{one:.4g}" for one in point))
+
+    ends = {"strongest": int(np.argmax(size)), "weakest": int(np.argmin(size))}
+    return [*(row(what, solution.flux_density[number], at(number))
+              for what, number in ends.items()),
+            row("mean", solution.flux_density.mean(axis=0))]
+
+
+def field_figure(solution: Solution) -> Figure:
+    """Draw the components along a line or a circle, with the error bars below, or as maps."""
+    if (along := curve(solution.points)) is None:
+        return maps_figure(solution.points, {
+            f"B{name}": 1e3 * column
+            for name, column in zip(COMPONENTS, solution.flux_density.T, strict=True)}, "mT")
+    place, label = along
+    bars = curve(solution.observation.positions)
+    below = bars if solution.errors.any() else None  # blocks in vacuum have none
+    figure, (top, *others) = stacked_axes(2 if below else 1, [2, 1] if below else [1])
+    order = np.argsort(place, kind="stable")
+    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], COLOURS,
+                                         solution.flux_density.T, strict=False):
+        top.plot(place[order], 1e3 * column[order], ".-", ms=4, lw=0.8, color=colour,
+                 label=f"B{component}")
+    top.set_ylabel("B in mT")
+    top.legend(ncols=3)
+    if below:
+        others[0].semilogy(below[0], 1e6 * solution.errors, ".", ms=3, color=MEASURED)
+        others[0].set_ylabel("error bar in µT")
+    (others or [top])[-1].set_xlabel(label)
+    return figure

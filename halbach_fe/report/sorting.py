@@ -3,41 +3,146 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.files import write_text
-from halbach_fe.design.sorting import SortedBlocks
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
-from halbach_fe.report.multipoles import multipole_figure, reference_summary, reference_text
+from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
+from halbach_fe.report.multipoles import (
+    main_in_words,
+    multipole_figure,
+    reference_summary,
+    reference_text,
+)
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
-from halbach_fe.response.multipoles import Multipoles, plain, text_table
+from halbach_fe.report.words import counted, ppm
+from halbach_fe.response.deviations import DeviationModel
+from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 QUANTILES = (0.01, 0.5, 0.99)
 """Quantiles of the rms of random orders that sort.json states."""
 
 
 def sort_summary(found: SortedBlocks, limit: float | None) -> dict[str, object]:
-    """Return the content of sort.json; the rms values are of the |c_n| of the mean."""
-    unit = found.model.unit
+    """Return the content of sort.json; rms values are those of the mean."""
+    unit = "units" if found.fields is None else "ppm"
     return {
-        "study": found.study.name, "reference": reference_summary(found.model, limit),
+        "study": found.study.name, **_content(found, limit),
         "blocks": len(found.table), "left_over": found.left_over,
-        "table_order": found.own_order,
-        "sorted": plain(found.best, unit), "unsorted": plain(found.numbered, unit),
-        "rms_sorted_units": _rms(found.best), "rms_unsorted_units": _rms(found.numbered),
+        "table_order": found.own_order, "turned": turn_rows(found),
+        f"rms_sorted_{unit}": found.best.rms_of_mean,
+        f"rms_unsorted_{unit}": found.numbered.rms_of_mean,
         "random_orders": len(found.random),
-        "rms_random_units": dict(zip(map(str, QUANTILES), np.quantile(
+        f"rms_random_{unit}": dict(zip(map(str, QUANTILES), np.quantile(
             found.random, QUANTILES).tolist(), strict=True)),
-        "best_random_units": float(found.random.min()),
+        f"best_random_{unit}": float(found.random.min()),
     }
 
 
+def _content(found: SortedBlocks, limit: float | None) -> dict[str, object]:
+    """Return multipoles or homogeneity, and what they refer to, as entries of sort.json."""
+    if isinstance(found.model, DeviationModel) and found.fields is not None:
+        best, own = found.fields
+        return {"region": asdict(found.model.homogeneity.region), "limit_ppm": limit,
+                "sorted": plain_homogeneity(best), "unsorted": plain_homogeneity(own)}
+    assert isinstance(found.model, MultipoleModel)
+    unit = found.model.unit
+    return {"reference": reference_summary(found.model, limit),
+            "sorted": plain(found.best, unit), "unsorted": plain(found.numbered, unit)}
+
+
+def turn_rows(found: SortedBlocks) -> list[dict[str, object]]:
+    """Return serial number, place and turn of the blocks that are turned, as plain data."""
+    return [{"serial": found.table.serial[row], "ring": int(found.table.ring[row]),
+             "slot": int(found.table.slot[row]), "turn_deg": found.turn_deg[row].tolist()}
+            for row in np.flatnonzero(found.turn_deg.any(axis=1)).tolist()]
+
+
+def turn_table(found: SortedBlocks) -> list[dict[str, str]]:
+    """Return the rows of the table of turned blocks, as text."""
+    rows = []
+    for row in np.flatnonzero(found.turn_deg.any(axis=1)).tolist():
+        vector = found.turn_deg[row]
+        angle = float(np.linalg.norm(vector))
+        axis = ", ".join(f"{part:.3g}" for part in vector / angle)
+        rows.append({"block": found.table.serial[row], "ring": str(found.table.ring[row]),
+                     "slot": str(found.table.slot[row]),
+                     "turn": f"{angle:.0f}° about ({axis}) of its own axes"})
+    return rows
+
+
+def table_title(found: SortedBlocks) -> str:
+    """Return the title of `order_table`."""
+    return ("Multipoles in units of 1e-4" if not isinstance(found.model, DeviationModel) else
+            f"Deviations of |B| in {found.model.homogeneity.region.text}")
+
+
 def order_table(found: SortedBlocks) -> list[dict[str, str]]:
-    """Return the rows of the table of multipoles, as text."""
+    """Return the rows of the table of multipoles or fields, as text."""
+    if found.fields is not None:
+        best, own = found.fields
+        return homogeneity_rows({found.own_order: own, "sorted": best})
     return text_table(**{found.own_order: found.numbered, "sorted": found.best})
+
+
+def answer(found: SortedBlocks) -> Answer:
+    """Say what sorting gains over the table's order and over chance, and what to do next."""
+    best, own = found.best.rms_of_mean, found.numbered.rms_of_mean
+    low, high = np.quantile(found.random, QUANTILES[::2])
+    if isinstance(found.model, DeviationModel):
+        region = found.model.homogeneity.region.text
+        what, unit, text = f"the deviation of |B| in {region} is", "ppm rms", ppm
+        sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
+            *(ppm(each.peak_to_peak_ppm) for each in found.fields))
+    else:
+        what, unit, sizes = "the unwanted multipoles are", "units of 1e-4 rms", ""
+        text = "{:.3g}".format
+    question = "Which block goes into which slot?"
+    left = ("" if not found.left_over else f" {counted(found.left_over, 'block')} "
+            f"{'is' if found.left_over == 1 else 'are'} left over.")
+    turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
+              f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
+    if not found.has_choice and not found.turned:
+        return Answer(
+            question, f"Each into the only slot that it fits: there is no choice, and {what} "
+            f"{text(best)} {unit}.", "Blocks go only into slots of their own type, and here every "
+            "slot has its own.", "Let slots take the same blocks by prior.types of the study"
+            f"{types_in_words(found.alike)}, or measure spare blocks, and sort again.",
+            "halbach-fe sort STUDY BLOCKS -o DIR")
+    spread, prior = _uncertainty(found), found.study.prior
+    more = "".join(words for words, there in (
+        (", of the calibration of the coil", prior.common_mode_sd > 0),
+        (" and of the mounting", prior.mounting_sd_deg > 0)) if there)
+    return Answer(
+        question,
+        f"As blocks.sorted.csv says: {what} then {text(best)} {unit}{sizes}, instead of "
+        f"{text(own)} for the blocks {found.own_order}, and {text(low)} to {text(high)} for 98 % "
+        f"of random orders.{left}{turned}",
+        f"The uncertainty of the measured moments{more} adds {text(spread)} {unit}, whatever the "
+        f"order{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
+        "Assemble the magnet in this order, measure it, and update the blocks.",
+        "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")
+
+
+def _ordered(found: SortedBlocks) -> str:
+    """Say what no order can change: the field of blocks that are all as ordered."""
+    if not isinstance(found.model, DeviationModel):
+        return ""
+    values = found.model.units(found.model.offset + found.model.matrix @ found.model.nominal)
+    return (f" With all blocks as ordered the deviation would be "
+            f"{ppm(float(np.linalg.norm(values)))} ppm rms, by the design of the rings.")
+
+
+def _uncertainty(found: SortedBlocks) -> float:
+    """Return the rms, in the unit of the answer, that the uncertainty of the blocks makes."""
+    return float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
 
 
 @own_style
@@ -46,24 +151,42 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
     write_blocks(found.table, folder / "blocks.sorted.csv")
     summary = sort_summary(found, limit)
     write_text(folder / "sort.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({
-        "sort_multipoles.png": (
+    if found.turned:
+        with atomic(folder / "sort.csv") as temporary:
+            rows = np.flatnonzero(found.turn_deg.any(axis=1)).tolist()
+            write_csv({"serial": [found.table.serial[row] for row in rows],
+                       "ring": found.table.ring[rows], "slot": found.table.slot[rows],
+                       **dict(zip(("turn_x_deg", "turn_y_deg", "turn_z_deg"),
+                                  found.turn_deg[rows].T, strict=True))}, {
+                "content": "blocks that are turned in their slots: rotation vectors along own axes"
+            }, temporary)
+    figures = {"sort_orders.png": (
+        _random_orders_figure(found), f"Histogram of the root mean square of {_axis_text(found)} "
+        f"for {len(found.random)} random orders of the blocks; the lines are the order of the "
+        "table and the sorted blocks")}
+    if not isinstance(found.model, DeviationModel):
+        figures = {"sort_multipoles.png": (
             multipole_figure({found.own_order: found.numbered, "sorted": found.best}, limit),
             "Unwanted multipoles of the blocks in the order of the table and of the sorted blocks, "
-            "normal (left) and skew (right); bars are two standard deviations"),
-        "sort_orders.png": (
-            _random_orders_figure(found), "Histogram of the root mean square of the unwanted "
-            f"multipoles for {len(found.random)} random orders of the blocks; the lines are the "
-            "order of the table and the sorted blocks"),
-    }, folder)
-    write_page(folder / "sort.html", "sort.html.j2", pictures, found=found, study=found.study,
-               summary=summary, reference=reference_text(found.model), rows=order_table(found),
-               spread=float(np.sqrt(np.sum(found.best.root**2) / len(found.best.orders))))
+            "normal (left) and skew (right); bars are two standard deviations")} | figures
+    write_page(folder / "sort.html", "sort.html.j2", save(figures, folder), found=found,
+               study=found.study, answer=answer(found), rows=order_table(found),
+               turned=turn_table(found), title=table_title(found), text=_convention(found))
 
 
-def _rms(known: Multipoles) -> float:
-    """Return the rms of the |c_n| of the mean, in units."""
-    return float(np.sqrt(np.mean(known.sizes**2)))
+def _convention(found: SortedBlocks) -> str:
+    """Return sentences about the table of the page."""
+    if isinstance(found.model, DeviationModel):
+        return f"{SIZES} Ranges contain the uncertainty of the measured blocks."
+    return (f"{reference_text(found.model)} ± is the standard deviation, including the error of "
+            f"the solver. Main multipole of the sorted blocks: "
+            f"{main_in_words(found.model, found.best)}.")
+
+
+def _axis_text(found: SortedBlocks) -> str:
+    """Return what is sorted for."""
+    return ("the deviation of |B| in ppm" if isinstance(found.model, DeviationModel)
+            else "the unwanted multipoles in units of 1e-4")
 
 
 def _random_orders_figure(found: SortedBlocks) -> Figure:
@@ -71,8 +194,8 @@ def _random_orders_figure(found: SortedBlocks) -> Figure:
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
-    axis.axvline(_rms(found.numbered), color=PRIOR, lw=2, ls="--", label=found.own_order)
-    axis.axvline(_rms(found.best), color=POSTERIOR, lw=2, label="sorted")
-    axis.set(xlabel="rms of |c$_n$| in units", ylabel="random orders", xlim=(0, None))
+    axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
+    axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")
+    axis.set(xlabel=f"rms of {_axis_text(found)}", ylabel="random orders", xlim=(0, None))
     axis.legend()
     return figure

@@ -10,14 +10,24 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
-from halbach_fe.design.tolerance import QUANTILES, Tolerance
-from halbach_fe.report.multipoles import reference_summary, reference_text
+from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance, Tolerance
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity_tolerance import (
+    ENOUGH,
+    homogeneity_quantiles,
+    homogeneity_tolerance_answer,
+    homogeneity_tolerance_summary,
+    write_homogeneity_tolerance,
+)
+from halbach_fe.report.multipoles import main_in_words, reference_summary, reference_text
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.response.multipoles import plain
 
 
-def tolerance_summary(found: Tolerance) -> dict[str, object]:
+def tolerance_summary(found: Tolerance | HomogeneityTolerance) -> dict[str, object]:
     """Return the content of tolerance.json."""
+    if isinstance(found, HomogeneityTolerance):
+        return homogeneity_tolerance_summary(found)
     shares = found.shares
     return {
         "study": found.study.name, "reference": reference_summary(found.model, found.limit),
@@ -36,8 +46,17 @@ def _by_quantile(values: Floats) -> dict[str, float]:
     return dict(zip(map(str, QUANTILES), values.tolist(), strict=True))
 
 
-def quantile_table(found: Tolerance) -> list[dict[str, str]]:
-    """Return the rows of the table of multipoles, as text, one for each order n."""
+def table_title(found: Tolerance | HomogeneityTolerance) -> str:
+    """Return the title of `quantile_table`."""
+    return (f"Deviations of |B| in {found.model.region.text}"
+            if isinstance(found, HomogeneityTolerance) else
+            "Multipoles |c_n| in units of 1e-4")
+
+
+def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, str]]:
+    """Return the rows of the table as text: of multipoles one for each order n."""
+    if isinstance(found, HomogeneityTolerance):
+        return homogeneity_quantiles(found)
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
@@ -51,9 +70,38 @@ def quantile_table(found: Tolerance) -> list[dict[str, str]]:
     return rows
 
 
+def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
+    """Say how large the multipoles of the magnets are, how many meet the limit, and what next."""
+    if isinstance(found, HomogeneityTolerance):
+        return homogeneity_tolerance_answer(found)
+    largest = found.sizes.max(axis=1)
+    half, most = np.quantile(largest, (0.5, 0.95))
+    worst = found.model.orders[int(np.argmax(found.quantiles[1]))]
+    said = (f"Half of the magnets have all unwanted multipoles below {half:.3g} units of 1e-4, "
+            f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
+    share, prior = found.share, found.study.prior
+    if share is not None:
+        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+                f"have all unwanted multipoles within {found.limit:g} units. {said}")
+    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
+               if prior.mounting_sd_deg > 0 else "")
+    step = (("Sort measured blocks into their slots before assembly: that is better than chance.",
+             "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
+            ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
+             "halbach-fe infer STUDY --measurements MAP -o DIR"))
+    return Answer(
+        "Which multipoles do the tolerances of the blocks make?", said,
+        f"As far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % and "
+        f"{prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that those "
+        f"tolerances come on top. {len(found.sizes)} magnets were drawn.", *step)
+
+
 @own_style
-def write_tolerance(found: Tolerance, folder: Path) -> None:
+def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> None:
     """Write tolerance.json, tolerance.html and its figures."""
+    if isinstance(found, HomogeneityTolerance):
+        write_homogeneity_tolerance(found, folder)
+        return
     summary = tolerance_summary(found)
     write_text(folder / "tolerance.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
@@ -65,8 +113,8 @@ def write_tolerance(found: Tolerance, folder: Path) -> None:
             "unwanted multipole is below a limit"),
     }, folder)
     write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
-               study=found.study, summary=summary, reference=reference_text(found.model),
-               rows=quantile_table(found))
+               study=found.study, answer=answer(found), reference=reference_text(found.model),
+               rows=quantile_table(found), main=main_in_words(found.model, found.known))
 
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:

@@ -100,16 +100,16 @@ def _alternative(text: str) -> str:
     return f"{said} in map {where}" if where else said
 
 
-def suspicion_sentences(suspicion: Suspicion, titles: dict[str, str]) -> list[str]:
-    """Say what is suspected, with its odds, and what would decide."""
+def suspicion_in_words(suspicion: Suspicion, titles: dict[str, str]) -> str:
+    """Say what is suspected, with its odds."""
     place = place_in_words(suspicion.hypothesis.place)
     first = titles.get(suspicion.effects[0], suspicion.effects[0]) + (f", {place}" if place else "")
     odds = suspicion.probability / max(1 - suspicion.probability, 1e-9)
     others = [f"{titles.get(name, name)} ({100 * share:.0f} %)"
               for name, share in zip(suspicion.effects[1:], suspicion.shares[1:], strict=True)]
     together = f", or else {', '.join(others)}" if others else ""
-    return [f"Suspected with a probability of {100 * suspicion.probability:.0f} % (odds {odds:.1f} "
-            f": 1), which is too little to name it: {first}{together}.", more_readings(suspicion)]
+    return (f"Suspected with a probability of {100 * suspicion.probability:.0f} % (odds {odds:.1f} "
+            f": 1), which is too little to name it: {first}{together}.")
 
 
 def more_readings(suspicion: Suspicion) -> str:

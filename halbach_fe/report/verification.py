@@ -13,8 +13,9 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_table import magnet_rows
-from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
+from halbach_fe.report.magnet_view_3d import ViewPoints, field_points, view_of_nominal_magnet
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -29,6 +30,7 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
+from halbach_fe.report.words import ROUNDING, decimals, flux_density, ppm
 from halbach_fe.response.discretization_error import REFINEMENT
 from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, STEPS, Verification
 
@@ -37,40 +39,64 @@ MARKERS = ("v", "^", "o", ".", "s", "x")
 
 
 def difference_table(found: Verification) -> list[dict[str, str]]:
-    """Return rows of text: the change of the field for each change of the model, and the error."""
-    def row(what: str, pointwise: float, fourier: float | None) -> dict[str, str]:
-        return {"change": what, "pointwise": f"{pointwise:.1e}",
-                "Fourier": "" if fourier is None else f"{fourier:.1e}"}
+    """Return rows of text: the change of the field for each change of the model, and the error, in
+    ppm of the largest field; none if the field is exact.
+    """
+    if found.error_pointwise < ROUNDING:
+        return []
 
+    def row(what: str, pointwise: float, fourier: float | None) -> dict[str, str]:
+        return {"change": what, "pointwise in ppm": ppm(1e6 * pointwise)} | (
+            {} if fourier is None else {"Fourier in ppm": ppm(1e6 * fourier)})
+
+    regions = found.differences[0].by_region
+    several = regions if len(regions) > 1 else ()  # the only one is the whole map
     rows = [row(difference.what, difference.pointwise, difference.fourier)
-            | {name: f"{value:.1e}" for name, value in difference.by_region.items()}
+            | {f"{name} in ppm": ppm(1e6 * difference.by_region[name]) for name in several}
             for difference in found.differences]
     rows.append(row(f"estimated error (order {found.order:.1f})", found.error_pointwise,
-                    found.error_fourier) | dict.fromkeys(found.differences[0].by_region, ""))
+                    found.error_fourier) | {f"{name} in ppm": "" for name in several})
     return rows
 
 
-def verification_verdict(magnet: Magnet, found: Verification) -> str:
-    """Return sentences that state the field's estimated error and compare it with the noise."""
-    error = found.error_pointwise * found.main_field_T
-    if not error:
-        return ("No finite elements are needed: the field is the exact one of the blocks in "
-                "vacuum.")
-    text = (f"At the study's positions the estimated error of B is {error:.1e} T at most, "
-            f"{found.error_pointwise:.1e} of the largest field at these positions "
-            f"({found.main_field_T:.4g} T).")
-    if magnet.study.noise is not None and magnet.study.noise.regions:
-        sigma = min(region.sigma_T for region in magnet.study.noise.regions)
-        fourier = magnet.study.observation.quantity == "fourier_coefficients"
-        own = found.error_fourier if fourier else found.error_pointwise
-        if own is not None:
-            text += (f" The error of a {'Fourier coefficient' if fourier else 'reading'} is "
-                     f"{own * found.main_field_T / sigma:.2g} of the smallest noise sd in the "
-                     f"study ({sigma:.1e} T).")
-    if found.order <= FLATTEST:
-        text += (" The last refinement does not change the field less than the one before: the "
-                 "estimate is rough, and the mesh should be finer.")
-    return text
+def answer(found: Verification) -> Answer:
+    """Say how far the computed field is off, whether that matters, and what to do next."""
+    question = "How far is the computed field off?"
+    error, main = found.error_pointwise * found.main_field_T, found.main_field_T
+    measure = ("Measure the magnet, and update its blocks with the map.",
+               "halbach-fe infer STUDY --measurements MAP -o DIR")
+    if found.error_pointwise < ROUNDING:
+        return Answer(question, "Not at all: no finite elements are needed, the field is the exact "
+                      f"one of the blocks in vacuum ({flux_density(main, 4)} at most).",
+                      "Yes, to the rounding of the computer: it is a closed form.", *measure)
+    said = (f"At the study's positions B is off by {flux_density(error)} at most, by estimate. "
+            f"That is {ppm(1e6 * found.error_pointwise)} ppm of the largest field there "
+            f"({flux_density(main, 4)}).")
+    rough = found.order <= FLATTEST
+    noisy, noise = _beside_the_noise(found)
+    trust = ("No: the last refinement does not change the field less than the one before. The "
+             "estimate is rough, and the mesh should be finer." if rough else
+             f"Yes: the field converges as it should, with order {found.order:.1f} in the element "
+             "size.")
+    finer = (f"Make mesh.block_size_m smaller (elements are now "
+             f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
+             "halbach-fe verify STUDY -o DIR")
+    return Answer(question, said, " ".join(filter(None, (trust, noise))),
+                  *(finer if rough or noisy else measure), sound=not rough)
+
+
+def _beside_the_noise(found: Verification) -> tuple[bool, str]:
+    """Tell whether the error is above the noise of the readings, and say how they compare."""
+    study = found.magnet.study
+    fourier = study.observation.quantity == "fourier_coefficients"
+    own = found.error_fourier if fourier else found.error_pointwise
+    if study.noise is None or not study.noise.regions or own is None:
+        return False, ""
+    sigma = min(region.sigma_T for region in study.noise.regions)
+    ratio = own * found.main_field_T / sigma
+    return ratio > 1, (
+        f"The error of a {'Fourier coefficient' if fourier else 'reading'} is {decimals(ratio, 2)} "
+        f"times the smallest noise in the study ({flux_density(sigma)}).")
 
 
 def error_basis(found: Verification) -> str:
@@ -105,7 +131,7 @@ def write_verification(
     figures = {}
     if found.changes[:STEPS].any():
         figures["verification_convergence.png"] = _convergence_figure(found), (
-            "Relative change of the field against element size, both logarithmic: change by the "
+            "Change of the field against element size, both logarithmic: change by the "
             "next finer mesh with the slope of the order, estimated error of the study's own "
             "mesh, and for comparison the changes by a boundary farther away and by another "
             "formulation")
@@ -119,11 +145,12 @@ def write_verification(
         folder / "verification.html", "verification.html.j2", save(figures, folder),
         study=magnet.study, magnet_rows=magnet_rows(magnet),
         provenance=provenance, found=found, rows=difference_table(found), basis=error_basis(found),
-        verdict=verification_verdict(magnet, found), refinement=REFINEMENT, flattest=FLATTEST,
-        view=view_of_nominal_magnet(magnet, ViewPoints(
-            found.points, change, "positions", "change by a<br>finer mesh in T",
-            "a finer mesh changes B by %{customdata:.1e} T",
-            (float(change.min()), float(change.max())))))
+        main_field=flux_density(found.main_field_T, 4), answer=answer(found),
+        refinement=REFINEMENT, view=view_of_nominal_magnet(
+            magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
+                found.points, 1e6 * change, "positions", "change by a<br>finer mesh in µT",
+                "a finer mesh changes B by %{customdata:.3g} µT",
+                (1e6 * float(change.min()), 1e6 * float(change.max())))))
 
 
 def _convergence_figure(found: Verification) -> Figure:
@@ -132,25 +159,26 @@ def _convergence_figure(found: Verification) -> Figure:
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
     sizes = size * np.array([REFINEMENT**2, REFINEMENT, 1.0])
-    steps = np.array([difference.pointwise for difference in found.differences[:STEPS]])
+    steps = 1e6 * np.array([difference.pointwise for difference in found.differences[:STEPS]])
     line = size * np.array([REFINEMENT**2, 1 / REFINEMENT])
     axis.plot(sizes, steps, "o", color=POSTERIOR, label="change by the next finer mesh")
     axis.plot(line, steps[-1] * (line / size)**found.order, "-", color=POSTERIOR, lw=0.8,
               label=f"order {found.order:.1f}")
-    axis.plot(size, found.error_pointwise, "*", ms=12, color=PRIOR,
+    axis.plot(size, 1e6 * found.error_pointwise, "*", ms=12, color=PRIOR,
               label="estimated error of the study's mesh")
     for difference, style, colour in zip(found.differences[STEPS:], ("--", ":", "-."),
                                          (PUBLISHED, SECOND, MEASURED), strict=False):
         if difference.pointwise > 0:
-            axis.axhline(difference.pointwise, ls=style, color=colour,
+            axis.axhline(1e6 * difference.pointwise, ls=style, color=colour,
                          label=difference.what.replace("_", " "))
     axis.set(xscale="log", yscale="log", xlabel="element size at the magnet in mm",
-             ylabel="change of B over the largest field")
+             ylabel="change of B in ppm of the largest field")
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT, REFINEMENT**2]))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3, which="both")
-    axis.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize="small")
+    figure.legend(loc="outside upper center", ncols=2, fontsize="small")
     return figure
 
 
@@ -161,8 +189,9 @@ def _change_figure(found: Verification) -> Figure:
     for difference, change, colour, marker in zip(
             found.differences, found.changes, COLOURS, MARKERS, strict=False):
         seen = change > 0
-        axis.semilogy(place[seen], change[seen], marker, ms=4, color=colour,
+        axis.semilogy(place[seen], 1e6 * change[seen], marker, ms=4, color=colour,
                       label=difference.what.replace("_", " "))
-    axis.set(xlabel=label, ylabel="|change of B| in T")
+    axis.set(xlabel=label, ylabel="|change of B| in µT")
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     figure.legend(loc="outside upper center", ncols=2, fontsize="small")
     return figure

@@ -7,16 +7,58 @@ import numpy as np
 from halbach_fe.diagnosis.summary import EMPTY_CELL, block_in_words
 from halbach_fe.geometry.blocks import MagnetBlock
 
-SMALL_T = 1e-4
-"""Flux density below which texts and tables give it in µT."""
+SMALL_T, LARGE_T = 1e-4, 1.0
+"""Flux density below which texts and tables give it in µT, and from which they give it in T."""
+
+ROUNDING = 1e-11
+"""Fraction of a field below which its error is the rounding of the computer."""
 
 
-def flux_density(value: float) -> str:
-    """Format a flux density in T as mT, or as µT if it is small."""
+def flux_density(value: float, digits: int = 3) -> str:
+    """Format a flux density in T as mT, or as T or µT if it is large or small."""
     if np.isnan(value):
         return EMPTY_CELL
-    size, unit = (1e3 * value, "mT") if abs(value) >= SMALL_T else (1e6 * value, "µT")
-    return f"{size:.3g}\u00a0{unit}"
+    size, unit = ((value, "T") if abs(value) >= LARGE_T else (1e3 * value, "mT")
+                  if abs(value) >= SMALL_T or not value else (1e6 * value, "µT"))
+    return f"{decimals(size, digits)}\u00a0{unit}"
+
+
+def decimals(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, without an exponent; 0 if it is tiny."""
+    if abs(value) < 1e-6:
+        return "0"
+    text = f"{value:.{digits}g}"
+    return text if "e" not in text else f"{value:.0f}" if abs(value) > 1 else f"{value:.7f}"
+
+
+def with_error(value: float, sd: float) -> str:
+    """Return a number and its standard deviation, with two digits of the latter."""
+    if not abs(sd) > ROUNDING * abs(value):
+        return f"{value:.6g}"
+    places = int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))
+    return f"{value:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
+
+
+def ppm(value: float) -> str:
+    """Return a number of ppm as text, without an exponent."""
+    return (f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000
+            else "0" if abs(value) < 1e-3 else f"{value:.3g}")
+
+
+def probability(share: float) -> str:
+    """Return a probability in per cent, without claiming certainty."""
+    return ("less than 0.1\u00a0%" if share < 1e-3 else "more than 99.9\u00a0%"
+            if share > 0.999 else f"{100 * share:.3g}\u00a0%")
+
+
+def p_value(value: float) -> str:
+    """Return a p-value as text, without an exponent."""
+    return "less than 0.0001" if value < 1e-4 else f"{value:.2g}"
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return a number and its noun: 1 move, 2 moves."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def place_of(block: MagnetBlock) -> str:

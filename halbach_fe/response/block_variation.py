@@ -12,6 +12,7 @@ is neglected, some 5 % of a variation that is small itself.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -115,27 +116,38 @@ class Variations:
 
     def readings(self, observation: Observation, rows: slice) -> Floats:
         """Return some readings (k, amplitudes) in T per amplitude."""
-        seen, operator = observation.part(rows)
-        fields = self.fields(observation.points[seen])
-        return np.asarray(operator @ fields.reshape(-1, fields.shape[-1]))
+        found = []
+        for some in self._shares(range(len(observation))[rows]):
+            seen, operator = observation.part(slice(some.start, some.stop))
+            points = np.ascontiguousarray(observation.points[seen], float)
+            by_part = self.interaction.readings(points)
+            # each sensor reads one component: two thirds of the field need no sum over the parts
+            found.append(self._of_amplitudes(operator @ by_part.reshape(3 * len(points), -1)))
+        return np.concatenate(found)
 
     def fields(self, points: Floats) -> Floats:
         """Return B (k, 3, amplitudes) in T per amplitude at points (k, 3) in m."""
-        cells = self.interaction.cells
-        ends = np.cumsum([0, *(each.shape[-1] for each in self.polarization)])
-        found = np.empty((len(points), 3, ends[-1]))
-        step = max(1, AT_ONCE // (9 * cells.weights.size))
-        for first in range(0, len(points), step):
+        found = []
+        for some in self._shares(range(len(points))):
             by_part = self.interaction.readings(
-                np.ascontiguousarray(points[first:first + step], float))
-            flat = by_part.reshape(3 * len(by_part), -1)
-            columns = flat.shape[1] // len(cells)  # per cell
-            for number, polarization in enumerate(self.polarization):
-                mine = slice(columns * self.starts[number], columns * self.starts[number + 1])
-                found[first:first + step, :, ends[number]:ends[number + 1]] = (
-                    flat[:, mine] @ polarization.reshape(-1, polarization.shape[-1])
-                ).reshape(len(by_part), 3, -1)
-        return found
+                np.ascontiguousarray(points[some.start:some.stop], float))
+            found.append(self._of_amplitudes(by_part.reshape(3 * len(by_part), -1)).reshape(
+                len(by_part), 3, -1))
+        return np.concatenate(found)
+
+    def _shares(self, every: range) -> Iterator[range]:
+        """Yield parts of a range for which the fields of all parts of cells fit into memory."""
+        step = max(1, AT_ONCE // (9 * self.interaction.cells.weights.size))
+        return (every[first:first + step] for first in range(0, len(every), step))
+
+    def _of_amplitudes(self, by_part: Floats) -> Floats:
+        """Return values (r, amplitudes) per amplitude of those (r, parts 3) per polarization."""
+        columns = by_part.shape[1] // len(self.interaction.cells)  # per cell
+        return np.hstack([
+            by_part[:, columns * first:columns * last] @ polarization.reshape(
+                -1, polarization.shape[-1])
+            for first, last, polarization in zip(
+                self.starts[:-1], self.starts[1:], self.polarization, strict=True)])
 
     def field(self, amplitudes: Floats, points: Floats) -> Floats:
         """Return B (n, 3) in T of all variations together at points (n, 3) in m.

@@ -15,6 +15,7 @@ after.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 from typing import Literal
@@ -25,6 +26,8 @@ from scipy.special import lpmv, roots_jacobi
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.numbers import check_number
+from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import Response, response_matrix
@@ -67,6 +70,9 @@ NAMES = {(1, 0, "a"): "Z", (1, 1, "a"): "X", (1, 1, "b"): "Y", (2, 0, "a"): "Z2"
 """Names of shim coils for some harmonics, by degree, order, and letter."""
 
 
+SHAPES = ("sphere", "ellipsoid", "cylinder")
+
+
 @dataclass(frozen=True)
 class Region:
     """A sphere, an ellipsoid, or a cylinder along z.
@@ -90,12 +96,44 @@ class Region:
     half_axes_m: tuple[float, float, float]
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        """Refuse what is no region; StudyError."""
+        if self.shape not in SHAPES:
+            raise StudyError(must_be("shape", "a region", f"one of {', '.join(SHAPES)}",
+                                     f"'{self.shape}'"))
+        for name, values in (("half_axes_m", self.half_axes_m), ("centre_m", self.centre_m)):
+            if len(values) != 3:
+                raise StudyError(must_be(name, "a region", "three numbers", str(len(values))))
+            for value in values:
+                check_number(name, "a region", value)
+        if min(self.half_axes_m) <= 0:
+            raise StudyError(must_be("half_axes_m", "a region", "above 0",
+                                     f"{min(self.half_axes_m):g}"))
+
     @classmethod
     def sphere(
         cls, radius_m: float, centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> Region:
         """Return the sphere of a radius in m."""
         return cls("sphere", (radius_m, radius_m, radius_m), centre_m)
+
+    @classmethod
+    def of(
+        cls, sphere_m: float | None, ellipsoid_m: Sequence[float] | None,
+        cylinder_m: Sequence[float] | None, centre_m: Sequence[float],
+    ) -> Region | None:
+        """Return the region of a study or of the command line; None if no shape is given.
+
+        A sphere is given by its radius, an ellipsoid by its half axes, a cylinder by radius and
+        length, all in m.
+        """
+        centre = vector(np.array(centre_m, float))
+        if ellipsoid_m is not None:
+            return cls("ellipsoid", vector(np.array(ellipsoid_m, float)), centre)
+        if cylinder_m is not None:
+            radius, length = cylinder_m
+            return cls("cylinder", (radius, radius, length / 2), centre)
+        return None if sphere_m is None else cls.sphere(sphere_m, centre)
 
     @property
     def text(self) -> str:
@@ -115,7 +153,7 @@ class Region:
             return np.asarray((np.hypot(x, y) <= 1) & (np.abs(z) <= 1))
         return np.asarray(x**2 + y**2 + z**2 <= 1)
 
-    def points(self, surface_degree: int) -> tuple[Floats, Floats]:
+    def points(self, surface_degree: int, panel_m: float = np.inf) -> tuple[Floats, Floats]:
         """Return points (n, 3) in m, those of the surface first, and weights (n,).
 
         The weights, 0 on the surface, are those of means over the volume.
@@ -125,19 +163,25 @@ class Region:
         surface_degree : int
             Degree of the functions whose means over the unit sphere, to which an ellipsoid's
             surface is scaled, are exact.
+        panel_m : float
+            Length along z within which the field is a polynomial of `INTEGRATION_DEGREE`; longer
+            regions are integrated in several panels.
         """
+        surface = (_cylinder_surface if self.shape == "cylinder" else _sphere_surface)(
+            surface_degree)
         size = INTEGRATION_DEGREE // 2 + 1
-        if self.shape == "cylinder":
-            surface = _cylinder_surface(surface_degree)
+        panels = int(np.ceil(2 * self.half_axes_m[2] / panel_m))
+        if self.shape == "cylinder" or panels > 1:
             radii, radial = _on_radius(size, 1)
             angles = 2 * np.pi * np.arange(INTEGRATION_DEGREE + 1) / (INTEGRATION_DEGREE + 1)
-            heights, along = np.polynomial.legendre.leggauss(size)
+            heights, along = _in_panels(size, max(panels, 1))
             r, phi, z = (part.ravel() for part in np.meshgrid(radii, angles, heights,
                                                               indexing="ij"))
-            inner = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
-            weights = np.einsum("r,p,z->rpz", radial, np.ones(len(angles)), along).ravel()
+            wide = np.ones_like(z) if self.shape == "cylinder" else np.sqrt(1 - z**2)
+            inner = np.column_stack([wide * r * np.cos(phi), wide * r * np.sin(phi), z])
+            weights = wide**2 * np.einsum(
+                "r,p,z->rpz", radial, np.ones(len(angles)), along).ravel()
         else:
-            surface, _ = sphere_points(surface_degree)
             directions, angular = sphere_points(INTEGRATION_DEGREE)
             radii, radial = _on_radius(size, 2)
             inner = (radii[:, None, None] * directions).reshape(-1, 3)
@@ -145,6 +189,18 @@ class Region:
         unit = np.vstack([surface, inner])
         return (np.array(self.centre_m) + unit * self.half_axes_m,
                 np.append(np.zeros(len(surface)), weights / weights.sum()))
+
+
+def _sphere_surface(degree: int) -> Floats:
+    """Return points (n, 3) of the surface of the unit sphere."""
+    return sphere_points(degree)[0]
+
+
+def _in_panels(size: int, panels: int) -> tuple[Floats, Floats]:
+    """Return Gauss's points and weights from -1 to 1 in some panels of equal length."""
+    nodes, weights = np.polynomial.legendre.leggauss(size)
+    middles = (2 * np.arange(panels) + 1) / panels - 1
+    return (middles[:, None] + nodes / panels).ravel(), np.tile(weights / panels, panels)
 
 
 def sphere_points(degree: int) -> tuple[Floats, Floats]:
@@ -296,8 +352,8 @@ class HomogeneityModel:
     @property
     def solver_error_ppm(self) -> float:
         """Rms error bar of the solver for a component, relative to the nominal mean field."""
-        field = self._field(self.response.nominal[:, None])[..., 0]
-        mean = float(self.weights @ np.linalg.norm(field[:len(self.weights)], axis=1))
+        field = self.field(self.response.nominal[:, None])[..., 0]
+        mean = float(self.weights @ np.linalg.norm(field, axis=1))
         return PPM * float(np.sqrt(np.mean(self.response.error**2))) / mean
 
     def of(self, parameters: Gaussian, seed: int = 0) -> Homogeneity:
@@ -306,14 +362,27 @@ class HomogeneityModel:
         ``seed`` is that of the magnets that are drawn.
         """
         samples = parameters.sample(DRAWS, np.random.default_rng(seed))
-        every = self._field(np.vstack([parameters.mean, samples]).T)[:len(self.weights)]
-        field, drawn = every[..., 0], every[..., 1:]
+        every = self.field(np.vstack([parameters.mean, samples]).T)
+        return self.of_fields(every[..., 0], every[..., 1:])
+
+    def field(self, magnetizations: Floats) -> Floats:
+        """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d)."""
+        rows = slice(0, 3 * len(self.weights))
+        values = self.response.matrix[rows] @ magnetizations
+        return np.asarray(self.response.offset[rows, None] + values).reshape(
+            -1, 3, magnetizations.shape[1])
+
+    def of_fields(self, field: Floats, drawn: Floats) -> Homogeneity:
+        """Return the homogeneity for a mean field (n, 3) and drawn fields (n, 3, d) in T.
+
+        The n points are those of the region.
+        """
         mean = self.weights @ field
         direction = mean / np.linalg.norm(mean)
         along = np.einsum("n,ncd->cd", self.weights, drawn)
         aside = along / np.linalg.norm(along, axis=0) - direction[:, None]
-        size, rms, whole = self._deviations(np.linalg.norm(field, axis=1)[:, None])
-        sizes, every_rms, every_whole = self._deviations(np.linalg.norm(drawn, axis=1))
+        size, rms, whole = self.deviations(field[..., None])
+        sizes, every_rms, every_whole = self.deviations(drawn)
         return Homogeneity(
             float(size[0]), float(np.std(sizes)), direction,
             float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)), float(rms[0]), float(whole[0]),
@@ -323,22 +392,17 @@ class HomogeneityModel:
     def slices(self, mean: Floats) -> list[Slice]:
         """Return |B| in three planes for magnetizations (parameters,) in A/m."""
         size = np.full(len(self.in_air), np.nan)
-        size[self.in_air] = np.linalg.norm(self._field(mean[:, None])[len(self.weights):, :, 0],
-                                           axis=1)
-        found = []
-        for axis, values in enumerate(size.reshape(3, SLICE, SLICE)):
-            first, second = (self.region.centre_m[other] + self.region.half_axes_m[other]
-                             * np.linspace(-1, 1, SLICE) for other in range(3) if other != axis)
-            found.append(Slice(COMPONENTS[axis], first, second, values))
-        return found
+        rows = slice(3 * len(self.weights), None)
+        field = self.response.offset[rows] + self.response.matrix[rows] @ mean
+        size[self.in_air] = np.linalg.norm(field.reshape(-1, 3), axis=1)
+        return slices_of(self.region, size)
 
-    def _field(self, magnetizations: Floats) -> Floats:
-        """Return B (n, 3, d) in T at all points for magnetizations (parameters, d) in A/m."""
-        values = np.asarray(self.response.matrix @ magnetizations)
-        return (self.response.offset[:, None] + values).reshape(-1, 3, magnetizations.shape[1])
+    def deviations(self, fields: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return mean |B| (d,) in T, rms and peak-to-peak deviations (d,) in ppm.
 
-    def _deviations(self, size: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return mean |B| (d,) in T, rms and peak-to-peak deviations (d,) in ppm of |B| (n, d)."""
+        They are those of fields (n, 3, d) in T at the points of the region.
+        """
+        size = np.linalg.norm(fields, axis=1)
         mean = self.weights @ size
         deviation = PPM * (size / mean - 1)
         return (mean, np.sqrt(self.weights @ deviation**2),
@@ -378,10 +442,12 @@ def real_harmonics(
     return terms, np.array(rows)
 
 
-def homogeneity_model(
-    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES
-) -> HomogeneityModel:
-    """Build the matrix from block magnetizations to the field in a region.
+def region_points(
+    magnet: Magnet, region: Region, degrees: int = SHOWN_DEGREES
+) -> tuple[Floats, Floats, int]:
+    """Return the points (n, 3) in m and weights (n,) of a region in a magnet, and the degree.
+
+    The degree is that of the functions that the points of the surface resolve, see `Region.points`.
 
     Raises
     ------
@@ -394,6 +460,11 @@ def homogeneity_model(
     if min(region.half_axes_m) < SMALLEST_M:
         raise StudyError(must_be("the region", f"study {magnet.name}",
                                  f"of at least {SMALLEST_M:g} m in all directions", region.text))
+    far = magnet.field_reach
+    if np.abs(region.centre_m).max() + max(region.half_axes_m) > far:
+        raise StudyError(must_be("the region", f"study {magnet.name}",
+                                 f"within {far:.3g} m of the middle of the magnet, where there is "
+                                 "some field", region.text, "Was it meant in millimetres?"))
     middles = np.array([block.middle for block in magnet.blocks])
     if region.contains(middles).any():  # the points below may miss blocks in a large region
         raise StudyError(must_be("the region", f"study {magnet.name}", "in air",
@@ -403,7 +474,7 @@ def homogeneity_model(
     resolved = MOST_DEGREES if reach >= 1 else min(
         MOST_DEGREES, int(np.ceil(np.log(HIGHER_DEGREES) / np.log(reach))))
     surface_degree = max(resolved + degrees, SURFACE_DEGREE)
-    points, weights = region.points(surface_degree)
+    points, weights = region.points(surface_degree, magnet.bore_radius)
     inside = magnet.contains(points)
     if inside.any():
         x, y, z = 1e3 * points[int(np.argmax(inside))]
@@ -411,7 +482,21 @@ def homogeneity_model(
             "the region", f"study {magnet.name}", "in air",
             f"{region.text}, of which the point ({x:.4g}, {y:.4g}, {z:.4g}) mm is inside magnet or "
             "iron", "Choose a smaller region, or check the study's radii."))
-    planes = _slice_points(region)
+    return points, weights, surface_degree
+
+
+def homogeneity_model(
+    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES
+) -> HomogeneityModel:
+    """Build the matrix from block magnetizations to the field in a region.
+
+    Raises
+    ------
+    StudyError
+        If the study is a cross-section, or the region reaches into material.
+    """
+    points, weights, surface_degree = region_points(magnet, region, degrees)
+    planes = slice_points(region)
     in_air = ~magnet.contains(planes)
     bare = magnet.with_(instrument=Instrument(), observation=FluxDensity(
         quantity="flux_density", positions=PointPositions(kind="points", points_m=(
@@ -422,7 +507,7 @@ def homogeneity_model(
                             response_matrix(bare, observation, session), degrees, surface_degree)
 
 
-def _slice_points(region: Region) -> Floats:
+def slice_points(region: Region) -> Floats:
     """Return the points (3 SLICE^2, 3) in m of slices across x, y and z, see `Slice`."""
     found = []
     for axis in range(3):
@@ -433,9 +518,22 @@ def _slice_points(region: Region) -> Floats:
     return np.array(region.centre_m) + np.vstack(found) * region.half_axes_m
 
 
+def slices_of(region: Region, size_T: Floats) -> list[Slice]:
+    """Return the slices of |B| in T at `slice_points`, NaN inside material."""
+    found = []
+    for axis, values in enumerate(size_T.reshape(3, SLICE, SLICE)):
+        first, second = (region.centre_m[other] + region.half_axes_m[other]
+                         * np.linspace(-1, 1, SLICE) for other in range(3) if other != axis)
+        found.append(Slice(COMPONENTS[axis], first, second, values))
+    return found
+
+
 def default_region(magnet: Magnet) -> Region:
-    """Return the sphere about the origin of half the radius of the bore."""
-    return Region.sphere(INSIDE * magnet.bore_radius)
+    """Return the region of the study, or the sphere about the origin of half the bore's radius."""
+    asked = magnet.study.homogeneity
+    own = None if asked is None else Region.of(
+        asked.sphere_m, asked.ellipsoid_m, asked.cylinder_m, asked.centre_m)
+    return own or Region.sphere(INSIDE * magnet.bore_radius)
 
 
 def _quantiles(values: Floats) -> tuple[float, float, float]:

@@ -56,13 +56,6 @@ sum mixes a small part of a multipole into another. Harmonics of order k fall as
 blocks' radius r inwards, and the sum over steps h along z of a field whose sources are at the
 distance d has the error exp(-2 pi d / h)."""
 
-BEYOND_ENDS = 4.5
-"""Distance by which sums along z extend beyond the ends, relative to the magnet's outer radius. The
-field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 of a block lies
-beyond; it is added as the field of point dipoles (`beyond`). Higher orders fall faster: for two
-rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of that to the
-boundary of 3D meshes."""
-
 NOTHING_THERE = 1e-6
 """Tolerance below which the main multipole counts as zero, relative to the largest multipole that
 the blocks could produce together."""
@@ -148,6 +141,20 @@ class Multipoles:
     def expected_square(self) -> float:
         """Expectation of the sum of all |c_n|^2 in units^2, without the solver's error."""
         return float(self.mean @ self.mean + np.sum(self.root**2))
+
+    @property
+    def rms(self) -> float:
+        """Root of `expected_square` per order, in units."""
+        return float(np.sqrt(self.expected_square / len(self.orders)))
+
+    @property
+    def rms_of_mean(self) -> float:
+        """Rms of `sizes`, in units."""
+        return float(np.sqrt(np.mean(self.sizes**2)))
+
+    def share_within(self, limit: float, normals: Floats) -> float:
+        """Return the probability that all |c_n| are within a limit, from normals (count, 2 k)."""
+        return met(self.sizes_of(normals), limit)
 
     def sizes_of(self, normals: Floats) -> Floats:
         """Return |c_n| (count, k) of samples made from standard normal numbers (count, 2 k)."""
@@ -280,7 +287,7 @@ def multipole_models(
         integrated = magnet.dimension == 3 and z is None
         matrix = _complexes(model.matrix[part])
         if integrated:
-            far = beyond(magnet, _reach(magnet))
+            far = beyond(magnet, magnet.field_reach)
             matrix[0, :len(far)] += far  # variations inside blocks have next to no field there
         index = np.array([main, *orders]) - 1
         turn = _turn(magnet, matrix[main - 1], model)
@@ -309,10 +316,10 @@ def unwanted_orders(
     if magnet.dimension == 2 and reference.z_m is not None:
         raise StudyError(must_be("--at-z-m", f"study {magnet.name}", "left out, since it is 2D",
                                  f"{reference.z_m:g}"))
-    if reference.z_m is not None and abs(reference.z_m) > _reach(magnet):
+    if reference.z_m is not None and abs(reference.z_m) > (reach := magnet.field_reach):
         raise StudyError(must_be(
             "--at-z-m", f"study {magnet.name}",
-            f"from {-_reach(magnet):.3g} to {_reach(magnet):.3g} m, where there is some field",
+            f"from {-reach:.3g} to {reach:.3g} m, where there is some field",
             f"{reference.z_m:g}", "Was it meant in millimetres?"))
     return orders, _radius(magnet, reference)
 
@@ -487,11 +494,6 @@ def beyond(magnet: Magnet, reach: float) -> Complexes:
     return np.concatenate(integrals)
 
 
-def _reach(magnet: Magnet) -> float:
-    """Return the distance in m from the middle at which sums along z end."""
-    return magnet.half_length + BEYOND_ENDS * magnet.radius
-
-
 def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
     """Return the reference radius in m, by default as `MultipoleReference` describes."""
     positions = magnet.study.observation.positions
@@ -518,7 +520,7 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
     angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
     if magnet.dimension == 3 and z is None:
-        end = _reach(magnet)
+        end = magnet.field_reach
         step = 2 * np.pi * (bore - radius) / -np.log(SUM_ERROR)
         limits = (-end, end, int(np.ceil(2 * end / step)) + 1)
     settings = FourierCoefficients(
@@ -549,7 +551,8 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     def text(known: Multipoles, number: int) -> str:
         if known.mean[number] > MAIN_UNITS:
             return "main"
-        return f"{known.mean[number]:+.2f} ± {known.sd[number]:.2f}"
+        value = round(float(known.mean[number]), 2)
+        return f"{value:+.2f} ± {known.sd[number]:.2f}" if value else f"0 ± {known.sd[number]:.2f}"
 
     first = next(iter(columns.values()))
     rows = []
@@ -571,5 +574,4 @@ def plain(known: Multipoles, unit: str) -> dict[str, object]:
     """Return multipoles as plain data for JSON; ``unit`` is the unit of the main multipole."""
     name = unit.replace(" ", "_")
     return {f"main_{name}": known.main, f"main_sd_{name}": known.main_sd, "roll_rad": known.roll,
-            "roll_sd_rad": known.roll_sd, "rms_units": float(np.sqrt(
-                known.expected_square / len(known.orders))), "multipoles": known.table()}
+            "roll_sd_rad": known.roll_sd, "rms_units": known.rms, "multipoles": known.table()}

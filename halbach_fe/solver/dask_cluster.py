@@ -155,18 +155,23 @@ def connected(address: str) -> Iterator[Cluster]:
     try:
         import dask
         import distributed
+        from distributed.comm.addressing import parse_address, parse_host_port
+        from distributed.comm.registry import get_backend
     except ImportError:
         raise ExtraMissingError("--scheduler needs Dask, which is not installed: "
                                 "`pip install halbach-fe[cluster]`.") from None
     # The files of a run are part of its task, so large tasks are intended: silence Dask's warning.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TiB"})
-    try:
+    try:  # a client that fails on such an address would print a traceback when it is deleted
+        scheme, location = parse_address(address)
+        get_backend(scheme)
+        parse_host_port(location)
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise SchedulerError(
             f"Input --scheduler must be the address of a running Dask scheduler, such as "
-            f"tcp://host:8786; instead received {address} ({error}). Start the scheduler, or "
-            "correct its address.") from None
+            f"tcp://host:8786; instead received {address or 'an empty text'} ({error}). "
+            "Start the scheduler, or correct its address.") from None
     try:
         yield Cluster(client, address)
     except Exception as error:

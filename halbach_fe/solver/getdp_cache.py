@@ -290,6 +290,9 @@ def default_cache(folder: Path | None = None) -> Cache | None:
         if home.startswith("~"):  # the user has no home folder
             return None
         named = Path(home, "halbach-fe")
+    if Path(named).exists() and not Path(named).is_dir():
+        raise OutputError(f"The cache {printable(named, MAX_QUOTED)} must be a folder, but is a "
+                          "file. Name another folder.")
     if os.environ.get(TRUST_VARIABLE) != "1" and _others_may_write(Path(named)):
         raise OutputError(
             f"Other users may write to the cache {printable(named, MAX_QUOTED)}, so that its "

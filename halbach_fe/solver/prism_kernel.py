@@ -48,9 +48,21 @@ Six = tuple[float, float, float, float, float, float]
 
 
 @compiled
-def _angle(s1: float, r1: float, s2: float, r2: float, u: float, d: float) -> float:
-    """Return ``[atan(s u/(d R))]`` between two ends of an edge, for d > 0."""
-    return atan2(u * d * (s2 * r1 - s1 * r2), d * d * r1 * r2 + s1 * s2 * u * u)
+def _angle(
+    s1: float, aup: float, alow: float, s2: float, bup: float, blow: float,
+    up: float, low: float, d: float,
+) -> float:
+    """Return ``[[atan(s u/(d R))]]`` between two ends of an edge and the end faces, for d > 0.
+
+    It is minus the solid angle of the side face, from 0 to 2 pi. The angles of both end faces are
+    the arguments of complex numbers, and their difference is that of a quotient, up to a turn.
+    """
+    im1, re1 = up * d * (s2 * aup - s1 * bup), d * d * aup * bup + s1 * s2 * up * up
+    im2, re2 = low * d * (s2 * alow - s1 * blow), d * d * alow * blow + s1 * s2 * low * low
+    angle = atan2(im1 * re2 - re1 * im2, re1 * re2 + im1 * im2)
+    # beside the face it is at most pi, so that a small positive angle is 0 but for rounding
+    beside = s1 >= 0 or s2 <= 0 or up >= 0 or low <= 0
+    return angle - 2 * pi if angle > (1.0 if beside else 0.0) else angle
 
 
 @compiled
@@ -98,8 +110,7 @@ def _straight_edge(
                          / ((aup - up) * (alow + low) * (b2 + tiny)))
     normal = subtended = 0.0
     if distance > zero:
-        angle = _angle(s1, aup, s2, bup, up, distance) - _angle(
-            s1, alow, s2, blow, low, distance)
+        angle = _angle(s1, aup, alow, s2, bup, blow, up, low, distance)
         if d < 0:
             angle = -angle
         normal = angle

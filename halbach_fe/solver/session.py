@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+from halbach_fe.core.numbers import check_number
 from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Run, find_getdp
@@ -139,12 +140,16 @@ class Session:
         ------
         GetDPNotFoundError
             If GetDP is not found, or does not answer like GetDP.
+        StudyError
+            If ``jobs`` is not at least 1.
 
         Examples
         --------
         >>> Session.open("results").jobs in (1, 2)
         True
         """
+        if jobs is not None:
+            check_number("jobs", "Session.open", jobs, 1, whole=True)
         return cls(find_getdp(getdp), Path(folder),
                    jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
                    cache=default_cache(None))

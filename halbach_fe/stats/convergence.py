@@ -16,10 +16,6 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import SamplingError
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # ArviZ warns on import of its next version
-    import arviz
-
 MAX_R_HAT = 1.01
 MIN_EFFECTIVE = 400.0
 """Limits that the paper cited above recommends: the largest R-hat, and the smallest effective
@@ -52,6 +48,10 @@ class ConvergenceDiagnostics:
 
 def assess_convergence(samples: Floats) -> ConvergenceDiagnostics:
     """Return the diagnostics of samples (chains, draws, m)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ArviZ warns on import of its next version
+        import arviz  # here, as that takes seconds, which processes of single chains can do without
+
     data = xr.Dataset({"x": (("chain", "draw", "parameter"), samples)})
 
     def figure(found: xr.Dataset) -> Floats:

@@ -23,7 +23,7 @@ from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.core.numbers import MAX_CELL, parse_number
-from halbach_fe.core.tables import csv_text
+from halbach_fe.core.tables import WITH_COMMAS, csv_text, other_separator
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import COLUMNS, MAX_BLOCKS, FreeBlocks, RowError
 
@@ -178,6 +178,9 @@ def _csv(raw: bytes, where: str) -> _Content:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)
              if line.strip() and not line.lstrip().startswith("#")]
     _check_count(len(lines) - 1, where)
+    if (separator := other_separator(lines[0][1])) is not None:
+        raise StudyError(must_be("header", where, "names that commas separate",
+                                 f"names that {separator} separate", WITH_COMMAS))
     numbers = [number for number, _ in lines[1:]]
     rows: list[list[str]] = []
     reader = csv.reader((line for _, line in lines), strict=True)

@@ -16,6 +16,7 @@ from halbach_fe.study.types import (
     Length,
     Line,
     ReferenceTemperature,
+    RemanenceCoefficient,
     StudyModel,
 )
 
@@ -51,7 +52,7 @@ class Prior(StudyModel):
     variation_length_m: Length | None = None
     mounting_sd_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 0.0
     types: dict[Line, Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]] = {}  # noqa: RUF012
-    temperature_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)] | None = None
+    temperature_coefficient_per_K: RemanenceCoefficient | None = None
     reference_temperature_C: ReferenceTemperature | None = None
 
     @model_validator(mode="after")

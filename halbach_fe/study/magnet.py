@@ -10,15 +10,21 @@ from pydantic import Field, model_validator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.types import (
+    RISING_PER_K,
     Angle,
     Coordinate,
     FluxDensityVector,
     Moment,
     Point,
     ReferenceTemperature,
+    RemanenceCoefficient,
     StudyModel,
     Temperature,
 )
+
+FERRITE_PER_K = -1.5e-3
+"""Temperature coefficient of the remanence above which a magnet is no ferrite, which has -0.002/K;
+that of NdFeB is -0.0012/K, of SmCo -0.0004/K and of AlNiCo -0.0002/K."""
 
 MOST_SQUARE = 0.99
 """Largest squareness for which irreversible losses are computed."""
@@ -93,7 +99,7 @@ class Demagnetization(StudyModel):
 
     intrinsic_coercivity_A_per_m: Annotated[float, Field(ge=1e4, le=1e7)]
     squareness: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
-    remanence_coefficient_per_K: Annotated[float, Field(ge=-0.01, le=0.01)]
+    remanence_coefficient_per_K: RemanenceCoefficient
     coercivity_coefficient_per_K: Annotated[float, Field(ge=-0.02, le=0.02)]
     reference_temperature_C: ReferenceTemperature = 20.0
     temperature_C: Temperature = 20.0
@@ -104,6 +110,13 @@ class Demagnetization(StudyModel):
         if self.irreversible and self.squareness > MOST_SQUARE:
             raise ValueError(f"squareness must be at most {MOST_SQUARE} for irreversible losses, "
                              f"not {self.squareness}; the polarization would jump at the knee")
+        if self.coercivity_coefficient_per_K > RISING_PER_K and (
+                self.remanence_coefficient_per_K > FERRITE_PER_K):
+            raise ValueError(
+                f"coercivity_coefficient_per_K ({self.coercivity_coefficient_per_K}) lets the "
+                "coercivity rise with the temperature, as that of ferrite alone does, but "
+                f"remanence_coefficient_per_K ({self.remanence_coefficient_per_K}) is not that of "
+                "ferrite; other magnets have a negative one")
         for name, coefficient in (("remanence", self.remanence_coefficient_per_K),
                                   ("coercivity", self.coercivity_coefficient_per_K)):
             if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:

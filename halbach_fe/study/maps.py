@@ -18,6 +18,9 @@ PROBE_KEYS = ("crosstalk", "gain", "sensor_position_m", "planar_hall_per_T", "qu
 belong to a map: its pose and its stage, and the offsets, which change from day to day."""
 
 
+RESULTS = ("run.json", "study.registered.toml")
+"""Files beside which `halbach-fe register` makes a folder for every map."""
+
 POSE_KEYS = ("translation_m", "rotation_rad")
 """Keys of an instrument that say how a map lies in the magnet."""
 
@@ -69,6 +72,8 @@ class MapSettings(StudyModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> MapSettings:
+        if self.name in RESULTS:
+            raise ValueError(f"the name '{self.name}' of a map is that of a file of results")
         if "\0" in self.file:
             raise ValueError("file must be a path")
         if self.stage is None and any(self.stage_shift_sd_m):

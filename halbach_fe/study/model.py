@@ -20,6 +20,9 @@ from pydantic import Field, ValidationError, model_validator
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array
+from halbach_fe.study.design import Design
+from halbach_fe.study.holder import Holder
+from halbach_fe.study.homogeneity import HomogeneityRegion
 from halbach_fe.study.inference import Inference, Plan, Prior
 from halbach_fe.study.iron import Iron, IronMaterial, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
@@ -59,8 +62,11 @@ class Study(StudyModel):
     prior: Prior = Prior()
     inference: Inference = Inference()
     plan: Plan = Plan()
+    homogeneity: HomogeneityRegion | None = None
     demagnetization: Demagnetization | None = None
     shim_tray: ShimTray | None = None
+    design: Design | None = None
+    holder: Holder | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -98,6 +104,9 @@ class Study(StudyModel):
         if self.external.neighbours and self.dimension == 2:
             raise ValueError("external.neighbours needs a 3D study: beside a cross-section, which "
                              "has no end, there is no other magnet on the axis")
+        if self.homogeneity is not None and self.dimension == 2:
+            raise ValueError("homogeneity needs a 3D study: a cross-section has no volume in which "
+                             "the field could be homogeneous")
         if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
             raise ValueError("prior.variation_sd needs a 3D study without iron")
         self._check_maps()

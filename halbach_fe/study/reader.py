@@ -8,9 +8,11 @@ from __future__ import annotations
 import difflib
 import tomllib
 import types
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.errors import StudyError, must_be
@@ -20,10 +22,15 @@ from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import TableCurve
 from halbach_fe.study.model import Study, iron_of
-from halbach_fe.study.types import MIN_LENGTH_M
 
-MAX_WRONG_UNIT = 1e9
+MAX_WRONG_UNIT = 1e12
 """Values from this size on are not explained by a wrong unit."""
+
+WRONG_UNITS = (
+    ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
+    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4))
+"""End of a key, a unit in which its value may have been given, and what that is in the right one.
+"""
 
 
 def read_study(path: str | Path) -> Study:
@@ -160,7 +167,7 @@ def _sentence(error: ValidationError, where: str) -> str:
         if kind == "union_tag_not_found":
             hint = f"Add the key, as one of {', '.join(map(repr, tags))}."
     elif isinstance(value, int | float) and not isinstance(value, bool):
-        hint = _unit_hint(key, value)
+        hint = _unit_hint(key, value, first.get("ctx", {}))
     return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
 
 
@@ -168,17 +175,20 @@ def _more(errors: list[Any]) -> str:
     return f" ({len(errors) - 1} more in this file.)" if len(errors) > 1 else ""
 
 
-def _unit_hint(key: str, value: float) -> str:
-    """Return a hint to a unit that is wrong by a factor of 1000, as far as the value shows it."""
-    if not abs(value) < MAX_WRONG_UNIT:
-        return "Correct the value."
-    wrong = {"_m": "millimetres", "_T": "millitesla"}
+def _unit_hint(key: str, value: float, limits: Mapping[str, Any]) -> str:
+    """Return a hint to a unit that is wrong, if the value is within the limits in the right one.
+
+    ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt.
+    """
     key = key.partition("[")[0] if key.endswith("]") else key
-    for suffix, unit in wrong.items():
-        if key.endswith(suffix) and abs(value) > 1:
-            return f"Was it meant in {unit}? Then write {value / 1000:g}."
-    if key.endswith("_m") and 0 < abs(value) < MIN_LENGTH_M:
-        return f"Was it meant in kilometres? Then write {value * 1000:g}."
+    if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
+        return "Correct the value."
+    for suffix, unit, factor in WRONG_UNITS:
+        given = value * factor
+        if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
+                limits.get("ge", -np.inf) <= given <= limits.get("le", np.inf)) and (
+                limits.get("gt", -np.inf) < given < limits.get("lt", np.inf)):
+            return f"Was it meant in {unit}? Then write {given:.6g}."
     return "Correct the value."
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import jinja2
+import numpy as np
 
 from halbach_fe.core.errors import OutputError, must_be
 from halbach_fe.core.files import atomic
@@ -19,6 +20,10 @@ from halbach_fe.study.reader import parse_study, with_free_blocks
 
 TEMPLATE = "new_study.toml.j2"
 
+LATITUDES, ANGLES = 9, 16
+"""Number of latitudes, and of points on each, of a sphere that is measured: they determine the
+spherical harmonics up to degree 8."""
+
 
 @dataclass(frozen=True)
 class MagnetTemplate:
@@ -27,7 +32,10 @@ class MagnetTemplate:
     Lengths are in m, the remanence is in T. ``ring_length_m`` is None for a cross-section.
     ``material`` names a grade of magnet in place of the remanence. ``inner_radii_m`` are the inner
     radii of rings of their own, in the order of z. ``free_blocks`` is the path of a table of blocks
-    that takes the place of the rings, from the folder of the study file.
+    that takes the place of the rings, from the folder of the study file. ``cube_m`` is the
+    edge of cubes, ``steel`` the name of the steel of the iron ring, ``dsv_m`` the diameter of a
+    sphere that is measured in place of circles along the magnet. ``sigma_T`` and ``position_sd_m``
+    are the noise of readings and positions.
     """
 
     multipole_order: int = 1
@@ -42,6 +50,11 @@ class MagnetTemplate:
     material: str | None = None
     inner_radii_m: tuple[float, ...] = ()
     free_blocks: str | None = None
+    cube_m: float | None = None
+    steel: str | None = None
+    dsv_m: float | None = None
+    sigma_T: float = 5e-5
+    position_sd_m: float = 1e-4
 
 
 def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
@@ -65,9 +78,22 @@ def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
         loader=jinja2.PackageLoader("halbach_fe.study", "."), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     text = environment.get_template(TEMPLATE).render(
-        name=_name(name), magnet=magnet, table=table, half=_half_length(magnet, table))
+        name=_name(name), magnet=magnet, table=table, half=_half_length(magnet, table),
+        sphere=[] if magnet.dsv_m is None else _sphere(magnet.dsv_m / 2))
     parse_new_study(text, folder)
     return text
+
+
+def _sphere(radius: float) -> list[str]:
+    """Return points on a sphere about the origin as TOML, a line for each of Gauss' latitudes."""
+    angle = 2 * np.pi * np.arange(ANGLES) / ANGLES
+    lines = []
+    for height in np.polynomial.legendre.leggauss(LATITUDES)[0]:
+        across = radius * np.sqrt(1 - height**2)
+        lines.append(", ".join(f"[{x:.5g}, {y:.5g}, {radius * height:.5g}]" for x, y in zip(
+            (across * np.cos(angle)).round(9) + 0.0, (across * np.sin(angle)).round(9) + 0.0,
+            strict=True)))
+    return lines
 
 
 def _half_length(magnet: MagnetTemplate, table: FreeBlocks | None) -> float | None:

@@ -57,6 +57,10 @@ Temperature = Annotated[float, Field(ge=-273.15, le=500.0, allow_inf_nan=False)]
 ReferenceTemperature = Annotated[float, Field(ge=-200.0, le=200.0, allow_inf_nan=False)]
 """Temperature in degrees Celsius at which a material was measured; room temperature in kelvin is
 beyond the limit."""
+RISING_PER_K = 5e-4
+"""Largest temperature coefficient of magnets other than the coercivity of ferrite: remanences of
+compensated SmCo are constant, and coercivities of AlNiCo rise by up to 3e-4/K."""
+RemanenceCoefficient = Annotated[float, Field(ge=-0.01, le=RISING_PER_K)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 

@@ -50,7 +50,8 @@ NODES = {100: 6, 400: 4, 1500: 3}
 """Gauss points along a side of a block, by the largest number of blocks; 2 for more blocks."""
 
 LONE_NODES = 6
-"""Gauss points along a side of a block that is measured alone."""
+"""Gauss points along a side of a block that is measured alone. With 12 the moment of a sector of
+permeability 1.05 changes by 2e-5."""
 
 PRECISION = 1e-8
 """Relative residual of the linear system. The method's own error was measured to be 3e-3 of the
@@ -123,6 +124,8 @@ def lone_moment_matrix(shape: Shape, permeability: Floats) -> Floats:
 
     ``permeability`` (3, 3) is the relative recoil permeability in the shape's axes.
     """
+    if np.array_equal(permeability, np.eye(3)):
+        return shape.volume / MU_0 * np.eye(3)
     nodes, volumes = shape.nodes(LONE_NODES)
     fields = np.stack([piece_field((shape, *WHOLE), axis, nodes) for axis in np.eye(3)], axis=2)
     share, chi = volumes / volumes.sum(), permeability - np.eye(3)

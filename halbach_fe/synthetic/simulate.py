@@ -138,6 +138,11 @@ def simulate_campaign(
         raise StudyError(must_be(
             "`maps`", f"study {study.name}", "left out of a simulated measurement, which is of one "
             "map", f"a list of {len(study.maps)}"))
+    if stated := study.instrument.model_dump(exclude_defaults=True):
+        raise StudyError(must_be(
+            "`instrument`", f"study {study.name}", "left out of a simulated measurement, whose map "
+            "is at the study's points in m and T", f"{', '.join(sorted(stated))}",
+            "Leave [instrument] out. What the mapper does wrong is told by --hide."))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
     # separate streams of random numbers: a further draw from one does not change the others

@@ -35,7 +35,8 @@ from halbach_fe.inference.registration import odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.answer import Answer as PageAnswer
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.page import (
     MEASURED,
@@ -76,6 +77,9 @@ class Hypothesis:
     open_keys: tuple[OpenKey, ...]
     pose: PosePrior
 
+
+SHOWN_SHARE = 1e-3
+"""Probability down to which it is shown in per cent."""
 
 ALL = (STEP, LENGTH, RADIUS)
 HYPOTHESES = (
@@ -146,7 +150,10 @@ def hypothesis_table(answers: list[Answer], published: PublishedErrors) -> list[
             found.middle_m[:2], found.translation_sd_m[:2], strict=True))
         fringe, homogeneous = each.medians()
         rows.append({
-            "a profile of": each.hypothesis.name, "odds": f"{100 * probability:.3g} %",
+            "a profile of": each.hypothesis.name,
+            "odds": f"{100 * probability:.3g} %" if probability > SHOWN_SHARE else _power((
+                found.log_evidence - max(one.registration.log_evidence for one in answers))
+                / np.log(10)),
             "fringe": f"{fringe:.3f}", "homogeneous": f"{homogeneous:.1e}",
             "chi²/reading": f"{found.chi2:.3g}",
             "x, y in mm": f"{x}, {y}" if each.hypothesis.pose is ANYWHERE else "0, 0",
@@ -345,7 +352,10 @@ def run(arguments: argparse.Namespace) -> int:
             "places.png": (place_figure(poses), "Where the profile lies in the cross-section"),
         }, folder), read_study(STUDY), common.digests({"profile": HERE / "fig4_faser_on_axis.csv",
                                                        "study file": STUDY}),
-        title="What is the published FASER profile a profile of?", found=found, hypotheses=rows,
+        title="What is the published FASER profile a profile of?", hypotheses=rows,
+        answer=PageAnswer(
+            "What is the published FASER profile a profile of?", found[0], " ".join(found[1:]),
+            "Read what is left, and the further pages below."),
         split="Every fifth reading (index 5, 10, ..., 155) was set aside before anything was "
               "fitted. Errors are medians of |predicted / measured - 1| of B_x over these, as the "
               "paper defines them: in its fringe field (index 1-35 and 121-156) and in its "
@@ -361,12 +371,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def diagnosed(best: Answer, data: xr.Dataset, session: Session, text: str,
               folder: Path) -> list[str]:
-    """Diagnose the registered study, write its page, return the verdict."""
+    """Diagnose the registered study, write its page, return what it says first."""
     study = best.registration.study
     found = diagnose(study, data, session, say=common.say)
     write_diagnosis(found, separations(found, data, session), study, text, folder)
-    print_diagnosis(found, folder)
-    return verdict(found)
+    print_diagnosis(found, argparse.Namespace(study=STUDY, output=folder))
+    said = answer(found)
+    return [said.said, said.trust]
 
 
 def write_summary(answers: list[Answer], poses: list[Registration], path: Path) -> None:

@@ -22,7 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.report.magnetizations import error_summary, write_magnetizations
+from halbach_fe.report.magnetizations import error_summary, expected_spread, write_magnetizations
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.model import Study
@@ -93,9 +93,8 @@ def figures(prior: Gaussian, posterior: Gaussian, truth: Floats) -> dict[str, fl
                 [reduction(of(one)[RING - 1], of(other)[RING - 1])
                  for one, other in zip(*draws, strict=True)], percent))
     error, covariance = posterior.mean - truth, posterior.covariance
-    correlation = covariance / np.outer(posterior.sd, posterior.sd)
     return found | error_summary(posterior, truth) | {
-        "z_rms_spread": float(np.linalg.norm(correlation) / np.sqrt(2) / len(truth)),
+        "z_rms_spread": expected_spread(posterior),
         "chi2_per_parameter": float(error @ np.linalg.solve(covariance, error) / len(truth))}
 
 

@@ -131,6 +131,61 @@ def test_the_functions_are_all_there():
         _ = hf.nothing_like_it
 
 
+def test_a_report_replaces_no_other_result(dipole, tmp_path):
+    """A folder belongs to one command and one study, in Python too."""
+    study = dipole(array__recoil_permeability=1.0, noise={"regions": [
+        {"name": "all", "sigma_T": 1e-4}]})
+    campaign = hf.simulate_measurement(study)
+    folder, session = tmp_path / "results", hf.Session.open(tmp_path / "runs")
+    result = hf.infer(hf.build_magnet(study), campaign.readings, session)
+    page = hf.write_report(result, folder).read_bytes()
+    other = hf.simulate_measurement(study.with_(name="other"))
+    for one, said in ((campaign, "halbach-fe infer"), (other, "halbach-fe infer")):
+        with pytest.raises(hf.HalbachError, match=f"holds results of `{said}` of study dipole"):
+            hf.write_report(one, folder)
+    another = hf.infer(hf.build_magnet(study.with_(name="other")), campaign.readings, session)
+    with pytest.raises(hf.HalbachError, match="one command and one study"):
+        hf.write_report(another, folder)
+    assert (folder / "report.html").read_bytes() == page
+    assert hf.write_report(result, folder) == folder / "report.html"
+    with pytest.raises(TypeError, match="no report for a NoneType"):
+        hf.write_report(None, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_every_result_has_a_command():
+    from halbach_fe.cli.verbs import VERBS
+    from halbach_fe.report.result_files import OWNERS, _write
+
+    assert set(OWNERS) == set(_write.registry) - {object}
+    assert {command for command, _ in OWNERS.values()} <= set(VERBS)
+
+
+SEEDS = "seed .* a whole number of at least 0; instead received -1"
+
+
+@pytest.mark.parametrize(("use", "said"), [
+    (lambda magnet, session: hf.Session.open(session.folder, jobs=0), "jobs .* at least 1"),
+    (lambda magnet, session: hf.plan(magnet, session, points=0), "points .* at least 1"),
+    (lambda magnet, session: hf.tolerance(magnet, session, draws=0), "draws .* from 20 to 1e.06"),
+    (lambda magnet, session: hf.tolerance(magnet, session, limit_units=-1), "from 1e-06 to 1e.06"),
+    (lambda magnet, session: hf.shim(None, session, swaps=-1), "swaps .* at least 0"),
+    (lambda magnet, session: hf.shim(None, session, swaps=1.5), "a whole number .* received 1.5"),
+    (lambda magnet, session: hf.shim(None, session, turns=True), "turns .* a whole number"),
+    (lambda magnet, session: hf.demagnetization(magnet, session, across=0), "from 2 to 100"),
+    (lambda magnet, session: hf.simulate_measurement(magnet.study, seed=-1), SEEDS),
+    (lambda magnet, session: hf.sort(magnet, None, session, seed=-1), SEEDS),
+    (lambda magnet, session: hf.Region.sphere(float("nan")), "half_axes_m .* received nan"),
+    (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received 0.1"),
+    (lambda magnet, session: hf.Region.sphere(-0.1), "half_axes_m .* above 0"),
+    (lambda magnet, session: hf.Region("cube", (0.01,) * 3), "one of sphere"),
+    (lambda magnet, session: hf.Region("cylinder", (0.01, 0.01)), "three numbers")])
+def test_numbers_out_of_range(dipole, session, use, said):
+    """They are refused before anything is solved, as on the command line."""
+    with pytest.raises(hf.HalbachError, match=said):
+        use(hf.build_magnet(dipole()), session)
+
+
 def run(*command):
     return subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True)
 

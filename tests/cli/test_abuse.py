@@ -18,6 +18,9 @@ from halbach_fe.cli.verbs import with_values
 from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import write_blocks
+from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import read_study
 from tests.cli.test_all_keys import BASE, measured_blocks
 from tests.cli.test_cli import refused
@@ -61,13 +64,16 @@ def test_a_stock_of_blocks_in_the_magnet(campaign, tmp_path, capsys, kind):
 @pytest.mark.parametrize(("arguments", "said"), [
     (["sort", "{study}", "{blocks}", "--seed", "1", "--seed", "2"], "--seed: is given twice"),
     (["tolerance", "{study}", "--draws", "1e4"], "must be a whole number, not '1e4'"),
-    (["tolerance", "{study}", "--draws", "1000001"], "from 1 to 1e+06, not 1000001"),
+    (["tolerance", "{study}", "--draws", "1000001"], "from 20 to 1e+06, not 1000001"),
+    (["tolerance", "{study}", "--draws", "1"], "from 20 to 1e+06, not 1"),
     (["tolerance", "{study}", "--limit-units", "1e308"], "from 1e-06 to 1e+06, not 1e308"),
     (["tolerance", "{study}", "--limit-units", "x"], "must be a number, not 'x'"),
-    (["demagnetization", "{study}", "--across", "1000000"], "from 1 to 100, not 1000000"),
+    (["demagnetization", "{study}", "--across", "1000000"], "from 2 to 100, not 1000000"),
+    (["demagnetization", "{study}", "--across", "1"], "from 2 to 100, not 1"),
     (["simulate-measurement", "{study}", "--coil-sd", "100"], "from 1e-09 to 0.3, not 100"),
     (["simulate-measurement", "{study}", "--order", "99"], "from 1 to 10, not 99"),
     (["simulate-measurement", "{study}", "--element-size", "1e-9"], "from 1e-05 to 10"),
+    (["forces", "{study}", "--density-kg-per-m3", "7.5"], "7.5 g/cm^3 are 7500 kg/m^3"),
     (["import-map", "{measured}", "--at", "x=0,x=1"], "must give x once"),
     (["import-map", "{measured}", "--at", "x=nan"], "must be a finite number, not 'nan'")])
 def test_command_lines(campaign, tmp_path, capsys, arguments, said):
@@ -82,9 +88,12 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
 @pytest.mark.parametrize(("arguments", "code", "said"), [
     (["tolerance", "{study}", "--reference-radius-m", "0.0499"], 3, "inner radius"),
     (["tolerance", "{study}", "--at-z-m", "1e9"], 3, "--at-z-m"),
-    (["homogeneity", "{study}", "--sphere-m", "20"], 3, "contains blocks"),
+    (["homogeneity", "{study}", "--sphere-m", "0.3"], 3, "contains blocks"),
+    (["homogeneity", "{study}", "--sphere-m", "20"], 3, "in millimetres"),
     (["homogeneity", "{study}", "--sphere-m", "1e-300"], 3, "at least 1e-06 m"),
+    (["forces", "{study}", "--order", "{measured}"], 4, "with the column block"),
     (["multipoles", "{study}", "--posterior", "{measured}"], 4, "a posterior.h5 that halbach-fe"),
+    (["multipoles", "{study}", "--posterior", "nope.h5"], 4, "received No such file or directory"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=0.1", "--hide", "gain_x=0.2"], 3,
      "given once"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=1e308"], 3, "from -0.9 to 10"),
@@ -92,6 +101,7 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
     (["simulate-measurement", "{study}", "--hide", "swapped_axes=1,1"], 3, "another axis"),
     (["simulate-measurement", "{study}", "--hide", "rotated_by_one_block=0.5"], 3, "whole number"),
     (["simulate-measurement", "{study}", "--hide", "temperature=100,0.1"], 3, "does not reverse"),
+    (["simulate-measurement", "{study}", "--hide", "temperature=-300,-0.001"], 3, "from -293 "),
     (["simulate-measurement", "{study}", "--hide", "knee=0,0"], 3, "coercivity"),
     (["simulate-measurement", "{study}", "--hide", "iron_ring=0.01,0.02,9,2"], 3, "outer radius"),
     (["simulate-measurement", "{study}", "--hide", "iron_ring=0.3,0.2,9,2"], 3, "above inner"),
@@ -123,6 +133,33 @@ def test_temperatures_in_kelvin(campaign, tmp_path, capsys, celsius):
     code, sentence = refused(["demagnetization", study, "-o", tmp_path / "out"], capsys)
     assert code == 3
     assert "reference_temperature_C" in sentence
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"plan__candidates": [{"kind": "points", "points_m": [[0.0, 0.0, 20.0], [0.0, 0.0, 0.0],
+                                                           [0.0, 0.0, 0.01]]}]}, "Are they in met"),
+    ({"demagnetization__remanence_coefficient_per_K": 1.2e-3}, "remanence_coefficient_per_K"),
+    ({"demagnetization__coercivity_coefficient_per_K": 3e-3}, "that of ferrite alone")])
+def test_studies_in_other_units_or_of_another_sign(tmp_path, capsys, changes, said):
+    study = tmp_path / "study.toml"
+    study.write_text(tomlkit.dumps(changed(BASE, **changes)))
+    code, sentence = refused(["plan", study, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert said in sentence
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    (["x"], "block in line 2 of order of assembly"), ([], "all 8 blocks of the magnet"),
+    (["r01s01", "r01s02"], "r01s02, which is in line 3 too")])
+def test_orders_of_assembly(campaign, tmp_path, capsys, names, said):
+    """What is wrong is in the table, not in the study."""
+    study, order = campaign[0], tmp_path / "order.csv"
+    blocks = [block.name for block in build_magnet(read_study(study)).blocks]
+    order.write_text("block\n" + "\n".join([*names, *blocks[1:]]) + "\n")
+    code, sentence = refused(["forces", study, "--order", order, "-o", tmp_path / "out"], capsys)
+    assert code == 4
+    assert said in sentence
+    assert str(order) in sentence
 
 
 def test_a_result_as_input(campaign, tmp_path, capsys):
@@ -192,6 +229,128 @@ def test_options_that_the_file_does_not_need(tmp_path, capsys, options, said):
     assert code == 4
     assert said in sentence
     assert main(list(map(str, command))) == 0
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (["-o", ""], "-o/--output: must not be empty"),
+    (["-o", 300 * "x"], "-o/--output: must be a path"),
+    (["-o", "out", "--cache", ""], "--cache: must not be empty"),
+    (["-o", "out", "--getdp", ""], "--getdp: must not be empty"),
+    (["-o", "out", "--no-cache", "--cache", "x"], "not allowed with argument")])
+def test_paths_that_are_none(campaign, tmp_path, capsys, monkeypatch, options, said):
+    """An unset variable of a shell is no path; an empty one would be the current folder."""
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as raised:
+        main(["solve", str(campaign[0]), *options])
+    assert raised.value.code == 2
+    assert said in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["new", ""])
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_file_in_place_of_the_cache(campaign, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HALBACH_FE_CACHE_LIMIT_GIB", "1")
+    for command in (["cache", "ls"], ["solve", campaign[0], "-o", tmp_path / "out"]):
+        code, sentence = refused([*command, "--cache", campaign[1]], capsys)
+        assert code == 8
+        assert "must be a folder, but is a file" in sentence
+
+
+@pytest.mark.parametrize("options", [
+    ["--length-unit", "mm"], ["--field-unit", "mT"], ["--origin-m", "0.01,0,0"], COLUMNS,
+    ["--decimal-comma"], ["--format", "opera"]])
+def test_options_of_the_format_of_listed_maps(campaign, tmp_path, capsys, options):
+    """They would have no effect: each map has units of its own, in the study."""
+    study, _, _ = campaign
+    study.write_text(tomlkit.dumps(changed(BASE, maps=[{"name": "a", "file": "map.csv"}])))
+    code, sentence = refused(["infer", study, "-o", tmp_path / "out", *options], capsys)
+    assert code == 3
+    assert "maps.instrument.length_unit_m and flux_density_unit_T" in sentence
+    assert main(["infer", str(study), "-o", str(tmp_path / "out"), "--dry-run"]) == 0
+
+
+@pytest.mark.parametrize(("inference", "said"), [
+    ({"excluded_readings": list(range(1, 17))}, "some that the study does not exclude"),
+    ({"excluded_readings": [99]}, "rows of map"),
+    ({"held_out": {"radii_m": [0.01]}}, "none, at radii from 0.03 to 0.03 m"),
+    ({"held_out": {"radii_m": [0.01]}}, "Or are they in mm? Then set `instrument.length_unit_m`")])
+def test_sentences_about_readings(campaign, tmp_path, capsys, inference, said):
+    study, measured, _ = campaign
+    study.write_text(tomlkit.dumps(changed(BASE, inference=inference)))
+    code, sentence = refused(["infer", study, "--measurements", measured, "-o", tmp_path / "out"],
+                             capsys)
+    assert code == 4
+    assert said in sentence
+
+
+@pytest.mark.parametrize(("changes", "code", "said"), [
+    ({"inference": {"excluded_readings": [99]}}, 4, "rows of map b"),
+    ({"inference": {"held_out": {"every": 9}}}, 4, "readings of map b"),
+    ({"inference": {"held_out": {"components": ["z"]}}}, 4, "readings of map b"),
+    ({"noise": {"position_sd_m": 1e-6}}, 3, "since map b has no sigma_T"),
+    ({"noise": {"regions": [{"name": "far", "sigma_T": 1e-4, "z_min_m": 1.0}]}}, 3,
+     "every reading of map b"),
+    ({"name": "run.json"}, 3, "that of a file of results")])
+def test_sentences_name_the_map(campaign, tmp_path, capsys, changes, code, said):
+    study, measured, _ = campaign
+    header, *rows = measured.read_text().splitlines()
+    (tmp_path / "b.csv").write_text("\n".join(
+        [header, *(row.replace("0.2", "0.21") for row in rows)]) + "\n")
+    study.write_text(tomlkit.dumps(changed(BASE, maps=[
+        {"name": "a", "file": "map.csv"}, {"name": "b", "file": "b.csv"} | changes])))
+    found, sentence = refused(["infer", study, "-o", tmp_path / "out"], capsys)
+    assert found == code
+    assert said in sentence
+
+
+def test_gains_that_no_probe_has(campaign, tmp_path, capsys):
+    """The field is three times too large, and the gain is open."""
+    study, _, _ = campaign
+    study.write_text(tomlkit.dumps(changed(BASE, instrument_sd={"gain": 0.01})))
+    magnet = build_magnet(read_study(study))
+    points = points_from(magnet.study.observation.positions)
+    write_map(field_map(points, 3 * field_of(magnet.blocks, points)), tmp_path / "large.csv")
+    code, sentence = refused(["infer", study, "--measurements", tmp_path / "large.csv", "-o",
+                              tmp_path / "out"], capsys)
+    assert code == 4
+    assert "standard deviations. Are they in another unit, or of another magnet?" in sentence
+
+
+def test_a_map_that_is_not_in_m_and_T(tmp_path, capsys):
+    rows = [f"{x},{y},{z},{x + 1},{y},{-2 * z}" for x in range(3) for y in range(3)
+            for z in range(3)]
+    for scale, said in (("e3", "below 10 T"), ("", "within 100 m")):
+        file = tmp_path / "map.csv"
+        file.write_text("x_m,y_m,z_m,Bx_T,By_T,Bz_T\n" + "\n".join(
+            ",".join(f"{cell}e12" if number < 3 and not scale else f"{cell}{scale}"
+                     if number >= 3 else cell for number, cell in enumerate(row.split(",")))
+            for row in rows) + "\n")
+        code, sentence = refused(["check", file], capsys)
+        assert code == 4
+        assert said in sentence
+
+
+def test_angles_in_degrees(tmp_path, capsys):
+    file = tmp_path / "ring.txt"
+    file.write_text("r phi z Br Bphi Bz\n" + "".join(
+        f"10 {angle} 0 1 0 0\n" for angle in range(0, 360, 45)))
+    command = ["import-map", file, "-o", tmp_path / "map.csv", "--length-unit", "mm",
+               "--field-unit", "mT", "--angle-unit"]
+    code, sentence = refused([*command, "rad"], capsys)
+    assert code == 4
+    assert "within 12.6 rad; instead received 315. Are they in degrees?" in sentence
+    assert main([str(each) for each in (*command, "deg")]) == 0
+
+
+def test_a_coordinate_of_the_file_and_of_the_options(tmp_path, capsys):
+    file = tmp_path / "hall.txt"
+    file.write_text("0.0 0.0 0.0 731.2 1.1 0.0\n0.0 0.0 1.0 730.9 1.2 0.1\n")
+    code, sentence = refused(["import-map", file, "-o", tmp_path / "map.csv", *COLUMNS,
+                              "--at", "x=0.5"], capsys)
+    assert code == 4
+    assert "a column x in the file and --at x=0.5" in sentence
 
 
 def test_values_that_begin_with_a_minus():

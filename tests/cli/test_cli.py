@@ -124,7 +124,7 @@ def test_infer_writes_everything(study, measured, tmp_path, capsys):
     arguments = ["infer", str(study), "--measurements", str(measured), "-o", str(out)]
     assert main(arguments) == 0
     shown = capsys.readouterr()
-    assert "posterior" in shown.out
+    assert "after, rms" in " ".join(shown.out.split())
     assert "Report:" in shown.err
     assert {"posterior.h5", "prediction.csv", "summary.json", "report.html", "profile.png",
             "response.h5"} <= {path.name for path in out.iterdir()}
@@ -170,7 +170,7 @@ def test_prior_of_measured_blocks(study, table, tmp_path, capsys):
     assert main(["prior", str(study), str(table), "-o", str(out)]) == 0
     assert "along in %" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {
-        "prior.h5", "prior.json", "prior.html", "prior_qq.png", "run.json"}
+        "prior.h5", "prior.json", "prior.html", "prior_blocks.png", "page.json", "run.json"}
     assert main(["prior", str(study), str(table), "-o", str(out), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary == json.loads((out / "prior.json").read_text())

@@ -24,23 +24,29 @@ from tests.support.interruption import (
 )
 
 EXAMPLE = ROOT / "studies" / "quadrupole"
-MOMENTS = 3
+MOMENTS = 2
 """Of each command; `python -m benchmarks.run recovery` has more, and diagnose."""
+IMPORTS = 0.3
+"""Share of a command's time that its imports take, before there is anything to lose."""
 
 
 @pytest.mark.parametrize("verb", ["solve", "infer"])
 def test_killed_and_run_again(verb, tmp_path):
     study, campaign, alone = EXAMPLE / "study.toml", EXAMPLE / "campaign", tmp_path / "alone"
     took = undisturbed(command(verb, study, campaign, alone), environment_of(tmp_path / "cache"))
-    generator, hits = np.random.default_rng(), 0
-    for number in range(MOMENTS):
-        output, moment = tmp_path / str(number), float(generator.uniform(0.2, took))
+    generator, hits, earliest = np.random.default_rng(), 0, min(IMPORTS * took, 1.0)
+    for number in range(5 * MOMENTS):
+        output, moment = tmp_path / str(number), float(generator.uniform(earliest, took))
         end = kill_and_run_again(
             command(verb, study, campaign, output), environment_of(tmp_path / f"cache-{number}"),
             output, alone, moment)
         assert not end.broken, f"killed after {moment} s"
         hits += end.hit
-    assert hits
+        if hits == MOMENTS:
+            break
+        if not end.hit:  # the machine is less busy than when the time was taken
+            took = max(0.7 * took, 1.1 * earliest)
+    assert hits == MOMENTS
 
 
 ORPHANING = """

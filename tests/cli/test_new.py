@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -25,6 +26,9 @@ MAGNETS = [
            for shape, iron, length, order in itertools.product(
                ("sector", "trapezoid", "cuboid"), (False, True), (None, 0.03), (1, 2))]
 MAGNETS += [MagnetTemplate(material="N42"),
+            MagnetTemplate(shape="cuboid", cube_m=0.012, ring_length_m=0.012, inner_radius_m=0.13,
+                           outer_radius_m=0.142, blocks_per_ring=24, dsv_m=0.16),
+            MagnetTemplate(steel="aisi_1010", iron_ring=True),
             MagnetTemplate(inner_radii_m=(0.05, 0.06), ring_length_m=0.03, shape="trapezoid"),
             MagnetTemplate(free_blocks=str(ROOT / "studies/mri4all/blocks.csv")),
             MagnetTemplate(free_blocks=str(ROOT / "studies/hybrid-quadrupole/blocks.csv"),
@@ -80,6 +84,58 @@ def test_command_writes_rings_of_their_own_and_free_blocks(tmp_path, capsys):
             assert main(["new", str(tmp_path / "wrong.toml"), *wrong]) == 3
         assert capsys.readouterr().err
         assert not (tmp_path / "wrong.toml").exists()
+
+
+CUBES = ["--cube-m", "0.012", "--radius-m", "0.136", "--blocks-per-ring", "24"]
+
+
+def test_cubes_around_a_sphere_with_noise_that_suits_them(tmp_path):
+    """A magnet of cubes makes some 10 mT, and a cross-section of sectors some 0.7 T."""
+    path, strong = tmp_path / "cubes.toml", tmp_path / "strong.toml"
+    assert main(["new", str(path), *CUBES, "--rings", "4", "--dsv-m", "0.16"]) == 0
+    study = read_study(path)
+    points = points_from(study.observation.positions)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.08, rtol=1e-3)
+    assert study.array.block.width_m == study.array.ring_length_m == 0.012
+    hidden = held_out_readings(study, observe(study, points, np.ones_like(points, bool)))
+    assert hidden.mean() == pytest.approx(1 / 5, abs=0.01)
+    assert main(["new", str(strong), "--steel", "aisi_1010"]) == 0
+    assert read_study(strong).iron_ring.curve.name == "aisi_1010"
+    noise, other = study.noise, read_study(strong).noise
+    assert 1e-6 <= noise.regions[0].sigma_T <= 3e-6
+    assert 5e-5 <= other.regions[0].sigma_T <= 1e-4  # the control: not that of every magnet
+    assert 1e-5 <= noise.position_sd_m[0] <= 1e-4
+
+
+@pytest.mark.parametrize(("options", "code", "said"), [
+    (["--cube-m", "0.012"], 2, "--radius-m"), ([*CUBES, "--shape", "sector"], 2, "--shape"),
+    (["--inner-radii-m", "0.02,0.03"], 2, "--ring-length-m"),
+    (["--inner-radii-m", "0.02,0.03", "--ring-length-m", "0.03", "--rings", "2"], 2, "--rings"),
+    (["--free-blocks", "{overlapping}"], 3, "overlap"),
+    *((["--free-blocks", str(ROOT / "studies/mri4all/blocks.csv"), option, value], 2, option)
+      for option, value in (("--remanence-T", "1.2"), ("--shape", "sector"), ("--rings", "1"),
+                            ("--blocks-per-ring", "16"), ("--ring-length-m", "0.1"),
+                            ("--material", "N42"), ("--outer-radius-m", "0.2")))])
+def test_options_that_a_study_would_not_show(tmp_path, capsys, options, code, said):
+    """Nor is a study written that no command could use."""
+    path, overlapping = tmp_path / "magnet.toml", tmp_path / "overlapping.csv"
+    overlapping.write_text(
+        "name,shape,x_m,y_m,z_m,size_x_m,size_y_m,size_z_m,remanence_T\n"
+        "a,cuboid,-0.03,0,0,0.02,0.02,0.02,1.3\nb,cuboid,-0.02,0,0,0.02,0.02,0.02,1.3\n")
+    options = [each.format(overlapping=overlapping) for each in options]
+    assert main(["new", str(path), *options]) == code
+    assert said in capsys.readouterr().err
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["my magnet.toml", "-x.toml"])
+def test_the_command_that_is_proposed_works(tmp_path, capsys, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "--", name]) == 0
+    proposed = capsys.readouterr().err.partition("Next: halbach-fe ")[2]
+    words = shlex.split(proposed)
+    assert words[0] == "solve"
+    assert main(["multipoles", words[1], "-o", "out"]) == 0
 
 
 def test_nothing_is_overwritten_and_nonsense_is_refused(tmp_path, capsys):

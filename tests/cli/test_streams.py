@@ -43,6 +43,14 @@ def test_streams_that_cannot_be_written(verb, to, code, said):
     assert len(shown.splitlines()) == bool(said)
 
 
+def test_a_table_on_a_full_device():
+    """rich wrote an empty text to it by itself, which fails where nothing is buffered."""
+    code = FLAWED.format("common.print_table([{'a': 'b'}])")
+    found, _, said = shell(f"'{sys.executable}' -c \"{code}\" >/dev/full", PYTHONUNBUFFERED="1")
+    assert (found, said.count("\n")) == (8, 1)
+    assert "standard output: No space left" in said
+
+
 def test_a_reader_that_leaves():
     """As programs do that a broken pipe ends: silently, with 141."""
     assert shell(f"{PROGRAM} --help | true; exit ${{PIPESTATUS[0]}}") == (141, "", "")

@@ -9,12 +9,19 @@ import os
 import subprocess
 import sys
 import threading
+from datetime import datetime
 
 import pytest
 
 from halbach_fe.core.errors import OutputError
 from halbach_fe.core.files import write_text
-from halbach_fe.core.result_folder import RECORD, locked_folder, result_folder
+from halbach_fe.core.result_folder import (
+    RECORD,
+    finished_results,
+    keep_results,
+    locked_folder,
+    result_folder,
+)
 
 
 def run(folder, *names, command="solve", study="a"):
@@ -172,3 +179,90 @@ def test_a_lock_that_is_removed_meanwhile(tmp_path, monkeypatch):
         monkeypatch.undo()
         with pytest.raises(OutputError, match="in use"):
             run(tmp_path, "report.html")
+
+
+def test_what_a_finished_run_left(tmp_path):
+    """Its inputs and results, and whether somebody has changed these since."""
+    folder, given = tmp_path / "out", tmp_path / "map.csv"
+    given.write_text("1 2 3")
+    with result_folder(folder, "solve", "a", [given, tmp_path / "gone"]):
+        for name in ("page.html", "part/page.html"):
+            write_text(folder / name, name)
+    with finished_results(folder) as found, finished_results(folder) as again:
+        assert found.record == again.record
+        assert found.record.inputs == {str(given): hashlib.sha256(b"1 2 3").hexdigest()}
+        assert datetime.fromisoformat(found.record.ended).tzinfo is not None
+        assert found.read("part/page.html", 14) == b"part/page.html"
+        assert found.changed() == []
+        with pytest.raises(OutputError, match="in use"):  # a run would change what is read
+            run(folder, "page.html")
+        for name, most, said in (("page.html", 8, "more than 8"), (RECORD, 99, "no result")):
+            with pytest.raises(ValueError, match=said):
+                found.read(name, most)
+        (folder / "page.html").write_text("other")
+        (folder / "part" / "page.html").unlink()
+        (folder / "part").rmdir()
+        assert found.changed() == ["page.html"]
+        (tmp_path / "page.html").write_text("part/page.html")
+        (folder / "part").symlink_to(tmp_path)
+        with pytest.raises(ValueError, match="not in the folder"):
+            found.read("part/page.html", 99)
+        (folder / "page.html").unlink()
+        (folder / "page.html").symlink_to(given)
+        assert "page.html" in found.changed()
+        with pytest.raises(ValueError, match="not in the folder"):
+            found.read("page.html", 99)
+    with result_folder(folder, "solve", "a"), pytest.raises(OutputError, match="in use"), \
+            finished_results(folder):
+        pass
+
+
+def test_results_are_not_written_over(tmp_path):
+    """By a command that writes a single file, in a folder of the results too."""
+    run(tmp_path / "out", "page.html", "part/page.html")
+    (tmp_path / "out" / "part" / RECORD).write_text("{")
+    for name in ("page.html", "part/page.html"):
+        with pytest.raises(OutputError, match="is a result of `solve`"):
+            keep_results(tmp_path / "out" / name)
+    keep_results(tmp_path / "out" / "part" / "mine.html")
+    keep_results(tmp_path / "page.html")
+
+
+def left_by_a_killed_run(folder):
+    folder.mkdir()
+    subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False)
+
+
+def left_by_a_failed_run(folder):
+    run(folder, "page.html")
+    with pytest.raises(ZeroDivisionError), result_folder(folder, "solve", "a"):
+        raise ZeroDivisionError
+
+
+def a_pipe(folder):
+    folder.mkdir()
+    os.mkfifo(folder / RECORD)
+
+
+def a_link(folder):
+    run(folder.with_name("other"), "page.html")
+    folder.mkdir()
+    os.symlink(folder.with_name("other") / RECORD, folder / RECORD)
+
+
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda folder: None, "which does not exist"), (lambda folder: folder.touch(), "a file"),
+    (lambda folder: folder.mkdir(), "which has no run.json"),
+    (left_by_a_killed_run, "failed, was killed"), (left_by_a_failed_run, "failed, was killed"),
+    (a_pipe, "damaged or of another"), (a_link, "cannot be read")])
+def test_no_finished_results(tmp_path, make, said):
+    make(tmp_path / "out")
+    with pytest.raises(OutputError, match=said), finished_results(tmp_path / "out"):
+        pass
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "[" * 100_000, '{"command": 7}', "\0"])
+def test_records_of_others(tmp_path, content):
+    (tmp_path / RECORD).write_text(content)
+    with pytest.raises(OutputError, match="damaged or of another"), finished_results(tmp_path):
+        pass

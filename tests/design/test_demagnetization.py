@@ -207,5 +207,7 @@ def test_the_command_line(tmp_path, capsys):
 def test_studies_that_say_too_little_are_refused(dipole, session):
     with pytest.raises(StudyError, match="what the material withstands"):
         demagnetization_map(build_magnet(dipole()), session)
+    with pytest.raises(StudyError, match="with temperature_C: the rest is known of N42SH"):
+        demagnetization_map(build_magnet(dipole(array__material="N42SH")), session)
     with pytest.raises(ValueError, match="zero or negative"):
         Demagnetization(**COLD | {"coercivity_coefficient_per_K": -0.012, "temperature_C": 120.0})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
@@ -17,7 +17,7 @@ from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
@@ -105,5 +105,27 @@ def test_sides_that_are_equal_are_told_with_their_odds(session, generator):
     # the magnet is symmetric: neither side can be sure
     assert max(position.probability for position in found.positions) < 0.9
     assert abs(named.values[0]) == pytest.approx(0.04, abs=4 * named.sd[0])
-    assert "The magnet is the same from several sides" in " ".join(verdict(found))
+    assert "The magnet is the same from several sides" in " ".join(answer(found).sentences)
     assert len(diagnosis_summary(found)["positions"]) == len(found.positions) > 1
+
+
+def identified(name, value, *equals):
+    """An effect with an amplitude of standard deviation 1, and the names of its alternatives."""
+    (effect,) = [one for one in catalogue() if one.name == name]
+    return IdentifiedEffect(
+        Hypothesis(effect, Place()), np.array([value]), np.array([1.0]),
+        SelectedEffect(Candidate(name, "", (0,)), 50.0, 45.0, tuple(
+            (Candidate(other, "", (0,)), 49.0) for other in equals)))
+
+
+def test_equals_that_take_turns_have_come_to_rest():
+    """An offset that a background explains as well would give way to it in every other round."""
+    before = [identified("z_scale", 3.0), identified("offset_x", 9.0)]
+    equal = identified("background", 9.0, "offset_x")
+    assert only_equals_took_turns(before, [identified("z_scale", 3.1), equal])
+    # controls: another effect moves, the new one explains more, is more, or replaces nothing
+    assert not only_equals_took_turns(before, [identified("z_scale", 4.0), equal])
+    assert not only_equals_took_turns(before, [before[0], identified("background", 9.0)])
+    assert not only_equals_took_turns(before, [*before, equal])
+    assert not only_equals_took_turns(before, [equal])
+    assert not only_equals_took_turns(before, before)

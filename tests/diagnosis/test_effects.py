@@ -130,10 +130,13 @@ def test_seams_move_what_is_beyond_them_outwards():
     effect = EFFECTS["ring_gap"]
     moved = [
         [block.displacement_m[2]
-         for block in build_magnet(effect.apply(STUDY, place, [1e-3])).blocks[::16]]
+         for block in build_magnet(effect.apply(STUDY, place, [1e-3, 0.0])).blocks[::16]]
         for place in effect.places(STUDY)]
     assert moved == pytest.approx(np.array([
         [-1e-3, 0, 0, 0], [-5e-4, -5e-4, 5e-4, 5e-4], [0, 0, 0, 1e-3]]))
+    half_held = effect.apply(STUDY, effect.places(STUDY)[1], [1e-3, 5e-4])
+    assert [block.displacement_m[2] for block in build_magnet(half_held).blocks[::16]] == (
+        pytest.approx([0, 0, 1e-3, 1e-3]))
 
 
 def test_losses_of_corners_add_up_and_are_no_gains():

@@ -17,7 +17,7 @@ from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import NominalSolver, with_short_steps
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -59,12 +59,17 @@ def test_a_knee_is_named_with_its_parameters(session, generator):
     assert found.converged
     assert found.after.prior_conflict < found.after.conflict_limit < found.before.prior_conflict
     assert found.study.demagnetization.irreversible
-    assert f"coercivity {coercivity / 1e3:.0f}"[:14] in " ".join(verdict(found))
+    assert f"coercivity {coercivity / 1e3:.0f}"[:14] in " ".join(answer(found).sentences)
     assert diagnosis_summary(found)["effects"][0]["parameters"][1]["value"] == coercivity
 
     # negative control: the same blocks have lost nothing
     clean = diagnose(STUDY, field_map(POINTS, whole + noise), session, effects=some, solver=solver)
     assert clean.identified == ()
+
+    # the cheap estimate leaves out coercivities that the readings rule out: all of them here
+    tried = [candidate.place for candidate in found.candidates if candidate.effect == "knee"]
+    assert 0 < len(tried) < len(COERCIVITIES)
+    assert "knee" not in {candidate.effect for candidate in clean.candidates}
 
 
 def test_where_it_is_looked_for():

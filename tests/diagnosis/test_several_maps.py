@@ -24,7 +24,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.campaign import read_maps
 from halbach_fe.measurement.field_map import field_map, points_of, readings_sha256, write_map
 from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
@@ -129,7 +129,7 @@ def test_a_stage_that_is_rolled_is_named_with_its_map(generator, tmp_path, rolle
     other = ({"body", "fringe"} - {rolled}).pop()
     assert found.study.maps[[one.name for one in found.study.maps].index(other)] == (
         found.corrected_study.maps[[one.name for one in found.study.maps].index(other)])
-    assert f"map {rolled}" in " ".join(verdict(found))
+    assert f"map {rolled}" in " ".join(answer(found).sentences)
     # if it could not be told from another effect, that map would be measured again
     (roll,) = found.identified
     rival = Candidate("misalignment_xy", f"map {rolled}", ())
@@ -148,7 +148,7 @@ def test_nothing_is_named_of_maps_without_errors(generator, tmp_path):
                      effects=SOME)
     assert not found.found_anything
     assert found.unknown is None
-    assert "these maps can show" in " ".join(verdict(found))
+    assert "these maps can show" in " ".join(answer(found).sentences)
 
 
 def test_poses_that_are_open_hide_no_effect_and_take_none(generator, tmp_path):
@@ -180,7 +180,7 @@ def test_what_nobody_listed_is_unknown_and_named_with_its_map(generator, tmp_pat
     assert found.unknown is not None
     assert found.unknown.kind == "instrument"
     assert {part.map for part in found.unknown.parts} == {"fringe"}
-    assert "in map fringe" in " ".join(verdict(found))
+    assert "in map fringe" in " ".join(answer(found).sentences)
 
 
 def test_the_command_names_the_probe_that_maps_share(generator, tmp_path, capsys):

@@ -11,7 +11,7 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.summary import diagnosis_summary, other_findings
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle
@@ -40,7 +40,7 @@ def test_a_coarse_mesh_is_no_effect(session, generator):
     assert diagnosis.solver_error.largest_over_noise > 1
     assert diagnosis_summary(diagnosis)["verdict"] == "numerical"
     assert [one.name for one in other_findings(diagnosis)] == ["solver_error"]
-    assert verdict(diagnosis)[-1].startswith("The solver's own error explains the misfit")
+    assert answer(diagnosis).said.startswith("The solver's own error explains the misfit")
 
 
 @pytest.mark.parametrize(("method", "gain"), [("reaction", 0.0), ("direct", 0.1)])

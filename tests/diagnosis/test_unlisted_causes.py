@@ -8,8 +8,10 @@ import pytest
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
 from halbach_fe.diagnosis.unknown_cause import are_scattered
-from halbach_fe.report.diagnosis import verdict
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -53,9 +55,35 @@ def test_an_unlisted_cause_is_unknown(small, session, seed):
         assert set(first.components) == {"xyz"[axis] for axis in cause.axes}
     # the posterior mean has the size of what was added; the blocks absorb a part of it
     assert first.rms_T == pytest.approx(np.sqrt(3) * cause.rms_T, rel=0.5)
-    text = " ".join(verdict(found))
+    text = " ".join(answer(found).sentences)
     assert "outside the catalogue is missing" in text
     assert "It looks like" in text
+
+
+def coordinates_of(points):
+    """The coordinates that errors of the instrument may depend on."""
+    found = instrument_families(points, np.linspace(0, 1, len(points)), np.ones((len(points), 3)),
+                                np.ones((len(points), 3, 3)), 1e-5)
+    return {family.along for family in found}, found
+
+
+def test_on_a_line_azimuth_and_radius_are_functions_of_z():
+    z = np.linspace(-0.5, 0.5, 60)
+    line = np.column_stack([0.07 + 0.001 * z, 0.03 - 0.02 * z, z])
+    assert not coordinates_of(line)[0] & {"radius", "angle"}
+    bent = line + np.column_stack([0.01 * np.sin(9 * z), 0 * z, 0 * z])
+    assert coordinates_of(bent)[0] >= {"radius", "angle", "z"}  # the control
+
+
+def test_a_map_of_one_component_has_errors_of_one_sensor():
+    z = np.linspace(-0.5, 0.5, 60)
+    _, found = coordinates_of(np.column_stack([0 * z, 0 * z, z]))
+    family = next(one for one in found if (one.acts_on, one.along) == ("readings", "z"))
+    fields = family.fields()[:, :, 0] / 1e-5  # (terms, n): what a map of Bx shows, in sigma
+    error = 3 * np.cos(7 * z)
+    evidence = Evidence(fields @ fields.T, fields @ error, float(error @ error), len(z),
+                        np.ones(len(fields)), np.zeros((0, len(fields))))
+    assert fit_family(family, evidence).axes == (0,)
 
 
 def test_without_the_competition_false_names_appear(small, session, monkeypatch):
@@ -87,7 +115,7 @@ def test_a_missing_block_beside_an_unlisted_cause(small, session):
     assert [effect.hypothesis.effect.name for effect in found.identified] == ["block_missing"]
     assert found.unknown is not None
     assert not found.unknown.alone
-    assert "outside the catalogue remains" in " ".join(verdict(found))
+    assert "outside the catalogue remains" in " ".join(answer(found).sentences)
 
 
 def test_scattered_sources():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import tempfile
 import tomllib
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,6 +26,7 @@ from halbach_fe.core.errors import (
     HalbachWarning,
     MeasurementError,
     MeshError,
+    OutputError,
     StudyError,
 )
 from halbach_fe.geometry.magnet import build_magnet
@@ -40,6 +42,7 @@ from halbach_fe.measurement.formats.files import READERS as FORMATS
 from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.measurement.formats.grid import grid_of
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
+from halbach_fe.report.campaign_report import read_campaign
 from halbach_fe.response import matrix as matrix_module
 from halbach_fe.response.matrix import Response, StoredMatrix, _beside
 from halbach_fe.response.matrix import _read as read_response
@@ -77,6 +80,7 @@ from tests.measurement.test_import_map import (
     rows,
 )
 from tests.solver.test_dofs import ROWS, SOLUTIONS, matrix, saved, vectors
+from tests.support.results import results
 
 TINY = parse_study(changed(
     DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__growth=4.0,
@@ -179,6 +183,22 @@ def unverified(module: ModuleType, read: Callable[[Path], Any]) -> Callable[[Pat
             warnings.simplefilter("ignore", HalbachWarning)
             return read(path)
     return reading
+
+
+RESULTS_OF_TESTS = tempfile.TemporaryDirectory()
+"""Where results are for as long as the tests run."""
+
+
+@cache
+def sound_results(name: str) -> Path:
+    return results(Path(RESULTS_OF_TESTS.name) / name, "solve")
+
+
+def in_results(path: Path) -> dict[str, object]:
+    """Read a file in its place in a folder of results, beside a sound one."""
+    folder = sound_results(path.name)  # so that whatever names the folder names the file
+    (folder / path.name).write_bytes(path.read_bytes())
+    return read_campaign([sound_results("sound"), folder]).plain()
 
 
 def a_matrix() -> bytes:
@@ -444,6 +464,8 @@ XML = (b"<DataArray", b"</DataArray>", b"NumberOfComponents", b'"1000000000"', b
        b"<Piece", b"offset")
 MSH = (b"$Nodes\n", b"$EndNodes\n", b"$Elements\n", b"$EndElements", b"$Periodic\n", b"$NodeData\n",
        b"$PhysicalNames\n", b"1000000000\n", b"2.2 0 8\n")
+RESULTS = (b'"../page.html"', b'"/etc/passwd"', b'"\\u001b[31m"', b'"\\ud800"', b"null", b"[", b"{",
+           b"1e999", b'"command"', b'"halbach-fe check"', b'"ended"', b'"study": null', b'"rows"')
 LOG = (b"  0 KSP Residual norm 1.0\n", b"KSP Residual norm nan\n", b" 3 KSP Residual norm x\n",
        b"System 1/1: 72 Dofs\n", b"System 1/1: %s Dofs\n" % (b"1" * 5000), b"Warning : ",
        b"NEWTON 1 0 x\n", b"NEWTON 1 3 1e-9\n", b"Error : ")
@@ -462,7 +484,8 @@ NAMES = (
     "map (HDF5)", "map (VTU)", "block table", "order of assembly",
     "import: columns", "import: opera", "import: comsol",
     "import: openpmd", "import as columns", "import as opera", "import as comsol",
-    "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains", "mesh",
+    "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains",
+    "results: run.json", "results: page.json", "mesh",
     "regions", "GetDP: unknowns", "GetDP: unknowns of edges", "GetDP: solutions",
     "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log", "cached answer")
 """To collect tests by, without making the seeds."""
@@ -504,7 +527,8 @@ def readers() -> tuple[Reader, ...]:
                read_map, MeasurementError, check_map, XML),
         Reader("block table", "blocks.csv", (BLOCKS_CSV,), read_blocks, MeasurementError,
                check_blocks, COLUMNS),
-        Reader("order of assembly", "order.csv", (ORDER_CSV,), read_order, MeasurementError,
+        Reader("order of assembly", "order.csv", (ORDER_CSV,),
+               partial(read_order, blocks=("r01s01", "r01s02")), MeasurementError,
                check_order, (b"block",)),
         replace(foreign, name="import: columns", seeds=columns),
         replace(foreign, name="import: opera", seeds=((OPERA + rows(field=FIELD)).encode(),)),
@@ -529,6 +553,9 @@ def readers() -> tuple[Reader, ...]:
                 b"(-1, 2)", b"(", b"{", b"\x93NUMPY\x02\x00")),
         Reader("stored chains", "chains.nc", (chains(),), unverified(mcmc, resumed), None,
                check_resumed, (*HDF5, b"PCG64", b"bit_generator", b"state", b"has_uint32")),
+        *(Reader(f"results: {name}", name, ((sound_results("sound") / name).read_bytes(),),
+                 in_results, OutputError, json.dumps, RESULTS)
+          for name in ("run.json", "page.json")),
         Reader("mesh", "mesh.msh", (left["mesh"], ascii_mesh), mesh_beside(
             left["regions"]), MeshError, tokens=MSH),
         Reader("regions", "regions.json", (left["regions"],), Regions.read, MeshError,

@@ -17,6 +17,7 @@ from halbach_fe.geometry.regions import Regions
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.report.page import write_page
+from halbach_fe.report.page_record import Picture
 from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.magnetostatics import fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
@@ -263,7 +264,7 @@ def test_templates_escape(tmp_path, text):
     """The frame that all pages share, text in every place; the harmless page is the control."""
     def parts(word):
         study = parse_study(TINY).model_copy(update={"description": word})
-        write_page(tmp_path / "page.html", "calibration.html.j2", [("", word)], study,
+        write_page(tmp_path / "page.html", "calibration.html.j2", [Picture("", word)], study,
                    {word or "x": word}, results={})
         return Parts((tmp_path / "page.html").read_text(encoding="utf-8"))
     found = parts(text.replace("\ud7ff", ""))

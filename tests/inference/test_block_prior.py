@@ -18,7 +18,7 @@ import xarray as xr
 
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map
@@ -37,7 +37,7 @@ from halbach_fe.stats.small_samples import (
 )
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic import bodies
-from halbach_fe.synthetic.helmholtz_coil import moment_matrix
+from tests.oracles.lone_block import moment_matrix
 
 VOLUME = np.pi * (0.1865**2 - 0.104**2) / 16 * 0.08
 """Of a block of the short dipole."""
@@ -193,12 +193,35 @@ def test_rotation_from_block_axes(vacuum_dipole, generator):
                           table_of(study, slots, truth, rings, moment=VOLUME * truth))
 
 
-def test_volume_of_the_table_counts(vacuum_dipole, generator):
+def test_moments_are_kept(vacuum_dipole, generator):
+    """The field of a block is that of its moment, whatever its volume is; a wrong one is refused.
+
+    The prior of a block was its moment over the measured volume, in the volume of the study.
+    """
     study = vacuum_dipole()
+    magnet = build_magnet(study)
     slots, rings, truth = blocks_and_truth(study, generator)
-    prior = prior_from_blocks(build_magnet(study),
-                              table_of(study, slots, truth, rings, volume=0.98 * VOLUME))
-    np.testing.assert_allclose(prior.gaussian.mean, truth.ravel() / 0.98, rtol=1e-9)
+    prior = prior_from_blocks(magnet, table_of(study, slots, truth, rings, volume=0.98 * VOLUME))
+    np.testing.assert_allclose(prior.gaussian.mean, truth.ravel(), rtol=1e-9)
+    for ratio in (0.67, 1.2):
+        table = table_of(study, slots, truth, rings, volume=ratio * VOLUME)
+        with pytest.raises(MeasurementError, match=r"volume_m3 of block B0 .* of its block"):
+            prior_from_blocks(magnet, table)
+        with pytest.raises(MeasurementError, match="volume_m3 of block B0"):
+            loose_blocks(magnet, table)
+
+
+def test_lengths_of_a_cross_section(dipole, generator):
+    """Without a length of the rings, volumes tell it; they must tell the same one."""
+    study = dipole(array__recoil_permeability=1.0, array__ring_length_m=None)
+    slots, rings, truth = blocks_and_truth(study, generator)
+    volumes = np.full(len(slots), VOLUME)
+    table = table_of(study, slots, truth, rings, volume=VOLUME)
+    mean = prior_from_blocks(build_magnet(study), table).gaussian.mean
+    np.testing.assert_allclose(mean, truth[:, :2].ravel(), rtol=1e-9)
+    volumes[3] *= 1.4
+    with pytest.raises(MeasurementError, match="volume_m3 of block B3"):
+        prior_from_blocks(build_magnet(study), replace(table, volume=volumes))
 
 
 def test_temperature(vacuum_dipole, generator):
@@ -210,6 +233,9 @@ def test_temperature(vacuum_dipole, generator):
                                truth.ravel() / 0.99)
     np.testing.assert_allclose(  # without a coefficient temperatures are not used
         prior_from_blocks(build_magnet(vacuum_dipole()), warm).gaussian.mean, truth.ravel())
+    different = replace(warm, temperature=np.where(np.arange(len(slots)) % 2, 20.0, 30.0))
+    with pytest.raises(MeasurementError, match=r"20 to 30 °C\. Add temperature_coefficient_per_K"):
+        prior_from_blocks(build_magnet(vacuum_dipole()), different)
     with pytest.raises(MeasurementError, match=r"temperature_C of block B0 .* must be given"):
         prior_from_blocks(build_magnet(study), table_of(study, slots, truth, rings))
 

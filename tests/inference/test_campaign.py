@@ -18,7 +18,7 @@ from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.campaign import maps_of, read_maps
-from halbach_fe.measurement.field_map import write_map
+from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import concatenate, observe
 from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.solver.session import Session
@@ -26,7 +26,7 @@ from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
-from tests.support.short_dipole import BODY, FRINGE, TEXT, campaign_study, reading, truth
+from tests.support.short_dipole import BODY, FRINGE, NOISE_T, TEXT, campaign_study, reading, truth
 
 POSES = {"body": (Rotation.from_rotvec([0.004, -0.003, 0.006]), np.array([3e-4, -2e-4, 5e-4])),
          "fringe": (Rotation.from_rotvec([-0.005, 0.004, 0.002]), np.array([-4e-4, 3e-4, 0.0503]))}
@@ -178,6 +178,24 @@ def test_a_sensor_out_of_place_in_one_map_only(generator):
     assert both.magnitude(np.vstack(fields)) == pytest.approx(
         np.linalg.norm(np.vstack([fields[0], np.repeat(fields[1], 3, axis=0)]), axis=1))
     assert both.places[:3] == pytest.approx(BODY[0] + np.outer([1e-3, 0, -1e-3], [0, 0, 1]))
+
+
+def test_sensors_whose_places_are_uncertain(generator, tmp_path):
+    """One sensor is 2 mm out of place, with the map where it is said to be, by magpylib."""
+    source = truth(generator)
+    places = [BODY + np.array([0.002, 0, 0]), BODY, BODY]
+    field = np.stack([source.getB(points)[:, axis] for axis, points in enumerate(places)], axis=1)
+    data = field_map(BODY, field + NOISE_T * generator.standard_normal(field.shape))
+    study = campaign_study().with_(maps=(), instrument_sd={"sensor_position_m": 2e-3})
+    result = infer(build_magnet(study), data, Session.open(tmp_path))
+    found = {name.split(".")[-1]: value for name, value in terms(result).items()}
+    for sensor, apart in zip("xyz", np.array([2, 0, 0]) - 2 / 3, strict=True):
+        change, sd = found[f"sensor_{sensor}_x_m"]
+        assert abs(change - 1e-3 * apart) < 4 * sd
+        assert sd < 2e-4
+    common, sd = found["translation_x_m"]  # what all have in common is a shift of the map
+    assert abs(common - 2e-3 / 3) < 4 * sd
+    assert result.disagreement == ""
 
 
 def campaign_file(folder, maps, extra=""):

@@ -60,4 +60,45 @@ def test_readings_that_the_study_holds_out(short_dipole):
 def test_read_again_at_the_same_points(dipole):
     """Other readings at the points of the map are a test of the noise, at least."""
     check(dipole(noise=NOISE, **COMPONENTS),
-          field_map(points_of(TRAINING), TRAINING["B_T"].values + 1e-9))
+          field_map(points_of(TRAINING), TRAINING["B_T"].values + 1e-4))
+
+
+@pytest.mark.parametrize(("moved_m", "added_T"), [(1e-9, 0.0), (0.0, 1e-6), (1e-8, -1e-6)])
+def test_the_training_map_rounded(dipole, moved_m, added_T):
+    with pytest.raises(MeasurementError, match=r"--held-out.*the same readings"):
+        check(dipole(noise=NOISE, **COMPONENTS),
+              field_map(points_of(TRAINING) + np.array([moved_m, 0, 0]),
+                        TRAINING["B_T"].values + added_T))
+
+
+def campaign(dipole, other, **settings):
+    study = dipole(noise=NOISE, maps=[{"name": "a", "file": "a.csv"},
+                                      {"name": "b", "file": "b.csv"} | settings], **COMPONENTS)
+    return maps_of(study, {"a": TRAINING, "b": other})
+
+
+def in_mm(data):
+    return field_map(1e3 * points_of(data), 1e3 * data["B_T"].values)
+
+
+@pytest.mark.parametrize(("other", "settings"), [
+    (TRAINING, {}),
+    (part(slice(0, 11)), {}),
+    (part([3, 7]), {}),
+    (field_map(points_of(TRAINING).round(6), TRAINING["B_T"].values.round(6)), {}),
+    (field_map(points_of(TRAINING), TRAINING["B_T"].values + 1e-5), {}),
+    (in_mm(TRAINING), {"instrument": {"length_unit_m": 1e-3, "flux_density_unit_T": 1e-3}}),
+    (field_map(points_of(TRAINING)[:, [1, 0, 2]], TRAINING["B_T"].values[:, [1, 0, 2]]),
+     {"instrument": {"position_axes": ["y", "x", "z"], "field_axes": ["y", "x", "z"]}})],
+    ids=["the same", "one row less", "a part", "rounded", "rounded to the noise",
+         "in mm and mT", "other axes"])
+def test_readings_in_two_maps(dipole, other, settings):
+    with pytest.raises(MeasurementError, match=r"`maps` 'a' and 'b'.*must not count twice"):
+        campaign(dipole, other, **settings)
+
+
+def test_two_maps_at_the_same_points(dipole, generator):
+    again = TRAINING["B_T"].values + 1e-4 * generator.normal(size=(12, 3))
+    assert len(campaign(dipole, field_map(points_of(TRAINING), again))) == 2
+    blank = np.where(np.arange(3) == 2, 0.01, np.nan) * np.ones((12, 1))
+    assert len(campaign(dipole, field_map(points_of(TRAINING), blank))) == 2

@@ -16,7 +16,7 @@ from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior
 from halbach_fe.inference.registration import odds, register
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.report.registration import by_hypothesis, sentences
+from halbach_fe.report.registration import answer, by_hypothesis, sentences
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import TEXT as CIRCLES
@@ -83,7 +83,7 @@ def test_a_profile_beside_the_axis_with_a_wrong_step(magnet, generator, tmp_path
     # without the step it fits worse: a control
     assert by_hypothesis(found)["nothing open"] < 1e-3
     assert odds(found).sum() == pytest.approx(1.0)
-    said = " ".join(sentences(found))
+    said = " ".join([answer(found).trust, *sentences(found)])
     assert "7 other answers" in said
     assert "does not determine the" in said
 
@@ -107,7 +107,8 @@ def test_a_profile_of_another_magnet_is_not_explained(magnet, generator, tmp_pat
             assert "unexplained" in str(error)
             continue
         assert not found[0].explains
-        assert "does not explain the map" in sentences(found)[0]
+        assert "does not explain the map" in answer(found).said
+        assert not answer(found).sound
 
 
 def test_the_command_compares_what_may_be_open(generator, tmp_path, capsys):

@@ -14,9 +14,10 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import OpenKey
 from halbach_fe.inference.pose_search import coarse_poses, right_angles
-from halbach_fe.inference.registration import odds, register
+from halbach_fe.inference.registration import axes_of_map, odds, register, turn_from_axes
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.solver.session import Session
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
 
@@ -115,6 +116,22 @@ def test_open_keys_and_probe(magnet, generator, tmp_path):
         register(tight, data, Session.open(tmp_path), open_keys=[OpenKey("array.ring_length", 1.0)])
 
 
+@pytest.mark.parametrize(("keys", "said"), [
+    ([OpenKey("instrument.length_unit_m", 0.1)], "on which the readings depend.*without effect"),
+    ([OpenKey("mesh.block_size_m", 1e-3)], "on which the readings depend.*without effect"),
+    ([OpenKey("prior.magnitude_sd", 1e-3)], "on which the readings depend.*without effect"),
+    ([OpenKey("array.ring_length_m", 1e-4)] * 2, "open once"),
+    ([OpenKey("array.rings", 1.0)], r"array\.rings=1 of --fit .*A whole number cannot be fitted"),
+    ([OpenKey("array.remanence_T", 100.0)], r"array\.remanence_T=100 of --fit .* smaller"),
+])
+def test_open_keys_that_cannot_be_fitted(magnet, generator, tmp_path, keys, said):
+    data = measured(truth(generator), generator, Rotation.identity(), np.array([0.0, 0.0, -0.045]))
+    steps = []
+    with pytest.raises(StudyError, match=said):
+        register(magnet, data, Session.open(tmp_path), open_keys=keys, most=1, say=steps.append)
+    assert bool(steps) == ("depend" in said)  # all others are refused before the search
+
+
 def test_every_pose_has_its_own_derivatives(magnet, generator, tmp_path):
     """Equal poses of an ideal dipole find the same length, whichever is fitted first."""
     data = measured(truth(generator, 0.0, 1.01), generator, Rotation.identity(),
@@ -166,3 +183,20 @@ def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):
     assert 0.5 < held_out["chi2_posterior"] < 2.0
     with pytest.raises(SystemExit, match="2"):
         main(["register", *arguments, "-o", str(tmp_path / "x"), "--fit", "array.rings"])
+    for options in (["--fit", "array.remanence_T=0.02", "--fit", "array.remanence_T=0.01"],
+                    ["--alternative", "array.remanence_T=0.02,array.remanence_T=0.01"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(["register", *arguments, "-o", str(tmp_path / "x"), *options])
+
+
+def test_turn_from_axes_is_what_remains_beside_right_angles():
+    small = np.array([1e-3, -2e-3, 5e-4])
+    for axes in ("xyz", "zxy", "yzx"):  # turns by 120 degrees have rotation vectors of odd numbers
+        frame = np.eye(3)[:, ["xyz".index(axis) for axis in axes]]
+        turned = Rotation.from_rotvec(small) * Rotation.from_matrix(frame)
+        instrument = Instrument(rotation_rad=tuple(turned.as_rotvec()))
+        assert list(axes_of_map(instrument).values()) == list(axes)
+        np.testing.assert_allclose(turn_from_axes(instrument), small, atol=1e-12)
+    half = Rotation.from_rotvec(small) * Rotation.from_rotvec([np.pi, 0, 0])
+    np.testing.assert_allclose(turn_from_axes(Instrument(
+        rotation_rad=tuple(half.as_rotvec()))), small, atol=1e-12)

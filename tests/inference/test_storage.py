@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
+from halbach_fe.api import homogeneity, multipoles
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import mcmc
@@ -59,6 +60,26 @@ def test_posterior_of_another_magnet(inferred, dipole, changes, key):
         read_posterior(build_magnet(other), path)
 
 
+def test_results_of_another_magnet(inferred, dipole, short_dipole, session):
+    """In Python too, and whatever it shares with the magnet."""
+    update, _ = inferred
+    alike = build_magnet(dipole(array__remanence_T=1.07, array__recoil_permeability=1.0))
+    larger = build_magnet(short_dipole(noise=NOISE, array__recoil_permeability=1.0))
+    known = {"posterior": update.posterior}
+    for use, said in (
+        (lambda: multipoles(alike, session, posterior=update), "with another `array.remanence_T`"),
+        (lambda: multipoles(larger, session, posterior=known), "96 parameters.*received 32"),
+        (lambda: multipoles(alike, session, posterior="posterior.h5"), "received a str"),
+        (lambda: homogeneity(larger, session, posterior=update), "another `dimension`"),
+        (lambda: homogeneity(larger, session, posterior=known), "96 parameters"),
+        (lambda: infer(larger, None, session, prior=update.posterior), "96 parameters"),
+        (lambda: infer(alike, None, session, prior=np.zeros(32)), "a Gaussian.*a ndarray"),
+    ):
+        with pytest.raises(MeasurementError, match=said):
+            use()
+    assert multipoles(update.magnet, session, posterior=update).tables
+
+
 def test_changed_posterior(inferred):
     update, path = inferred
     with h5py.File(path, "r+") as file:
@@ -66,6 +87,15 @@ def test_changed_posterior(inferred):
     with pytest.raises(OutputError, match="differs from its checksum") as raised:
         read_posterior(update.magnet, path)
     assert raised.value.exit_code == 8
+
+
+def test_another_hdf5_file_as_a_posterior(inferred, tmp_path):
+    """It is no posterior, rather than a changed one."""
+    update, _ = inferred
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["values"] = np.ones(3)
+    with pytest.raises(MeasurementError, match=r"a posterior\.h5 that halbach-fe infer wrote"):
+        read_posterior(update.magnet, tmp_path / "other.h5")
 
 
 def points_observed(update):

@@ -44,6 +44,14 @@ def test_round_trip(tmp_path):
     assert not np.array_equal(read_blocks(path).moment, table().moment)
 
 
+@pytest.mark.parametrize(("separator", "name"), [(";", "semicolons"), ("\t", "tabs")])
+def test_other_separators(tmp_path, separator, name):
+    path = written(tmp_path, *(row.replace(",", separator).replace(".", ",") for row in ROWS),
+                   header=HEADER.replace(",", separator))
+    with pytest.raises(MeasurementError, match=f"{name} separate. Separate columns by commas, and"):
+        read_blocks(path)
+
+
 def test_any_order_and_optional_columns(tmp_path):
     path = written(tmp_path, "0.1,A1,5,1,2,3", header="sigma_A_m2,serial,type,mz_A_m2,my_A_m2,"
                    "mx_A_m2")

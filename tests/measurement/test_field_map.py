@@ -10,7 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError, OutputError
-from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.registration import register
+from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.field_map import checked_map, field_map, points_of, read_map, write_map
+from halbach_fe.measurement.map_check import check_map
+from halbach_fe.solver.session import Session
 
 HEADER = "x_m,y_m,z_m,Bx_T,By_T,Bz_T\n"
 finite = st.floats(-9, 9, allow_nan=False)
@@ -168,3 +173,43 @@ def test_unknown_suffix_and_unwritable_folder(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="Cannot write"):
         write_map(data, tmp_path / "file" / "map.csv")
+
+
+def made(**variables):
+    """A map of three points, as a user makes it in Python."""
+    data = field_map(np.arange(9.0).reshape(3, 3) / 100, np.full((3, 3), 0.1))
+    return data.assign(variables)
+
+
+@pytest.mark.parametrize(("data", "said"), [
+    (None, "must be a Dataset; instead received a NoneType"),
+    ("map.csv", "must be a Dataset; instead received a str"),
+    ([made()], "must be a Dataset; instead received a list"),
+    (made().transpose(), "data.transpose"),
+    (made().sel(component=["z", "y", "x"]), "components z, y, x"),
+    (made().sel(component=["x"]), "components x"),
+    (made().drop_vars("component"), "components unnamed"),
+    (made().drop_vars("x_m"), "`x_m`"),
+    (made().isel(point=slice(0)), "at least one reading"),
+    (made().assign_coords(x_m=("point", [0.0, np.nan, 0.02])), "reading 2 .* finite numbers"),
+    (made(B_T=(("point", "component"), np.full((3, 3), "much"))), "numbers labelled"),
+    (made(sigma_T=(("other",), [1e-4, 1e-4])), "`sigma_T` .* labelled"),
+    (made(sigma_T=(("point", "component"), np.full((3, 3), -1e-4))), "sigma .* positive"),
+    (made(time_s=("point", [0.0, np.nan, 1.0])), "`time_s`")])
+def test_maps_that_are_made_in_python(dipole, data, said):
+    study = dipole()
+    for use in (lambda: maps_of(study, data), lambda: check_map(data),
+                lambda: register(build_magnet(study), data, Session.counting(1))):
+        with pytest.raises(MeasurementError, match=said):
+            use()
+    if data is not None:
+        with pytest.raises(MeasurementError, match=said):
+            maps_of(study, made(), data)
+    listed = dipole(maps=[{"name": "a", "file": "a.csv"}])
+    with pytest.raises(MeasurementError, match=said):
+        maps_of(listed, {"a": data})
+
+
+def test_sigma_of_one_number_holds_for_all_components():
+    assert checked_map(made(sigma_T=1e-4), "a")["sigma_T"].dims == ("point", "component")
+    assert checked_map(made(), "a").identical(made())

@@ -32,28 +32,30 @@ def test_the_numbers_are_those_of_the_prediction(campaign, session):
     result, said = answered(campaign, session, inference={"held_out": held_out})
     unseen = result.held_out
     off = 1e6 * np.sqrt(np.mean((result.readings - result.prediction_posterior.mean)[unseen]**2))
-    assert f"predicts {unseen.sum()} readings that were held out" in said[0]
-    assert f"to {off:.3g}\u00a0µT rms" in said[0]
+    assert f"predicts {unseen.sum()} readings that were held out" in said.said
+    assert f"to {off:.3g}\u00a0µT rms" in said.said
     # 5 % of some hundred readings: 95 ± 3 %
-    (share,) = re.findall(r"holds ([\d.]+)", said[0])
+    (share,) = re.findall(r"holds ([\d.]+)", said.said)
     assert 85 < float(share) <= 100
     ring, slot, value, sd = re.search(
-        r"most ring (\d+), slot (\d+) by ([-+][\d.]+)\s±\s([\d.]+)", said[1]).groups()
+        r"most ring (\d+), slot (\d+) by ([-+][\d.]+)\s±\s([\d.]+)", said.said).groups()
     block = result.magnet.number_of(int(ring), int(slot))
     nominal = result.by_block(result.response.nominal)[block]
     found = result.by_block(result.posterior.mean)[block]
     along = 100 * (found @ nominal / (nominal @ nominal) - 1)
     assert float(value) == pytest.approx(along, abs=0.05)
     assert 0 < float(sd) < 1.5  # the prior's is 1.4 %
-    assert "Model and readings agree" in said[2]
+    assert "Model and readings agree" in said.trust
+    assert said.sound
 
 
 def test_without_a_test_it_says_so(campaign, session):
     _, said = answered(campaign, session)
-    assert "No reading was held out" in said[0]
+    assert "No reading was held out" in said.trust
 
 
 def test_another_magnet_is_to_be_diagnosed(campaign, session):
     _, said = answered(campaign, session, array__ring_length_m=0.066)
-    assert "halbach-fe diagnose" in said[2]
-    assert "agree" not in said[2]
+    assert "halbach-fe diagnose" in said.command
+    assert not said.sound
+    assert "agree:" not in said.trust

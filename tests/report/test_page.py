@@ -13,10 +13,12 @@ from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import own_style, save, write_page
 from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page
 
+ANSWER = Answer("Is this a page?", "It is 1 page.", "Yes: it is a test.", "Read it to its end.")
 SEEN = "what the picture shows, in words"
 
 
@@ -25,7 +27,7 @@ def written(tmp_path):
     study = parse_study(DIPOLE | {"description": "<b>not bold</b>"})
     path = tmp_path / "page.html"
     write_page(path, "calibration.html.j2", save({"one.png": (Figure(), SEEN)}, tmp_path), study,
-               {"source": "a test"}, results={})
+               {"source": "a test"}, ANSWER, results={})
     return path
 
 
@@ -41,6 +43,8 @@ def test_a_page_is_whole(written):
 @pytest.mark.parametrize(("old", "new"), [
     ("src=\"data:", "src=\"https://example.org/"), (f"alt=\"{SEEN}\"", "alt=\"\""),
     (">Provenance<", ">Origin<"), ("<body>", "<body><script src=\"plotly.js\"></script>"),
+    ("It is 1 page.", ""), ("What next?</dt><dd>", "What next?</dt>"),
+    ('class="answer"', 'class="words"'), ("</h1>", "</h1><h2>First something else</h2>"),
     ("<style>", "<link rel=\"stylesheet\" href=\"page.css\"><style>")])
 def test_pages_that_are_not(written, old, new):
     text = written.read_text()

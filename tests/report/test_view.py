@@ -115,6 +115,25 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     assert not any("slot" in one for one in words(shown))
 
 
+def test_the_field_and_residuals_are_shown_when_asked_for(page):
+    """Hidden at first; each text of a block is in the page once."""
+    study = study_of("quadrupole")
+    points = np.array([[0.01, 0.0, 0.0], [0.0, 0.01, 0.0]])
+    view = magnet_view(build_magnet(study), known_of(study), None,
+                       (points, np.array([[2e-5, 0, 0], [0, 1e-5, 0]])))
+    assert view.count("ring 1, slot 7") == 1
+    shown = page(view)
+    hidden = shown.evaluate("document.getElementById('magnet-view').data.filter("
+                            "one => one.visible == 'legendonly').map(one => one.name)")
+    assert hidden == ["residuals, up to 20\u00a0µT", "|B| in a plane"]
+    before = coloured(shown)
+    shown.evaluate("Plotly.restyle('magnet-view', {visible: true})")
+    assert coloured(shown) > before + 1000
+    texts = shown.evaluate("document.getElementById('magnet-view').data[0].text")
+    assert len(texts) > 12
+    assert len(set(texts)) == 12
+
+
 @pytest.mark.parametrize("name", STUDIES)
 def test_studies_are_shown(page, name):
     study = study_of(name)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 from halbach_fe.api import homogeneity
 from halbach_fe.cli import main
@@ -52,7 +53,13 @@ def unit_fields(points):
 
 def random_points(region, generator, count):
     """Points that fill a region evenly, and points of its surface."""
-    unit = generator.uniform(-1, 1, (8 * count, 3))
+    return points_of(region, generator.uniform(-1, 1, (8 * count, 3)), count)
+
+
+def points_of(region, unit, count):
+    """The first of the points of a cube that lie in a region, and their projections onto its
+    surface.
+    """
     radius = np.hypot(*unit[:, :2].T) if region.shape == "cylinder" else np.linalg.norm(
         unit, axis=1)
     inner = unit[radius <= 1][:count]
@@ -83,6 +90,23 @@ def test_beside_random_points(generator, tmp_path, region):
     assert known.mean_sd_T == pytest.approx(0, abs=1e-15)
     assert known.rms_range_ppm == pytest.approx([known.rms_ppm] * 3)
     assert bool(known.harmonics) == (region.shape == "sphere")
+
+
+@pytest.mark.parametrize("region", [Region("cylinder", (0.008, 0.008, 0.2)),
+                                    Region("ellipsoid", (0.008, 0.006, 0.2))],
+                         ids=lambda region: region.text)
+def test_regions_longer_than_the_magnet(generator, tmp_path, region, monkeypatch):
+    found, magnet_of = known_magnet(generator, tmp_path, region)
+    # Halton's points fill a region more evenly than random ones: HALTON
+    cube = 2 * qmc.Halton(3, seed=generator).random(12_000) - 1
+    size = np.linalg.norm(magnet_of.getB(next(points_of(region, cube, 5000))), axis=1)
+    known = found.by_name["posterior"]
+    assert known.mean_T == pytest.approx(size.mean(), rel=0.02)
+    assert known.rms_ppm == pytest.approx(1e6 * size.std() / size.mean(), rel=0.03)
+    one_panel = Region.points
+    monkeypatch.setattr(Region, "points", lambda own, degree, _: one_panel(own, degree))
+    control = known_magnet(generator, tmp_path / "control", region)[0].by_name["posterior"]
+    assert control.mean_T != pytest.approx(size.mean(), rel=0.02)
 
 
 def test_harmonics_are_the_derivatives_at_the_centre(generator, tmp_path):
@@ -158,6 +182,8 @@ def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path):
 @pytest.mark.parametrize(("options", "sentence"), [
     (["--sphere-m", "0.025"], "must be in air"),
     (["--centre-m", "0", "0", "1"], "must be beside a region"),
+    (["--sphere-m", "0.005", "--centre-m", "0", "0", "10"], "where there is some field"),
+    (["--cylinder-m", "0.005", "100"], "where there is some field"),
 ])
 def test_bad_regions(tmp_path, capsys, options, sentence):
     path = tmp_path / "study.toml"
@@ -184,10 +210,11 @@ def test_command(tmp_path, capsys):
     path.write_text(TEXT)
     assert main(["homogeneity", str(path), "-o", str(tmp_path / "out"), "--sphere-m", "0.006",
                  "--degrees", "3"]) == 0
-    assert "In a sphere of 12 mm diameter the field is" in capsys.readouterr().err
+    assert "The mean field is" in capsys.readouterr().err
     summary = json.loads((tmp_path / "out" / "homogeneity.json").read_text())
     assert len(summary["prior"]["harmonics"]) == 15
     assert summary["prior"]["rms_ppm"] < summary["prior"]["peak_to_peak_ppm"]
     page = (tmp_path / "out" / "homogeneity.html").read_text()
     assert "ppm rms" in page
+    assert "in a sphere of 12 mm diameter?" in page
     assert (tmp_path / "out" / "harmonics.csv").read_text().count("prior") == 15

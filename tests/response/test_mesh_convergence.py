@@ -11,7 +11,8 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.verification import verification_verdict, write_verification
+from halbach_fe.report.verification import answer, write_verification
+from halbach_fe.report.words import decimals, flux_density, ppm
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
@@ -112,22 +113,24 @@ def test_verify_from_the_command_line(tmp_path, capsys):
     assert 0 < stored["error_pointwise"] < 0.1
     text = page(out / "verification.html")
     error, main_field = stored["error_pointwise"], stored["main_field_T"]
-    assert f"{error * main_field:.1e} T at most, {error:.1e} of the largest field" in text
-    assert f"{error * main_field / 1e-4:.2g} of the smallest noise" in text
-    assert f"{error * main_field:.1e} T at most" in shown.err
+    said = f"{flux_density(error * main_field)} at most"
+    assert said in text
+    assert f"That is {ppm(1e6 * error)} ppm of the largest field" in text
+    assert f"{decimals(error * main_field / 1e-4, 2)} times the smallest noise" in text
+    assert said in shown.err
     # the largest change of each column is the table's
     table = np.genfromtxt(out / "verification.csv", delimiter=",", skip_header=2)
     assert len(table) == 10
     for one, column in zip(stored["differences"], table[:, 3:].T, strict=True):
         assert column.max() / main_field == pytest.approx(one["pointwise"])
-        assert f"<td>{one['pointwise']:.1e}</td>" in text
+        assert f"<td>{ppm(1e6 * one['pointwise'])}</td>" in text
 
 
 def test_a_field_without_finite_elements(dipole, session, tmp_path):
     """In vacuum the reaction is nothing: no figure of convergence, and a verdict that says so."""
     study = dipole(array__recoil_permeability=1.0)
     found = verify(build_magnet(study), session)
-    assert "exact one of the blocks" in verification_verdict(build_magnet(study), found)
+    assert "exact one of the blocks" in answer(found).said
     write_verification(build_magnet(study), found, tmp_path, {})
     page(tmp_path / "verification.html")
     assert not (tmp_path / "verification_convergence.png").exists()

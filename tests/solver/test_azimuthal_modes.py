@@ -53,7 +53,7 @@ def test_every_column_against_its_exact_field(modes, session):
 
 def test_runs_of_few_modes_do_the_same(modes, session, monkeypatch):
     """Solutions of many blocks, which would fill the disk, are read a few modes at a time."""
-    study = modes(array__recoil_permeability=1.1)
+    study = modes(array__recoil_permeability=1.1, mesh__meridian_size_m=0.03)
 
     def columns():
         return azimuthal_modes.solve_modes(build_magnet(study), POINTS, [0], session)
@@ -126,7 +126,7 @@ def test_refinement_converges(modes, session):
 
 def test_superposition_of_rings(modes, session):
     """Columns add up to the nominal array, which was solved with all rings at once."""
-    study = modes(iron_ring=IRON)
+    study = modes(iron_ring=IRON, mesh__meridian_size_m=0.03)
     built = response_matrix(build_magnet(study),
                             observe(study, POINTS, np.ones((len(POINTS), 3), bool)), session)
     assert built.superposition_error < 1e-9

@@ -264,12 +264,21 @@ def test_a_client_that_has_given_up(dipole, session):
         solve_nominal(build_magnet(dipole()), POINTS, replace(session, run=lost.run))
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "tcp://127.0.0.1:no"])
+@pytest.mark.parametrize("address", ["", "tcp://127.0.0.1:1", "nonsense", "tcp://127.0.0.1:no"])
 def test_nobody_there(address, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("halbach_fe.solver.dask_cluster.CONNECT_S", 1.0)
     assert main(["solve", str(QUADRUPOLE / "study.toml"), "-o", str(tmp_path / "out"),
                  "--scheduler", address]) == 12
     assert "must be the address of a running Dask scheduler" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["", "nonsense", "http://127.0.0.1:8787"])
+def test_an_address_of_no_scheduler(address, monkeypatch):
+    """It is refused before there is a client, which would print a traceback when it is deleted."""
+    monkeypatch.delattr("distributed.Client")
+    with (pytest.raises(SchedulerError, match="must be the address of a running Dask scheduler"),
+          connected(address)):
+        pass
 
 
 def test_dask_is_not_installed(monkeypatch):

@@ -114,7 +114,7 @@ def test_order_and_comments_stay():
     study = parse_study(tomllib.loads(PLAIN))
     (background,) = with_effects(study, ["background"], np.random.default_rng(1))
     gap = EFFECTS["ring_gap"]
-    wide = gap.apply(background[0], gap.places(study)[2], [1e-4])
+    wide = gap.apply(background[0], gap.places(study)[2], [1e-4, 0.0])
     longer = EFFECTS["length"].apply(wide, EFFECTS["length"].places(study)[0], [1e-3])
     changed = edited_text(PLAIN, [background, (wide, "the gap"), (longer, "the length")])
     lines = changed.splitlines()

@@ -111,6 +111,7 @@ def test_hdf5_of_other_programs(tmp_path):
     ("1,2,\n", "1,2,,\n", "line 6 of .* 14 cells, as the header; .* 15 cells"),
     ('"N42, coated"', '"N42, coated', "line 4 of .* open quotation mark"),
     ('"N42, coated"', '"N42\x1b[31m"', "`type` in line 4 of .* printable"),
+    (CSV, "name;shape;x_m\na;cuboid;0,1\n", "names that semicolons separate. Separate columns by"),
     (CSV, "# nothing\n", "a header, and 1 to 1000000 blocks; instead received 0"),
     (CSV, "name,shape\n", "a header, and 1 to 1000000 blocks; instead received 0"),
     (",z_m", ",rotation_x_deg", "column z_m has 0 rows")])

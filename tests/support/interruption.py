@@ -16,6 +16,7 @@ import psutil
 import xarray as xr
 
 from halbach_fe.core.result_folder import RECORD
+from halbach_fe.report.page_record import PAGE_RECORD
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 
 ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}
@@ -99,7 +100,8 @@ def unreadable(folder: Path) -> list[str]:
 def differences(one: Path, other: Path) -> list[str]:
     """What differs in two folders of results: files, tables, arrays.
 
-    Pages name their folder, and run.json has their hashes.
+    Pages, with page.json beside them, name their folder and how long it took; run.json has their
+    hashes.
     """
     names = [{str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
              for folder in (one, other)]
@@ -109,7 +111,8 @@ def differences(one: Path, other: Path) -> list[str]:
             with (xr.open_dataset(one / name, engine="h5netcdf") as a,
                   xr.open_dataset(other / name, engine="h5netcdf") as b):
                 same = a.equals(b)
-        elif name != RECORD and name.endswith((".json", ".csv", ".toml", ".msh", ".pro", ".txt")):
+        elif Path(name).name not in (RECORD, PAGE_RECORD) and name.endswith(
+                (".json", ".csv", ".toml", ".msh", ".pro", ".txt")):
             same = filecmp.cmp(one / name, other / name, shallow=False)
         else:
             continue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from html.parser import HTMLParser
 
 
@@ -37,4 +39,20 @@ def page(path):
     assert not parts.loaded
     assert "Provenance" in parts.headings
     assert "halbach-fe 0" in text
+    answer_of(path)
     return text
+
+
+def answer_of(path):
+    """What a page says first, by its parts; AssertionError if anything of it is missing."""
+    text = path.read_text(encoding="utf-8")
+    first = re.search(r'<section class="answer.*?</section>', text, re.DOTALL)
+    assert first is not None
+    assert text.index("</h1>") < first.start() < text.index("<h2>")
+    parts = re.search(r'asked">(?P<asked>.*?)</p>.*?said">(?P<said>.*?)</p>'
+                      r".*?<dd>(?P<trust>.*?)</dd>.*?<dd>(?P<step>.*?)(<code>.*)?</dd>",
+                      first[0], re.DOTALL)
+    assert parts is not None
+    found = {name: html.unescape(part) for name, part in parts.groupdict().items()}
+    assert all(len(part) > 10 for part in found.values())
+    return found

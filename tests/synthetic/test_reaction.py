@@ -13,10 +13,11 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.synthetic import ngsolve_reaction, reaction, separate_reaction
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table
-from halbach_fe.synthetic.helmholtz_coil import block_mesh, moment_matrix, moments
+from halbach_fe.synthetic.helmholtz_coil import moments
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, PrismBody, SectorBody
 from tests.conftest import circle
+from tests.oracles.lone_block import block_mesh, moment_matrix
 from tests.synthetic.test_all_keys import PLAIN, POLYGON, PRISM, study_of, table_of
 
 POINTS = np.vstack([circle(0.05, 6, z) for z in (0.0, 0.06)])

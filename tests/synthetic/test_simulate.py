@@ -19,13 +19,14 @@ from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
+from halbach_fe.report.words import flux_density
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors, gradient_of
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
-from halbach_fe.synthetic.helmholtz_coil import moment_matrix
 from halbach_fe.synthetic.positions import between
+from halbach_fe.synthetic.separate_reaction import lone_moment_matrix
 from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
 from tests.conftest import DIPOLE, changed
 from tests.support.pages import page
@@ -135,7 +136,7 @@ def test_the_truth_is_sealed(campaigns):
     for name in ("map.csv", "held-out.csv", "blocks.csv", "truth/truth.json"):
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() in text
     largest = np.nanmax(np.abs(read_map(folder / "map.csv")["B_T"].values))
-    assert f"<td>{largest:.5g}</td>" in text
+    assert f"<td>{flux_density(largest, 5)}</td>" in text
     # blocks are shown as they were ordered, not as they were drawn
     shown = set(re.findall(r"M = \(([^)]*)\)", text.rpartition("<h2>Pictures")[0]))
     assert shown == _words(block.magnetization[:2]
@@ -154,8 +155,11 @@ def test_the_same_seed_gives_the_same_files(campaigns, tmp_path):
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert [str(path) for path in files] == [
         "blocks.csv", "campaign.html", "campaign_field.png", "campaign_geometry.png",
-        "held-out.csv", "map.csv", "run.json", "truth/truth.json"]
-    for path in files:
+        "held-out.csv", "map.csv", "page.json", "run.json", "truth/truth.json"]
+    records = [json.loads((each / "run.json").read_text()) | {"ended": ""}
+               for each in (folder, tmp_path)]
+    assert records[0] == records[1]  # but for the time
+    for path in (path for path in files if path.name != "run.json"):
         assert (tmp_path / path).read_bytes() == (folder / path).read_bytes()
         assert path.name == "campaign_geometry.png" or (
             tmp_path / path).read_bytes() != (other / path).read_bytes()
@@ -176,7 +180,18 @@ def test_refusals_on_the_command_line(campaigns, tmp_path, capsys):
     assert 11 in EXIT_CODES
 
 
-def test_output_that_cannot_be_written(tmp_path, capsys):
+def test_an_instrument_of_the_study(tmp_path, capsys):
+    """The map is in m and T at the study's points; the study would say that it is not."""
+    study = tmp_path / "study.toml"
+    study.write_text(STUDY + "\n[instrument]\nlength_unit_m = 0.001\n")
+    assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "out")]) == 3
+    assert "length_unit_m. Leave [instrument] out." in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_output_that_cannot_be_written(tmp_path, capsys, monkeypatch):
+    """It is found out before the simulation."""
+    monkeypatch.delattr("halbach_fe.cli.simulate_measurement.simulate_campaign")
     (tmp_path / "file").write_text("")
     study = tmp_path / "vacuum.toml"
     study.write_text(STUDY.replace("1.05", "1.0"))
@@ -248,7 +263,7 @@ def test_lone_moment(short_dipole):
     block, body = build_magnet(study).blocks[0], magnet_of(study).bodies[0]
     (tensor,) = demagnetizing_tensors([block])
     expected = block.volume / MU_0 * np.linalg.inv(np.eye(3) + 0.1 * tensor)
-    found = moment_matrix(body.shape, body.permeability)
+    found = lone_moment_matrix(body.shape, body.permeability)
     np.testing.assert_allclose(found, expected, atol=1e-3 * expected[0, 0])
     assert np.abs(found - block.volume / MU_0 * np.eye(3)).max() > 2e-2 * expected[0, 0]
 

@@ -26,13 +26,14 @@ class RingGapEffect(Effect):
     """A gap opens between the ring of the place and the next one at larger z.
 
     The rings on the outer side of the gap move away from the magnet's centre; a gap in the middle
-    moves both halves by half of it.
+    moves both halves by half of it. Which rings have really moved depends on where the others are
+    held. Therefore all rings may in addition have moved together along z.
     """
 
     name = "ring_gap"
     title = "gap between two rings"
     kind = "field"
-    parameters = (Parameter("gap", "m", 2e-4),)
+    parameters = (Parameter("gap", "m", 2e-4), Parameter("shift", "m", 1e-4))
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
@@ -41,18 +42,21 @@ class RingGapEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        total = np.zeros_like(nominal.points)
+        total = np.zeros((2, *nominal.points.shape))
         for number, block in enumerate(nominal.blocks):
-            total += nominal.block_translation_derivative(number, np.array([0.0, 0.0, _moves(
-                nominal.study.array.rings, place.ring, block.ring)]))
-        return total[None]
+            change = nominal.block_translation_derivative(number, np.array([0.0, 0.0, 1.0]))
+            total[0] += _moves(nominal.study.array.rings, place.ring, block.ring) * change
+            total[1] += change
+        return total
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        rings = study.array.rings
+        rings, (gap, shift) = study.array.rings, map(float, values)
+        moved = {ring: _moves(rings, place.ring, ring) * gap + shift
+                 for ring in range(1, rings + 1)}
         return with_exceptions(study, [
-            BlockException(ring=ring, shift_m=(0.0, 0.0, share * float(values[0])))
-            for ring in range(1, rings + 1) if (share := _moves(rings, place.ring, ring))])
+            BlockException(ring=ring, shift_m=(0.0, 0.0, length))
+            for ring, length in moved.items() if length])
 
 
 EFFECTS = (RingGapEffect(),)

@@ -27,6 +27,9 @@ OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
 MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
+MOST_RAD = 4 * np.pi
+"""Largest angle of a position, two turns: larger ones are in degrees."""
+
 KINDS = {"length": units.LENGTHS, "field": units.FIELDS, "angle": units.ANGLES,
          "time": units.TIMES}
 
@@ -188,7 +191,8 @@ def _used(
         used.pop("B", None)  # beside its components, B is the magnitude
     for name in declared.at:
         if name in used:
-            raise _contradiction(table, "header", f"a column {name}", f"--at {name}=")
+            raise _contradiction(table, "header", f"a column {name}",
+                                 f"--at {name}={declared.at[name]:g}")
     return used
 
 
@@ -279,6 +283,10 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
             raise MeasurementError(must_be("positions", where, "either x, y, z or r, phi, z",
                                            "both", "Leave some out with --columns and -."))
         angle = si["phi"]
+        if np.nanmax(np.abs(angle), initial=0.0) > MOST_RAD:
+            raise MeasurementError(must_be(
+                "phi", where, f"within {MOST_RAD:.3g} rad", f"{np.nanmax(np.abs(angle)):g}",
+                "Are they in degrees? Then give --angle-unit deg."))
         points = np.column_stack([si["r"] * np.cos(angle), si["r"] * np.sin(angle), si["z"]])
     else:
         points = np.column_stack([si["x"], si["y"], si["z"]])

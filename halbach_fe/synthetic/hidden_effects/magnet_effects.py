@@ -423,8 +423,9 @@ EFFECTS = (
     HiddenEffect("magnetization_gradient", "field",
                  (*BLOCK, HiddenParameter("fraction", least=-1.0, most=1.0)),
                  _draw_gradient, magnetization_gradient, needs=("four edges",), of_blocks=True),
-    HiddenEffect("temperature", "field",
-                 (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
+    HiddenEffect("temperature", "field",  # from room temperature, not below absolute zero
+                 (HiddenParameter("change", "K", least=-293.0),
+                  HiddenParameter("coefficient", PER_K)),
                  lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
     HiddenEffect("temperature_gradient", "field",
                  (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),

@@ -1,0 +1,105 @@
+"""The code as it was before it was made fast, and as it is: ratios of times measured in turn.
+
+The old code is a commit of this repository, installed beside the checkout. Each task runs in
+processes of its own (`benchmarks.speed_tasks`), old and new in turn; what counts is the processor
+time of a process and its children, which another program on the machine hardly changes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks.note import Note
+
+ROOT = Path(__file__).parent.parent
+BEFORE = "5c3aed3"
+"""The last commit before the compiled field."""
+
+REPEATS = {"exact": 3, "help": 7, "diagnose-small": 1}
+
+
+def old_code() -> Path:
+    """Return a folder with the packages of the old code, which is installed there if need be."""
+    site = ROOT / "build" / f"before-{BEFORE}"
+    if not site.exists():
+        source = ROOT / "build" / "before-source"
+        source.mkdir(parents=True, exist_ok=True)
+        archive = subprocess.run(["git", "archive", BEFORE], cwd=ROOT, check=True,
+                                 capture_output=True).stdout
+        subprocess.run(["tar", "-x"], cwd=source, input=archive, check=True)
+        subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps",
+                        "--target", str(site), str(source)], check=True)
+    return site
+
+
+def run_task(name: str, site: Path | None) -> tuple[float, dict[str, float]]:
+    """Run a task with the code at ``site`` (None: this checkout).
+
+    Returns
+    -------
+    seconds : float
+        Of processor time.
+    found : dict
+        What the task printed.
+    """
+    known = dict(os.environ)
+    if site is not None:
+        known["PYTHONPATH"] = str(site)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, str(Path(__file__).parent / "speed_tasks.py"), name],
+                          env=known, check=True, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime)
+    return seconds, json.loads(done.stdout.splitlines()[-1])
+
+
+def both(name: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the smallest figures of a task by the old code and by the new, run in turn."""
+    runs: tuple[list[dict[str, float]], list[dict[str, float]]] = [], []
+    for _ in range(REPEATS[name]):
+        for site, found in zip((old_code(), None), runs, strict=True):
+            seconds, figures = run_task(name, site)
+            found.append({"processor_s": seconds, **figures})
+    old, new = ({key: min(one[key] for one in found) for key in found[0]} for found in runs)
+    return old, new
+
+
+def exact(note: Note) -> None:
+    """Note the throughput of the exact field of blocks."""
+    old, new = both("exact")
+    for shape in ("sectors", "cuboids"):
+        note(f"exact.speedup_{shape}", old[f"{shape}_s"] / new[f"{shape}_s"], "ratio",
+             f"processor time of the code before, commit {BEFORE}: {old[f'{shape}_s']:.3g} s; now "
+             f"{new[f'{shape}_s']:.3g} s")
+        note(f"exact.over_magpylib_{shape}", new[f"{shape}_magpylib_s"] / new[f"{shape}_s"],
+             "ratio", "processor time of magpylib over ours, three unit columns of each block")
+        note(f"exact.error_{shape}", new[f"{shape}_error"], "of the largest column",
+             "largest difference from magpylib")
+
+
+def command_line(note: Note) -> None:
+    """Note how long the command line takes to show its help."""
+    new = both("help")[1]
+    note("cli.help_over_python", new["help_s"] / new["python_s"], "ratio",
+         "time of halbach-fe --help over that of an interpreter that does nothing, smallest of 7")
+
+
+def diagnosis(note: Note) -> None:
+    """Note how much faster a diagnosis is: 192 blocks in vacuum, 3840 readings, one displaced."""
+    old, new = both("diagnose-small")
+    note("diagnosis.speedup_small", old["processor_s"] / new["processor_s"], "ratio",
+         f"processor time of the code before, commit {BEFORE}: {old['processor_s']:.3g} s; now "
+         f"{new['processor_s']:.3g} s; displaced block named: {old['named']:g}, {new['named']:g}")
+    note("diagnosis.seconds_small", new["wall_s"], "s", f"wall time; before {old['wall_s']:.3g} s")
+
+
+def run(note: Note) -> None:
+    """Note all of them."""
+    exact(note)
+    command_line(note)
+    diagnosis(note)

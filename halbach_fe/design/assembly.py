@@ -1,0 +1,358 @@
+"""The plan to assemble a magnet: which block goes where and which way round, and its holder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
+from halbach_fe.diagnosis.summary import block_in_words
+from halbach_fe.geometry.block_export import blocks_of_table, blocks_table
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.mounting import as_meant, mountings
+from halbach_fe.geometry.prism import Prism, upright
+from halbach_fe.inference.block_prior import prior_from_blocks, shape_axes
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.study.array import block_name
+from halbach_fe.study.free_blocks import SIZES
+from halbach_fe.study.holder import Holder
+
+MOST_BLOCKS = 20_000
+"""Largest number of blocks: their STEP file has 15 MB."""
+
+SAME_DEG = 0.05
+"""Directions that differ by less than about this belong to blocks of one kind."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Blocks that are ordered together, as they are equal from their own axes.
+
+    Attributes
+    ----------
+    number : int
+        From 1.
+    sizes : dict
+        Columns ``shape``, ``size_z_m`` and others of a table of free blocks.
+    solid : Prism
+        A block in its own frame.
+    direction : ndarray, shape (3,)
+        Unit vector of the magnetization along its own axes.
+    remanence_T : float
+    material : str or None
+        Grade.
+    count : int
+    """
+
+    number: int
+    sizes: dict[str, Any]
+    solid: Prism
+    direction: Floats
+    remanence_T: float
+    material: str | None
+    count: int
+
+    @property
+    def shape(self) -> str:
+        """Shape and size in words, along x, y and z of its own axes."""
+        def mm(column: str) -> str:
+            return f"{1e3 * self.sizes[column]:.5g}"
+
+        height = mm("size_z_m")
+        return {
+            "cuboid": lambda: f"cuboid {mm('size_x_m')} × {mm('size_y_m')} × {height} mm",
+            "sector": lambda: (f"sector of radii {mm('inner_radius_m')} and "
+                               f"{mm('outer_radius_m')} mm, {self.sizes['angle_deg']:.4g}°, "
+                               f"{height} mm high"),
+            "trapezoid": lambda: (f"trapezoid {mm('size_x_m')} × {mm('inner_width_m')} to "
+                                  f"{mm('outer_width_m')} × {height} mm"),
+            "cylinder": lambda: f"cylinder of radius {mm('radius_m')} mm, {height} mm high",
+            "polygon": lambda: (f"polygon of {self.sizes['sides']} corners at "
+                                f"{mm('radius_m')} mm, {height} mm high"),
+            "prism": lambda: f"prism of {len(self.solid.outline)} corners, {height} mm high",
+        }[self.sizes["shape"]]()
+
+    @property
+    def magnetized(self) -> str:
+        """Direction of the magnetization in words, from its own axes."""
+        x, y, z = self.direction
+        rise, turn = round(float(np.degrees(np.arcsin(z))), 1), round(
+            float(np.degrees(np.arctan2(y, x))), 1)
+        if abs(rise) > 89.9:
+            return f"along {'−' * (rise < 0)}z"
+        along = {0.0: "x", 180.0: "−x", -180.0: "−x", 90.0: "y", -90.0: "−y"}.get(turn)
+        text = f"along {along}" if along else (
+            f"{abs(turn):g}° from x towards {'−' * (turn < 0)}y")
+        return text + (f", {abs(rise):g}° towards {'−' * (rise < 0)}z" if rise else "")
+
+
+@dataclass(frozen=True)
+class AssembledBlock:
+    """A block in its place.
+
+    Attributes
+    ----------
+    block : MagnetBlock
+        In a frame of its own.
+    kind : Kind
+    serial : str
+        Serial number; empty if it is not known.
+    measured_axes : ndarray, shape (3, 3), or None
+        Axes in which the moment of a measured block is given, as columns; None for a block whose
+        magnetization is inverted.
+    plate : Plate or None
+        The plate that holds it.
+    """
+
+    block: MagnetBlock
+    kind: Kind
+    serial: str
+    measured_axes: Floats | None
+    plate: Plate | None = None
+
+    @property
+    def name(self) -> str:
+        """Place in words, and the serial number."""
+        words = block_in_words(self.block.ring, self.block.slot, self.block.name)
+        return f"{words}, {self.serial}" if self.serial else words
+
+    @property
+    def has_own_name(self) -> bool:
+        """Whether it is a free block with a name, not one that ring and slot name."""
+        return self.block.name != block_name(self.block.ring, self.block.slot)
+
+    @cached_property
+    def direction(self) -> Floats:
+        """Unit vector of the magnetization along the axes of the magnet, (3,)."""
+        return np.array(self.block.easy_axis) * np.sign(self.block.remanence)
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of the block's middle about the z axis; 0 on the axis."""
+        return self.block.angle_deg
+
+    @property
+    def magnetization_angle_deg(self) -> float:
+        """Angle of the magnetization to the x axis, in the plane of the ring."""
+        x, y, _ = self.direction
+        return float(np.degrees(np.arctan2(y, x)))
+
+    @property
+    def from_radius_deg(self) -> float:
+        """Angle of the magnetization from the radius outwards, from -180 to 180."""
+        turn = self.magnetization_angle_deg - self.angle_deg
+        return float(180.0 - (180.0 - turn) % 360.0)
+
+    @property
+    def elevation_deg(self) -> float:
+        """Angle of the magnetization above the plane of the ring."""
+        return float(np.degrees(np.arcsin(np.clip(self.direction[2], -1.0, 1.0))))
+
+    @property
+    def way_round(self) -> str:
+        """Where the north pole of the block points, and which of its measured axes is up."""
+        turn, rise = round(self.from_radius_deg, 1), round(self.elevation_deg, 1)
+        if abs(rise) > 84:
+            north = "up" if rise > 0 else "down"
+        else:
+            side = "counter-clockwise" if turn > 0 else "clockwise"
+            north = {0.0: "outwards", 180.0: "inwards", 90.0: side, -90.0: side}.get(
+                -turn if turn == -180.0 else turn + 0.0, f"{abs(turn):g}° from outwards, {side}")
+            if rise:
+                north += f", {abs(rise):g}° {'up' if rise > 0 else 'down'}"
+        if not self.serial or self.measured_axes is None:
+            return f"north {north}"
+        axis = int(np.argmax(np.abs(self.measured_axes[2])))
+        sign = "" if self.measured_axes[2, axis] > 0 else "−"
+        return f"north {north}; its {sign}{'xyz'[axis]} up"
+
+
+@dataclass(frozen=True)
+class Assembly(ShownInNotebook):
+    """The plan to assemble a magnet.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    holder : Holder
+        The study's, or else one of usual sizes.
+    kinds : tuple of Kind
+    blocks : tuple of AssembledBlock
+        All that are there, ring by ring.
+    plates : tuple of Plate
+        Different plates of the holder.
+    reasons : tuple of str
+        Why there is no plate for some blocks.
+    left_over : int
+        Number of measured blocks without a place.
+    """
+
+    magnet: Magnet
+    holder: Holder
+    kinds: tuple[Kind, ...]
+    blocks: tuple[AssembledBlock, ...]
+    plates: tuple[Plate, ...]
+    reasons: tuple[str, ...]
+    left_over: int = 0
+
+
+def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
+    """Design the holder of a magnet, and plan its assembly.
+
+    `halbach_fe.write_report` writes the solids as STEP and STL files, the table and the page.
+
+    Parameters
+    ----------
+    magnet : Magnet
+        Its study may ask for a holder by the table ``holder``. Without it, plates of usual sizes
+        are designed where they can be made.
+    blocks : BlockTable, optional
+        Measured blocks in their places, as `halbach_fe.sort` assigns them. Their serial numbers
+        name the blocks.
+
+    Returns
+    -------
+    Assembly
+
+    Raises
+    ------
+    StudyError
+        If the study is 2D, or asks for a holder that cannot be made.
+    MeasurementError
+        If the table does not fit the study, or says nothing about places.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> plan = hf.cad(hf.build_magnet(hf.read_study("mri.toml")))
+    >>> plan.blocks[0].name, plan.blocks[0].way_round, plan.reasons
+    ('ring 1, slot 1', 'north counter-clockwise', ())
+    """
+    if magnet.dimension == 2:
+        raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3 for solids", "2",
+                                 "Use dimension = 3, and give array.ring_length_m."))
+    there = [number for number, block in enumerate(magnet.blocks) if block.remanence]
+    if len(there) > MOST_BLOCKS:
+        raise StudyError(must_be("`array`", f"study {magnet.name}", f"of at most {MOST_BLOCKS} "
+                                 "blocks for solids", str(len(there))))
+    serials = _serials(magnet, blocks)
+    table = blocks_table(magnet)
+    own = blocks_of_table(table)
+    kinds, members = _kinds(table, own)
+    axes = _measured_axes(magnet)
+    solids = [upright(block) for block in own]
+    found, reasons = _plates(magnet, own, solids)
+    plate_of = {number: plate for plate in found for copy in plate.blocks for number in copy}
+    return Assembly(
+        magnet, magnet.study.holder or Holder(), kinds,
+        tuple(AssembledBlock(block, kinds[members[number]], serials.get(original, ""),
+                             axes[original], plate_of.get(number))
+              for number, (block, original) in enumerate(zip(own, there, strict=True))),
+        found, reasons, 0 if blocks is None else int(np.sum(blocks.ring == 0)))
+
+
+def _plates(
+    magnet: Magnet, blocks: Sequence[MagnetBlock], solids: Sequence[Prism | None]
+) -> tuple[tuple[Plate, ...], tuple[str, ...]]:
+    """Return the plates for the blocks, and why there is none for some of them."""
+    held = [None if solid is None else HeldBlock(number, block.name, solid,
+                                np.array(block.easy_axis) * np.sign(block.remanence))
+            for number, (block, solid) in enumerate(zip(blocks, solids, strict=True))]
+    groups, tilted, alone = [], 0, 0
+    for together in overlapping([_z_limits(block) for block in blocks]):
+        group = [one for number in together if (one := held[number]) is not None]
+        if len(group) < len(together):
+            tilted += len(together)
+        elif len(group) == 1:
+            alone += 1
+        else:
+            groups.append(group)
+    reasons = [f"{count} block{'s' * (count > 1)} {why}" for count, why in (
+        (tilted, "at heights where a block is tilted"), (alone, "alone at their heights")) if count]
+    if not groups:
+        return (), tuple(reasons)
+    holder = magnet.study.holder
+    found, more = plates(groups, holder or Holder(), magnet.iron,
+                         None if holder is None else magnet.name)
+    return found, (*reasons, *more)
+
+
+def _z_limits(block: MagnetBlock) -> tuple[float, float]:
+    """Return the lowest and the highest z of a block in m."""
+    corners = np.array([[*edge.start, z] for edge in block.outline
+                        for z in (block.z_min, block.z_max)])
+    z = block.from_frame(corners)[:, 2]
+    return float(z.min()), float(z.max())
+
+
+def _serials(magnet: Magnet, table: BlockTable | None) -> dict[int, str]:
+    """Return the serial number of the block in every slot, by the number of the slot from 0.
+
+    The table names the place that a block was made for.
+
+    Raises
+    ------
+    MeasurementError
+        If the table does not fit the study, or says nothing about places.
+    """
+    if table is None:
+        return {}
+    if not table.ring.any():
+        raise MeasurementError(must_be(
+            "ring and slot", table.source, "given, to know which block goes where", "none",
+            "halbach-fe sort assigns blocks to slots: give its blocks.sorted.csv."))
+    prior_from_blocks(magnet, table)  # which refuses blocks of another magnet
+    serial_of = dict(zip(table.places, table.serial, strict=True))
+    return {number: serial_of[magnet.blocks[source].ring, magnet.blocks[source].slot]
+            for number, (source, matrix) in enumerate(mountings(magnet)) if matrix.any()}
+
+
+def _measured_axes(magnet: Magnet) -> list[Floats | None]:
+    """Return the axes of every block in which its moment is measured, as columns (3, 3).
+
+    They are the axes of its shape, which turn with a block that is mounted elsewhere or rotated.
+    """
+    meant, found = as_meant(magnet).blocks, []
+    for source, matrix in mountings(magnet):
+        factor = np.cbrt(np.linalg.det(matrix))
+        found.append(matrix / factor @ shape_axes(meant[source]) if factor > 0 else None)
+    return found
+
+
+def _kinds(
+    table: dict[str, list[Any]], blocks: Sequence[MagnetBlock]
+) -> tuple[tuple[Kind, ...], list[int]]:
+    """Return the kinds of blocks, and the number of the kind (from 0) of every block."""
+    shapes = {column for sizes in SIZES.values() for column in sizes} | {"shape", "size_z_m"}
+    found: dict[object, Kind] = {}
+    keys = []
+    for number, block in enumerate(blocks):
+        sizes = {column: values[number] for column, values in table.items()
+                 if column in shapes and values[number] is not None}
+        material = table["material"][number] if "material" in table else None
+        direction = block.axes.T @ block.easy_axis * np.sign(block.remanence)
+        key = (tuple((column, _rounded(value)) for column, value in sizes.items()), material,
+               tuple((np.round(direction / np.radians(SAME_DEG)) + 0.0).tolist()),
+               round(abs(block.remanence), 6))
+        keys.append(key)
+        new = Kind(len(found) + 1, sizes, Prism(block.outline, block.z_min, block.z_max), direction,
+                   abs(block.remanence), material, 0)
+        kind = found.get(key, new)
+        found[key] = replace(kind, count=kind.count + 1)
+    order = {key: number for number, key in enumerate(found)}
+    return tuple(found.values()), [order[key] for key in keys]
+
+
+def _rounded(value: object) -> object:
+    """Return a size to 0.1 µm, or an outline of such."""
+    if isinstance(value, float):
+        return round(value, 7)
+    return tuple(map(_rounded, value)) if isinstance(value, tuple) else value

@@ -1,0 +1,138 @@
+"""What a magnet is improved for: small multipoles, or a homogeneous field in a region.
+
+A study with a table ``[homogeneity]`` asks for a homogeneous field in its region. The search for
+better magnets is the same for both: the blocks' magnetizations are mapped linearly to values, whose
+sum of squares is made small. The values are b_n and a_n in units of 1e-4 of the main multipole, or
+deviations of |B| in ppm of its mean. An `Objective` is the map, `Known` its values for a magnet.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.numbers import LIMIT_PPM, LIMIT_UNITS, check_number
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.response.deviations import DeviationModel, deviation_model
+from halbach_fe.response.homogeneity import default_region, homogeneity_model, region_points
+from halbach_fe.response.multipoles import (
+    MultipoleModel,
+    MultipoleReference,
+    multipole_model,
+    unwanted_orders,
+)
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
+
+
+class Known(Protocol):
+    """The values of a magnet with their uncertainty, see `Multipoles` and `Deviations`."""
+
+    @property
+    def mean(self) -> Floats:
+        """Means of the values (k,)."""
+
+    @property
+    def root(self) -> Floats:
+        """Root (k, q) of their covariance."""
+
+    @property
+    def expected_square(self) -> float:
+        """Expectation of their sum of squares."""
+
+    @property
+    def rms(self) -> float:
+        """Its root, per multipole; or the rms deviation of |B|."""
+
+    @property
+    def rms_of_mean(self) -> float:
+        """The same for the means of the values."""
+
+    def share_within(self, limit: float, normals: Floats) -> float:
+        """Return the probability of meeting a limit, estimated from normal numbers (count, k)."""
+
+
+class Objective(Protocol):
+    """A linear map from magnetizations, see `MultipoleModel` and `DeviationModel`.
+
+    The values are ratios: row 0 of ``matrix`` (1 + k, parameters) is that of the main multipole or
+    of the mean field, to which the others are relative.
+    """
+
+    @property
+    def matrix(self) -> Any:
+        """Matrix (1 + k, parameters), of real or complex numbers."""
+
+    @property
+    def offset(self) -> Any:
+        """What external fields add, (1 + k,)."""
+
+    @property
+    def nominal_main(self) -> float:
+        """Main multipole or mean field of the nominal magnet."""
+
+    def scaled(self, main: float) -> Floats:
+        """Return the real matrix to the values for a given main multipole or mean field."""
+
+    def units(self, values: Any) -> Floats:
+        """Return the values of products with the matrix."""
+
+    def of(self, parameters: Gaussian) -> Any:
+        """Return the values for normally distributed magnetizations."""
+
+    def known(self, mean: Any, root: Any) -> Any:
+        """Return the values for mean and root of products with the matrix."""
+
+
+def check_objective(
+    magnet: Magnet, reference: MultipoleReference | None, limit_units: float | None,
+    limit_ppm: float | None,
+) -> None:
+    """Refuse, before any solve, what does not fit what the study asks for.
+
+    Raises
+    ------
+    StudyError
+        If multipoles are described for a study that asks for a homogeneous field, or a limit in
+        ppm is given for one that does not; if the multipoles do not fit the study, or the region
+        reaches into material.
+    """
+    for name, value, limits in (("limit_units", limit_units, LIMIT_UNITS),
+                                ("limit_ppm", limit_ppm, LIMIT_PPM)):
+        if value is not None:
+            check_number(name, f"study {magnet.name}", value, *limits)
+    if magnet.study.homogeneity is None:
+        if limit_ppm is not None:
+            raise StudyError(must_be(
+                "limit_ppm", f"study {magnet.name}", "left out, as the study asks for multipoles",
+                f"{limit_ppm:g}", "Add the table [homogeneity] with the region to the study, or "
+                "give limit_units."))
+        unwanted_orders(magnet, reference or MultipoleReference())
+        return
+    for name, there in (("limit_units", limit_units), ("the reference of multipoles", reference)):
+        if there is not None:
+            raise StudyError(must_be(
+                name, f"study {magnet.name}", "left out, as its table [homogeneity] asks for a "
+                "homogeneous field", "given", "Leave out the options of multipoles, or the table."))
+    region_points(magnet, default_region(magnet))
+
+
+def objective_of(
+    magnet: Magnet, reference: MultipoleReference | None, session: Session,
+    about: Floats | None = None,
+) -> MultipoleModel | DeviationModel:
+    """Return what the study asks for as a function of the magnetizations.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    reference : MultipoleReference or None
+        Radius, orders and z of multipoles, if the study asks for multipoles.
+    session : Session
+    about : ndarray, shape (parameters,), in A/m, optional
+        Magnetizations about which |B| is linearized; by default the nominal ones.
+    """
+    if magnet.study.homogeneity is None:
+        return multipole_model(magnet, reference or MultipoleReference(), session)
+    return deviation_model(homogeneity_model(magnet, default_region(magnet), session), about)

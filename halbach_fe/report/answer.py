@@ -1,0 +1,47 @@
+"""What every page says first, and the terminal too: the answer, how far to trust it, what next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a command in plain words.
+
+    Attributes
+    ----------
+    question : str
+        What was asked.
+    said : str
+        The answer, with its uncertainty.
+    trust : str
+        Whether it can be trusted, and why not.
+    step : str
+        What to do next.
+    command : str
+        The command for that, in which STUDY, MAP, BLOCKS and DIR stand for files and folders of the
+        user; empty if no command does it.
+    sound : bool
+        Whether the answer may be used as it stands. Otherwise its box is a warning.
+    """
+
+    question: str
+    said: str
+    trust: str
+    step: str
+    command: str = ""
+    sound: bool = True
+
+    @property
+    def sentences(self) -> tuple[str, str, str]:
+        """What the terminal says before the command."""
+        return self.said, self.trust, f"Next: {self.step}"
+
+    def with_paths(self, paths: Mapping[str, object]) -> Answer:
+        """Return the answer with the paths that are known in place of the words of its command."""
+        words = [shlex.quote(str(paths[word])) if paths.get(word) is not None else word
+                 for word in self.command.split(" ")]
+        return replace(self, command=" ".join(words))

@@ -1,0 +1,122 @@
+"""Table and page of the plan to assemble a magnet, with a drawing for every plate."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.assembly import Assembly
+from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.assembly_sheets import common_beginning, drawing, sheets
+from halbach_fe.report.page import write_page
+from halbach_fe.report.solids import Progress, holder_name, write_solids
+from halbach_fe.report.words import counted
+
+FRAME = ("x, y, z of the magnet; x is at the large notch of a plate, the pockets are open towards "
+         "+z, and angles count counter-clockwise as seen from +z")
+
+
+def answer(assembly: Assembly) -> Answer:
+    """Say what to order and to make, how far that is certain, and what to do next."""
+    copies = sum(len(plate.heights_m) for plate in assembly.plates)
+    said = [f"{counted(len(assembly.blocks), 'block')} of {counted(len(assembly.kinds), 'kind')}"
+            + (f" go into {counted(copies, 'plate')} of {counted(len(assembly.plates), 'shape')}."
+               if copies else " go without a holder.")]
+    said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
+             for reason in assembly.reasons]
+    trust = "Shapes and places are those of the study; the holder does not know the forces."
+    if assembly.plates:
+        wall = min(plate.wall_m for plate in assembly.plates)
+        said.append(f"Pockets are {1e3 * assembly.holder.clearance_m:.3g}\u00a0mm larger than the "
+                    "blocks on each side" + (
+                        "." if np.isinf(wall) else
+                        f", and the thinnest wall is {1e3 * wall:.3g}\u00a0mm."))
+        step = ("Make one pocket first and try a block in it; then print this page, and go sheet "
+                "by sheet. See which forces wait.")
+    else:
+        step = "See which forces the blocks feel, for tools and glue."
+    if assembly.left_over:
+        said.append(f"{counted(assembly.left_over, 'measured block')} "
+                    f"{'is' if assembly.left_over == 1 else 'are'} left over.")
+    return Answer("What is to be ordered and made?", " ".join(said), trust, step,
+                  "halbach-fe forces STUDY -o DIR")
+
+
+def kind_rows(assembly: Assembly) -> list[dict[str, str]]:
+    """Return a row of text for every kind of blocks."""
+    graded = any(kind.material for kind in assembly.kinds)
+    return [{"kind": str(kind.number), "shape": kind.shape.replace(" × ", "\u00a0×\u00a0"),
+             "magnetized": kind.magnetized, "remanence": f"{kind.remanence_T:.4g}\u00a0T",
+             **({"grade": kind.material or ""} if graded else {}),
+             "blocks": str(kind.count)} for kind in assembly.kinds]
+
+
+def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
+    """Return a row of text for every plate."""
+    return [{"holder": str(plate.number), "files": f"{holder_name(plate)}.step, .stl",
+             "to make": str(len(plate.heights_m)), "pockets": str(len(plate.blocks[0])),
+             "thickness": f"{1e3 * plate.thickness_m:.4g}\u00a0mm",
+             "floor": f"{1e3 * plate.floor_m:.3g}\u00a0mm" if plate.floor_m else "none",
+             "thinnest wall": f"{1e3 * plate.wall_m:.3g}\u00a0mm",
+             "lower faces at z": ", ".join(f"{1e3 * z:.5g}" for z in sorted(plate.heights_m))
+             + "\u00a0mm"} for plate in assembly.plates]
+
+
+def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str, object]:
+    """Return the content of assembly.json."""
+    return {
+        "study": assembly.magnet.name, "blocks": len(assembly.blocks),
+        "left_over": assembly.left_over, "frame": FRAME, "unit_of_solids": "mm",
+        "kinds": [{"kind": kind.number, "shape": kind.shape, "magnetized": kind.magnetized,
+                   "remanence_T": kind.remanence_T, "material": kind.material,
+                   "count": kind.count} for kind in assembly.kinds],
+        "holder": assembly.holder.model_dump(mode="json"),
+        "plates": [{"holder": plate.number, "file": f"{holder_name(plate)}.step",
+                    "lower_faces_z_m": list(plate.heights_m), "pockets": len(plate.blocks[0]),
+                    "thickness_m": plate.thickness_m, "floor_m": plate.floor_m,
+                    "thinnest_wall_m": plate.wall_m}
+                   for plate in assembly.plates],
+        "without_holder": list(assembly.reasons), "files": list(files)}
+
+
+def columns(assembly: Assembly) -> dict[str, Iterable[object]]:
+    """Return the columns of assembly.csv, with a row for every block."""
+    blocks = assembly.blocks
+    middle = np.array([one.block.middle for one in blocks])
+    direction = np.array([one.direction for one in blocks])
+    return {
+        "ring": [one.block.ring for one in blocks], "slot": [one.block.slot for one in blocks],
+        "name": [one.block.name for one in blocks], "serial": [one.serial for one in blocks],
+        "kind": [one.kind.number for one in blocks],
+        "holder": [one.plate.number if one.plate else "" for one in blocks],
+        **{f"{axis}_m": middle[:, number] for number, axis in enumerate("xyz")},
+        "angle_deg": [one.angle_deg for one in blocks],
+        **{f"magnetization_{axis}": direction[:, number] for number, axis in enumerate("xyz")},
+        "magnetization_angle_deg": [one.magnetization_angle_deg for one in blocks],
+        "from_radius_deg": [one.from_radius_deg for one in blocks],
+        "elevation_deg": [one.elevation_deg for one in blocks],
+        "way_round": [one.way_round for one in blocks]}
+
+
+def write_assembly(
+    assembly: Assembly, folder: Path, provenance: Mapping[str, str],
+    progress: Progress = lambda done, total: None,
+) -> None:
+    """Write the solids, assembly.csv, assembly.json and assembly.html."""
+    files = write_solids(assembly, folder, progress)
+    with atomic(folder / "assembly.csv") as temporary:
+        write_csv(columns(assembly), {"study": assembly.magnet.name, "frame": FRAME}, temporary)
+    write_text(folder / "assembly.json", json.dumps(
+        assembly_summary(assembly, files), indent=1, allow_nan=False) + "\n")
+    prefix = common_beginning([one.serial for one in assembly.blocks])
+    write_page(folder / "assembly.html", "assembly.html.j2", [], study=assembly.magnet.study,
+               provenance=provenance, answer=answer(assembly), kinds=kind_rows(assembly),
+               plates=plate_rows(assembly), prefix=prefix, holder=assembly.holder,
+               measured=any(one.serial for one in assembly.blocks),
+               files=["assembly.csv", "assembly.json", *files],
+               sheets=[drawing(sheet, prefix) for sheet in sheets(assembly)])

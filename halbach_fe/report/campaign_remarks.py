@@ -1,0 +1,171 @@
+"""Whether folders of results fit together: what was changed, is out of date, or of another study.
+
+Files are told apart by the SHA-256 that run.json holds of all that a run read and wrote.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import PurePath
+from typing import Any
+
+from halbach_fe.report.campaign_folders import Chapter
+from halbach_fe.study.differences import differences
+from halbach_fe.study.model import Study, magnet_description
+
+FINDING = ("register", "diagnose")
+"""Commands that write a study which later results should be of."""
+
+OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
+"""Commands whose results are of the measured magnet, and should be of such a study."""
+
+MOST_KEYS, MOST_VALUE = 6, 40
+"""Largest numbers of keys that a sentence names, and of characters of a value."""
+
+
+def doubts(chapters: Sequence[Chapter]) -> list[str]:
+    """Return a sentence for everything that does not fit together."""
+    return [*_changed(chapters), *_out_of_date(chapters), *_other_files(chapters),
+            *_unused_findings(chapters), *_unrelated(chapters),
+            *(text for text, known in _versions(chapters) if not known)]
+
+
+def versions(chapters: Sequence[Chapter]) -> list[str]:
+    """Return a sentence for every version of the study of which there are results by intent."""
+    return [text for text, known in _versions(chapters) if known]
+
+
+def _changed(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results that are not as their run has left them."""
+    return [f"Changed since the run in {one.label}: {', '.join(one.changed[:MOST_KEYS])}."
+            for one in chapters if one.changed]
+
+
+def _out_of_date(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results that were computed with an earlier version of another one."""
+    present = {digest for one in chapters for digest in one.record.files.values()}
+    found = []
+    for one in chapters:
+        for path, digest in one.record.inputs.items():
+            name = PurePath(path).name
+            holders = [other for other in chapters if other is not one
+                       and name in {PurePath(file).name for file in other.digests.values()}]
+            if holders and digest not in present:
+                found.append(
+                    f"{one.label} is out of date: it was computed with another {name} than "
+                    f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}. Run "
+                    f"{one.record.command} again, or leave out what does not belong to it.")
+    return found
+
+
+def _other_files(chapters: Sequence[Chapter]) -> list[str]:
+    """Name files of one name that had different contents; studies are compared by their keys."""
+    by_name: dict[str, dict[str, set[str]]] = {}
+    results = {PurePath(file).name for one in chapters for file in one.digests.values()}
+    for one in chapters:
+        for path, digest in one.record.inputs.items():
+            by_name.setdefault(PurePath(path).name, {}).setdefault(one.label, set()).add(digest)
+    found = []
+    for name, by_label in by_name.items():
+        if name.endswith(".toml") or name in results:
+            continue
+        apart = [pair for pair in combinations(by_label, 2)
+                 if not by_label[pair[0]] & by_label[pair[1]]]
+        if apart:
+            found.append(f"{' and '.join(apart[0])} read different files called {name}.")
+    return found
+
+
+def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
+    """Name studies with findings that no result here is of."""
+    found = []
+    for one in chapters:
+        found_nothing = one.verb == "diagnose" and not one.pages[0].said.rows
+        written = [] if found_nothing or not one.record.inputs else [
+            name for name in one.digests.values() if name.endswith(".toml")]
+        later = [other for other in chapters if other.verb in OF_MEASURED]
+        if one.verb in FINDING and written and later and not any(
+                other.has_study_of(one) for other in chapters):
+            found.append(f"No result here is of {one.label}/{written[0]}: {_listed(later)} "
+                         f"{'is' if len(later) == 1 else 'are'} without what "
+                         f"{one.record.command} has found.")
+    return found
+
+
+def _unrelated(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results without a study whose input no other result has to do with."""
+    found = []
+    for one in chapters:
+        inputs = set(one.record.inputs.values())
+        others = [other for other in chapters if other is not one]
+        if one.study is None and not any(
+                inputs & {*other.record.inputs.values(), *other.record.files.values()}
+                or other.uses(one) for other in others):
+            found.append(f"{one.label} is of a file that no other result here is of: "
+                         f"{', '.join(one.record.inputs) or 'an unknown one'}.")
+    return found
+
+
+def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, bool]]:
+    """Say how each version of the study differs from the first.
+
+    Every sentence comes with whether that may be so: another command wrote the version, or it has
+    the same magnet.
+    """
+    groups: list[tuple[Study, list[Chapter]]] = []
+    for one in chapters:
+        if (study := one.study) is None:
+            continue
+        of_same = [group for version, group in groups
+                   if not differences(_plain(version), _plain(study))]
+        if of_same:
+            of_same[0].append(one)
+        else:
+            groups.append((study, [one]))
+    found = []
+    for study, group in groups[1:]:
+        first = groups[0][0]
+        source = next(((other, name) for one in group for other in chapters
+                       for name in one.uses(other) if name.endswith(".toml")), None)
+        texts = [f"{key} is {_short(new)} instead of {_short(old)}"
+                 for key, (old, new) in differences(_plain(first), _plain(study)).items()]
+        more = f" and {len(texts) - MOST_KEYS} more" if len(texts) > MOST_KEYS else ""
+        changes = "; ".join(texts[:MOST_KEYS]) + more
+        of = f"{_listed(group)} {'is' if len(group) == 1 else 'are'} of"
+        if source is not None:
+            other, name = source
+            found.append((f"{of} {other.label}/{name}, which {other.record.command} wrote: "
+                          f"{changes}.", True))
+        else:
+            same = magnet_description(first) == magnet_description(study)
+            found.append((f"{of} another version of the study than {groups[0][1][0].label}: "
+                          f"{changes}.", same))
+    return found
+
+
+def _plain(study: Study) -> dict[str, Any]:
+    """Return a study as plain data, without paths, which start from the folder of its file."""
+    found = study.model_dump(mode="json", exclude={"description"})
+    found["maps"] = [one | {"file": None} for one in found["maps"]]
+    return found
+
+
+def _short(value: Any) -> str:
+    """Return a value of a key as a short text."""
+    if value is None:
+        return "not given"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list) and all(isinstance(one, float) for one in value):
+        text = ", ".join(f"{one:.4g}" for one in value)
+    else:
+        text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= MOST_VALUE else f"{text[:MOST_VALUE]}…"
+
+
+def _listed(chapters: Sequence[Chapter]) -> str:
+    """Return the names of folders in words."""
+    *others, last = (one.label for one in chapters)
+    return f"{', '.join(others)} and {last}" if others else last

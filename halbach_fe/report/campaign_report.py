@@ -1,0 +1,268 @@
+"""One page of all results of a magnet: the answer of every command, and links to their pages."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path, PurePath
+from urllib.parse import quote
+
+from halbach_fe.core.errors import MAX_QUOTED, MAX_SENTENCE, OutputError, must_be, printable
+from halbach_fe.core.files import as_path, write_text
+from halbach_fe.core.result_folder import keep_results, result_folder
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.campaign_folders import Chapter, Page, read_chapters
+from halbach_fe.report.campaign_remarks import OF_MEASURED, doubts, versions
+from halbach_fe.report.magnet_table import in_one_line
+from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
+from halbach_fe.report.page_record import Picture
+from halbach_fe.report.words import counted
+from halbach_fe.study.model import Study
+
+PAGE = "report.html"
+
+MOST_ROWS = 40
+"""Largest number of rows of a folded table. All of them are on its page."""
+
+SHORT_DIGEST = 16
+"""Digits of SHA-256 that the page shows."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What folders of results say about one magnet.
+
+    Attributes
+    ----------
+    chapters : tuple of Chapter
+        In the order in which data flow.
+    """
+
+    chapters: tuple[Chapter, ...]
+
+    @cached_property
+    def study(self) -> Study:
+        """The study of the first results."""
+        return next(one.study for one in self.chapters if one.study is not None)
+
+    @cached_property
+    def doubts(self) -> list[str]:
+        """What does not fit together, in sentences."""
+        return [printable(text, MAX_SENTENCE) for text in doubts(self.chapters)]
+
+    @cached_property
+    def versions(self) -> list[str]:
+        """How versions of the study differ by intent, in sentences."""
+        return [printable(text, MAX_SENTENCE) for text in versions(self.chapters)]
+
+    @property
+    def answered(self) -> list[tuple[Chapter, Page, Answer]]:
+        """All answers."""
+        return [(chapter, page, page.said.answer) for chapter in self.chapters
+                for page in chapter.pages if page.said.answer is not None]
+
+    def continued(self, chapter: Chapter, answer: Answer) -> Chapter | None:
+        """Return the later chapter of the command that an answer names as the next step."""
+        verb = re.match("halbach-fe ([a-z-]+)", answer.command)
+        later = self.chapters[self.chapters.index(chapter) + 1:]
+        return next((one for one in later if verb and one.verb == verb[1]), None)
+
+    def replaced(self, chapter: Chapter) -> Chapter | None:
+        """Return a later chapter of the same command, whose answers may all be used."""
+        later = self.chapters[self.chapters.index(chapter) + 1:]
+        return next((one for one in later if one.verb == chapter.verb and one.sound), None)
+
+    @property
+    def answer(self) -> Answer:
+        """What may be used as it stands, and what is left to do."""
+        unsound = list(dict.fromkeys(each for each, _, answer in self.answered if not answer.sound))
+        left = [each.label for each in unsound if self.replaced(each) is None]
+        instead = [f"{better.label} instead of {each.label}" for each in unsound
+                   if (better := self.replaced(each)) is not None]
+        said = f"{counted(len(self.chapters), 'result')} of one magnet. " + (
+            f"Not to be trusted as they are: {', '.join(left)}." if left else
+            "The answers may be used as they stand.")
+        if instead:
+            said += f" Use {', '.join(instead)}."
+        trust = (
+            "The results do not all fit together, as is said below." if self.doubts else
+            "They are of versions of the study that follow from each other, and no file was "
+            "changed since." if self.versions else
+            "They are of one study, and no file was changed since.")
+        last = self._next()
+        return Answer("What is known of this magnet?", said, trust,
+                      last.step if last else "Nothing that the results name is left to do.",
+                      last.command if last else "", sound=not (self.doubts or left))
+
+    def _next(self) -> Answer | None:
+        """Return the answer whose next step is the one to take.
+
+        It is that of an answer which may not be used; or else of the last one about the measured
+        magnet, if there is any.
+        """
+        left = [(chapter, answer) for chapter, _, answer in self.answered
+                if self.continued(chapter, answer) is None]
+        unsound = [answer for chapter, answer in left
+                   if not answer.sound and self.replaced(chapter) is None]
+        measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]
+        return next(iter([*unsound, *measured, *(answer for _, answer in reversed(left))]), None)
+
+    def plain(self) -> dict[str, object]:
+        """Return the answers and what does not fit as plain data."""
+        return {"study": self.study.name, "answer": asdict(self.answer), "doubts": self.doubts,
+                "versions": self.versions, "results": [
+                    {"folder": chapter.label, "command": chapter.record.command,
+                     "ended": chapter.record.ended, "page": page.path,
+                     "answer": None if page.said.answer is None else asdict(page.said.answer)}
+                    for chapter in self.chapters for page in chapter.pages]}
+
+
+def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> Campaign:
+    """Read the results of one magnet; see `campaign_report`.
+
+    The folder ``output`` of the report itself, which wildcards may name too, is left out.
+    """
+    paths = [] if isinstance(folders, str) else [
+        path for path in map(as_path, folders) if output is None
+        or path.resolve() != output.resolve()]
+    if not paths:
+        raise OutputError(must_be("folders", "the report", "a list of folders of results",
+                                  repr(folders)))
+    return Campaign(tuple(read_chapters(paths)))
+
+
+def campaign_report(folders: Sequence[str | Path], output: str | Path) -> Path:
+    """Join the results of one magnet into a page: the answer of every command, with links.
+
+    Nothing is computed: the page says what the folders hold, in the order in which data flow, and
+    what does not fit together. It needs no network; its links need the folders where they are.
+
+    Parameters
+    ----------
+    folders : sequence of str or Path
+        Folders of results, of one magnet. Several may be of one command.
+    output : str or Path
+        The page, if its name ends with .html; otherwise a folder for report.html.
+
+    Returns
+    -------
+    Path
+        Path of the page.
+
+    Raises
+    ------
+    OutputError
+        If a folder holds no finished results, results belong to several magnets, or the page
+        cannot be written.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> session = hf.Session.open("results")
+    >>> _ = hf.write_report(hf.solve(magnet, session), "solved")
+    >>> _ = hf.write_report(hf.verify(magnet, session), "verified")
+    >>> hf.campaign_report(["solved", "verified"], "dipole.html").name
+    'dipole.html'
+    """
+    output = as_path(output)
+    return write_campaign_report(read_campaign(folders, output), output)
+
+
+def write_campaign_report(campaign: Campaign, output: Path) -> Path:
+    """Write the page of a campaign; see `campaign_report`. Return its path."""
+    with ExitStack() as stack:
+        if output.suffix.lower() in (".html", ".htm"):
+            keep_results(output)
+            path = output
+        else:
+            path = output / PAGE
+            stack.enter_context(result_folder(output, "halbach-fe report", campaign.study.name))
+        write_text(path, _html(campaign, path))
+    return path
+
+
+@own_style
+def _html(campaign: Campaign, path: Path) -> str:
+    """Return the page, with links that start from where it will be."""
+    magnet = build_magnet(campaign.study)
+    picture = geometry_figure(magnet, points_from(campaign.study.observation.positions))
+    return rendered(
+        "campaign_report.html.j2", campaign.study, answer=campaign.answer, pictures=[],
+        magnet=in_one_line(magnet), picture=Picture(
+            base64.b64encode(png_of(picture)).decode(),
+            "The blocks with their magnetization, and the positions of the study"),
+        doubts=campaign.doubts, versions=campaign.versions,
+        parts=_parts(campaign, path),
+        folders=_folder_rows(campaign), inputs=_input_rows(campaign),
+        provenance={"programs": programs()})
+
+
+def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
+    """Return what the template shows of every page."""
+    pages = [(chapter, page) for chapter in campaign.chapters for page in chapter.pages]
+    first = {chapter.label: number for number, (chapter, _) in reversed(list(enumerate(pages, 1)))}
+    found = []
+    for number, (chapter, page) in enumerate(pages, 1):
+        answer, rows = page.said.answer, page.said.rows
+        later = campaign.continued(chapter, answer) if answer else None
+        files = {name: _link(chapter.folder / name, output) for name in chapter.record.files
+                 if (chapter.folder / name).exists()}
+        of = (f"{other.label}/{name}" for other in campaign.chapters
+              for name in chapter.uses(other) if name.endswith(".toml"))
+        found.append({
+            "number": number, "title": answer.question if answer else page.said.title,
+            "name": _shown(PurePath(chapter.label) / PurePath(page.path).parent),
+            "of": _shown(next(of, "")),
+            "command": chapter.record.command, "ended": _date(chapter.record.ended),
+            "answer": answer, "next": later and first[later.label], "picture": page.picture,
+            "rows": rows[:MOST_ROWS], "all_rows": len(rows), "page": files.get(page.path),
+            "files": {_shown(name): address for name, address in files.items()}})
+    return found
+
+
+def _shown(text: object) -> str:
+    """Return a text of a folder without control characters."""
+    return printable(text, MAX_QUOTED)
+
+
+def _link(path: Path, output: Path) -> str:
+    """Return the relative address of a file from the page; no name becomes a scheme or markup."""
+    return quote(os.fsencode(os.path.relpath(path.resolve(), output.parent.resolve())))
+
+
+def _date(ended: str) -> str:
+    """Return the time at which a run ended as people write it."""
+    try:
+        return f"{datetime.fromisoformat(ended):%d %B %Y, %H:%M} UTC"
+    except ValueError:
+        return "an unknown time"
+
+
+def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
+    """Return rows of text: which program wrote each folder, and when."""
+    return [{"results": one.label, "command": one.record.command, "ended": _date(one.record.ended),
+             "programs": one.pages[0].said.provenance.get("programs", "")}
+            for one in campaign.chapters]
+
+
+def _input_rows(campaign: Campaign) -> list[dict[str, str]]:
+    """Return rows of text: which files the commands read, and which of them wrote these."""
+    rows: dict[str, dict[str, str]] = {}
+    for one in campaign.chapters:
+        for path, digest in one.record.inputs.items():
+            row = rows.setdefault(digest, {
+                "file": _shown(os.path.basename(path)),
+                "SHA-256": printable(digest, SHORT_DIGEST),
+                "read by": "", "written by": ", ".join(
+                    other.label for other in campaign.chapters if digest in other.digests)})
+            row["read by"] += f"{', ' * bool(row['read by'])}{one.label}"
+    return list(rows.values())

@@ -1,0 +1,221 @@
+"""What a diagnosis says first: what the study lacks, how sure that is, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.model_selection import MAX_EFFECTS
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.diagnosis.summary import (
+    PRESENT,
+    STUDY_FILE,
+    amounts,
+    limits_in_words,
+    other_findings,
+    place_in_words,
+    position_in_words,
+    region_scores,
+    rivals,
+)
+from halbach_fe.inference.result import TRAINING
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.unknown_cause import (
+    more_readings,
+    suspicion_in_words,
+    unknown_advice,
+    unknown_sentences,
+)
+
+UNUSUAL_AMPLITUDE = 20.0
+"""Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
+magnet that is built with care."""
+
+
+def answer(diagnosis: Diagnosis) -> Answer:
+    """Say what the study lacks, how sure that is, and what to do next."""
+    found, doubts = _found(diagnosis), _doubts(diagnosis)
+    sound = not (diagnosis.unknown or diagnosis.suspected or diagnosis.solver_error or _fails(
+        diagnosis))
+    if sound and diagnosis.identified and len(doubts) == 1:  # only how well the model fits now
+        doubts = [f"Yes. {doubts[0]}"]
+    return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or (
+        "Yes: the readings are explained to their noise, with the blocks' tolerances integrated "
+        "out."), *_next(diagnosis), sound)
+
+
+def _next(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Return the next step, and its command."""
+    campaign = diagnosis.before.is_campaign
+    maps = "" if campaign else " --measurements MAP"
+    infer = f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR"
+    again = f"halbach-fe diagnose STUDY{maps} -o DIR"
+    if diagnosis.solver_error:
+        return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
+    if diagnosis.unknown is not None:
+        return unknown_advice(diagnosis.unknown), again
+    if diagnosis.suspected:
+        return " ".join(map(more_readings, diagnosis.suspected)), again
+    if _fails(diagnosis):
+        check = "halbach-fe check MAP -o DIR"
+        return ("Check the map without any magnet: it says which noise and which rows are in it.",
+                check)
+    if diagnosis.found_anything:
+        changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
+        return (f"{changed} What else it could be, and which measurement would tell, is below."
+                if any(map(rivals, diagnosis.identified)) else changed), infer
+    return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
+
+
+def _fails(diagnosis: Diagnosis) -> bool:
+    """Whether the readings disagree with what the diagnosis leaves."""
+    return diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
+
+
+def _found(diagnosis: Diagnosis) -> list[str]:
+    """Describe in sentences what is missing."""
+    titles = catalogue_titles(diagnosis)
+    after, unknown = diagnosis.after, diagnosis.unknown
+    sentences = [finding.sentence for finding in other_findings(diagnosis)]
+    if diagnosis.solver_error:
+        return sentences
+    if diagnosis.identified:
+        fits = diagnosis.converged and not _fails(diagnosis)
+        start = f"{_maps(diagnosis)} explained by" if fits else (
+            "The best explanation from the catalogue is")
+        sentences.append(f"{start}: " + "; ".join(
+            _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
+    elif diagnosis.suspected:
+        sentences.append("Nothing can be named for certain.")
+    elif unknown is None and not _fails(diagnosis):
+        several = after.is_campaign
+        these = "these maps" if several else "this map"
+        start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
+                 f"Nothing else is missing that {these} can show: with that," if sentences
+                 else f"Nothing is missing that {these} can show:")
+        agree = "the maps agree" if several else "the map agrees"
+        sentences.append(f"{start} {agree} with the study within noise (chi² per reading "
+                         f"{after.prior_conflict:.3g}).")
+    if unknown is not None:
+        sentences += unknown_sentences(unknown, bool(diagnosis.identified))
+    elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
+        disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
+        sentences.append(
+            f"{disagree} with the study (chi² per reading "
+            f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
+            "no effect of the catalogue explains the difference, nor does a smooth field or "
+            "sensor error. Check the noise of the study.")
+    for suspicion in diagnosis.suspected:
+        sentences.append(suspicion_in_words(suspicion, titles))
+    return sentences
+
+
+def _doubts(diagnosis: Diagnosis) -> list[str]:
+    """Say in sentences how far to trust what was found."""
+    titles = catalogue_titles(diagnosis)
+    before, after = diagnosis.before, diagnosis.after
+    sentences = ([] if diagnosis.uncompared is None
+                 else [_cut_in_words(diagnosis.uncompared, diagnosis.rounds)])
+    if diagnosis.solver_error:
+        return sentences
+    if diagnosis.identified:
+        held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
+                        for fit in [each for each in fits if each.part != TRAINING][:1])
+                for fits in (region_scores(before, diagnosis.loo_residuals_before),
+                              region_scores(after, diagnosis.loo_residuals_after))]
+        added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
+        sentences.append(
+            f"With {added} in the model, chi² per training reading is "
+            f"{after.prior_conflict:.3g}{held[1]} (before: {before.prior_conflict:.3g}{held[0]}).")
+        if _fails(diagnosis) and diagnosis.unknown is None:
+            sentences.append("That is still too large: another cause is missing.")
+    sentences += [
+        f"{_maps(diagnosis, 'do')} not tell {title_of(effect.hypothesis.effect.name, titles)} "
+        f"from {joined_by_or(titles_of_rivals(effect, titles))}."
+        for effect in diagnosis.identified if rivals(effect)]
+    if diagnosis.identified and diagnosis.positions:
+        sentences.append(
+            "The magnet is the same from several sides, so that the readings may be displaced by "
+            f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
+            "first is used here.")
+    unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
+               for effect in diagnosis.identified
+               if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
+    if unusual:
+        sentences.append(
+            "Far larger than usual (relative to the prior's standard deviation): "
+            f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
+            "suspect another cause.")
+    if diagnosis.identified and not diagnosis.converged and diagnosis.uncompared is None:
+        sentences.append(
+            f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
+            "their amplitudes still changed.")
+    if len(diagnosis.identified) == MAX_EFFECTS:
+        sentences.append(
+            f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
+            "many effects together are a fit rather than a diagnosis, and some of them take "
+            "the place of another cause.")
+    if after.too_near:
+        sentences.append(after.too_near)
+    nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
+                   or _fails(diagnosis))
+    if nothing and diagnosis.limits:
+        sentences.append(limits_in_words(diagnosis.limits))
+    return sentences
+
+
+def _maps(diagnosis: Diagnosis, verb: str = "are") -> str:
+    """Return the map, or the maps, as the subject of a sentence with a verb."""
+    if diagnosis.after.is_campaign:
+        return f"The maps {verb}"
+    return f"The map {'is' if verb == 'are' else 'does'}"
+
+
+def _cut_in_words(uncompared: int, rounds: int) -> str:
+    """Say that the time limit cut the search."""
+    text = ("The time limit cut the search after "
+            f"{rounds} {'rounds' if rounds > 1 else 'round'}: this is what it had so far")
+    return f"{text}, with {uncompared} hypotheses not compared." if uncompared else f"{text}."
+
+
+def _over_prior_sd(identified: IdentifiedEffect) -> float:
+    """Return the largest ratio of an amplitude to its prior standard deviation.
+
+    Amplitudes that only say whether an effect is present are ignored.
+    """
+    effect = identified.hypothesis.effect
+    first = int(effect.is_binary or effect.applied_in_full)
+    return max((abs(value) / parameter.sd for value, parameter in zip(
+        identified.values[first:], identified.parameters[first:], strict=True)), default=0.0)
+
+
+def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
+    """Describe an effect with its place and amplitudes."""
+    effect = identified.hypothesis.effect
+    parts = [title_of(effect.name, titles), place_in_words(identified.place),
+             "; ".join(text for text in amounts(identified) if text != PRESENT)]
+    return ", ".join(part for part in parts if part)
+
+
+def catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return the descriptions of all effects by name."""
+    return {effect.name: effect.title for effect in (
+        *catalogue(), *(identified.hypothesis.effect for identified in diagnosis.identified))}
+
+
+def titles_of_rivals(identified: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
+    """Return the descriptions of an effect's rivals."""
+    return [title_of(candidate.effect, titles) for candidate, _ in rivals(identified)]
+
+
+def title_of(name: str, titles: dict[str, str]) -> str:
+    """Return the description of an effect, with its name if other effects have the same
+    description.
+    """
+    title = titles.get(name, name)
+    return f"{title} ({name})" if list(titles.values()).count(title) > 1 else title
+
+
+def joined_by_or(parts: Sequence[str]) -> str:
+    """Join phrases by commas and a final "or"."""
+    return " or ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]

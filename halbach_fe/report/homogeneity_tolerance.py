@@ -1,0 +1,114 @@
+"""Figures, table and page of the homogeneity that results from the tolerances of the blocks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.files import write_text
+from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import SIZES, solver_error_text
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import ppm
+
+ENOUGH = 0.9
+"""Share of the magnets within the limit from which the tolerances suffice."""
+
+
+def homogeneity_tolerance_summary(found: HomogeneityTolerance) -> dict[str, object]:
+    """Return the content of tolerance.json."""
+    return {
+        "study": found.study.name, "region": asdict(found.model.region),
+        "draws": len(found.rms_ppm), "limit_ppm": found.limit,
+        "as_ordered": {"mean_T": found.ordered.mean_T, "rms_ppm": found.ordered.rms_ppm,
+                       "peak_to_peak_ppm": found.ordered.peak_to_peak_ppm},
+        **{f"{name}_quantiles": dict(zip(map(str, QUANTILES), np.quantile(
+            values, QUANTILES).tolist(), strict=True)) for name, values in (
+                ("mean_T", found.mean_T), ("rms_ppm", found.rms_ppm),
+                ("peak_to_peak_ppm", found.peak_to_peak_ppm))},
+        "solver_error_ppm": found.model.solver_error_ppm,
+        "share_within_limit": found.share, "share_sd": found.share_sd,
+    }
+
+
+def homogeneity_quantiles(found: HomogeneityTolerance) -> list[dict[str, str]]:
+    """Return a row of text for the rms deviation, the one peak to peak, and the mean field."""
+    def row(name: str, ordered: str, texts: list[str]) -> dict[str, str]:
+        return {"": name, "as ordered": ordered} | {
+            f"{100 * q:g} % below": text for q, text in zip(QUANTILES, texts, strict=True)}
+
+    def quantiles(values: Floats) -> list[float]:
+        return np.quantile(values, QUANTILES).tolist()
+
+    return [
+        row("rms in ppm", ppm(found.ordered.rms_ppm), list(map(ppm, quantiles(found.rms_ppm)))),
+        row("peak to peak in ppm", ppm(found.ordered.peak_to_peak_ppm),
+            list(map(ppm, quantiles(found.peak_to_peak_ppm)))),
+        row("mean field in mT", f"{1e3 * found.ordered.mean_T:.5g}",
+            [f"{1e3 * value:.5g}" for value in quantiles(found.mean_T)])]
+
+
+def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
+    """Say how homogeneous the magnets are, how many meet the limit, and what next."""
+    (half, most), (wide, widest) = (np.quantile(values, (0.5, 0.95)) for values in (
+        found.rms_ppm, found.peak_to_peak_ppm))
+    said = (f"Half of the magnets deviate by less than {ppm(half)} ppm rms ({ppm(wide)} peak to "
+            f"peak) from their mean field in {found.model.region.text}, 95 % by less than "
+            f"{ppm(most)} ({ppm(widest)}). With all blocks as ordered it is "
+            f"{ppm(found.ordered.rms_ppm)} ppm rms.")
+    share, prior = found.share, found.study.prior
+    if share is not None:
+        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+                f"are within {found.limit:g} ppm rms. {said}")
+    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
+               if prior.mounting_sd_deg > 0 else "")
+    enough = share is not None and share >= ENOUGH
+    step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
+             "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
+            ("Sort measured blocks into their slots before assembly: that is better than chance.",
+             "halbach-fe sort STUDY BLOCKS -o DIR"))
+    text, small = solver_error_text(found.model, half)
+    return Answer(
+        "How homogeneous is the field that the tolerances of the blocks leave?", said,
+        f"As far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % and "
+        f"{prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that those "
+        f"tolerances come on top. {len(found.rms_ppm)} magnets were drawn. {text}", *step,
+        sound=small)
+
+
+@own_style
+def write_homogeneity_tolerance(found: HomogeneityTolerance, folder: Path) -> None:
+    """Write tolerance.json, tolerance.html and its figure."""
+    summary = homogeneity_tolerance_summary(found)
+    write_text(folder / "tolerance.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    pictures = save({"tolerance_ppm.png": (
+        _figure(found), "Share of the simulated magnets whose field deviates from its mean by less "
+        "than a limit, rms (left) and peak to peak (right)")}, folder)
+    write_page(folder / "tolerance.html", "homogeneity_tolerance.html.j2", pictures,
+               study=found.study, draws=len(found.rms_ppm), convention=SIZES,
+               answer=homogeneity_tolerance_answer(found), region=found.model.region.text,
+               rows=homogeneity_quantiles(found))
+
+
+def _figure(found: HomogeneityTolerance) -> Figure:
+    """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axis, values, ordered, name in (
+            (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
+            (right, found.peak_to_peak_ppm, found.ordered.peak_to_peak_ppm, "peak to peak")):
+        axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
+        axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
+        axis.set(xlabel=f"{name} deviation in ppm", xlim=(0, None), ylim=(0, 1.02))
+        axis.grid(alpha=0.3)
+    left.set_ylabel("share of magnets")
+    if found.limit is not None:
+        left.axvline(found.limit, color=PRIOR, ls="--", label="limit")
+    left.legend(loc="lower right")
+    return figure

@@ -1,0 +1,103 @@
+"""What a page says, for machines: page.json beside every page.
+
+A report of a campaign is made of these files and the figures beside them, so that it never has to
+read HTML.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from halbach_fe.core.errors import printable
+from halbach_fe.core.files import write_text
+from halbach_fe.report.answer import Answer
+from halbach_fe.study.model import Study
+
+PAGE_RECORD = "page.json"
+
+LONGEST_TEXT = 10_000
+"""Largest number of characters of a text. The longest answers have some thousand."""
+
+
+class Picture(NamedTuple):
+    """A figure in a page.
+
+    Attributes
+    ----------
+    png : str
+        The picture in base64.
+    caption : str
+    file : str
+        Name of its file beside the page.
+    """
+
+    png: str
+    caption: str
+    file: str = ""
+
+
+def _cleaned(text: str) -> str:
+    """Return a text without control characters."""
+    return printable(text, LONGEST_TEXT)
+
+
+def _cleaned_answer(answer: Answer) -> Answer:
+    """Return an answer whose texts have no control characters."""
+    texts = {key: _cleaned(value) for key, value in vars(answer).items() if key != "sound"}
+    return Answer(**texts, sound=answer.sound)
+
+
+Text = Annotated[str, AfterValidator(_cleaned)]
+Row = dict[Text, Text]
+
+
+class FigureFile(BaseModel):
+    """The file of a figure beside a page, and its caption."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    file: Text
+    caption: Text
+
+
+class PageRecord(BaseModel):
+    """The content of page.json.
+
+    Attributes
+    ----------
+    page : str
+        Name of the page's file.
+    title : str
+    answer : Answer or None
+    figures : tuple of FigureFile
+        In the order of the page.
+    rows : tuple of dict of str to str
+        The page's main table; empty if it has none.
+    provenance : dict of str to str
+    study : Study or None
+        The study that the results are of.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    page: Text
+    title: Text
+    answer: Annotated[Answer, AfterValidator(_cleaned_answer)] | None = None
+    figures: tuple[FigureFile, ...] = ()
+    rows: tuple[Row, ...] = ()
+    provenance: dict[Text, Text] = {}
+    study: Study | None = None
+
+
+def write_record(
+    page: Path, title: str, answer: Answer | None, pictures: Sequence[Picture],
+    rows: Sequence[Mapping[str, str]], provenance: Mapping[str, str], study: Study | None,
+) -> None:
+    """Write page.json beside a page; see `PageRecord`."""
+    record = PageRecord(
+        page=page.name, title=title, answer=answer, rows=tuple(map(dict, rows)), study=study,
+        figures=tuple(FigureFile(file=each.file, caption=each.caption) for each in pictures),
+        provenance=dict(provenance))
+    write_text(page.with_name(PAGE_RECORD), record.model_dump_json(indent=1) + "\n")

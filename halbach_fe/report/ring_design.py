@@ -1,0 +1,172 @@
+"""The study of a design, its table, figures and page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter
+
+from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.ring_design import Designed, RingDesign
+from halbach_fe.measurement.tables import write_csv
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import slices_figure
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.words import ppm
+from halbach_fe.study.edit_file import write_edited
+
+STUDY_FILE = "study.designed.toml"
+
+
+def answer(found: Designed) -> Answer:
+    """Say which rings are best and what more field costs, and what to do next."""
+    best, region = found.best, found.region.text
+    start = "" if found.reached else ("No design reaches what is asked. The one that misses it by "
+                                      "least: ")
+    text = [f"{start}{best.blocks} blocks in {_count(found.best)} make {1e3 * best.mean_T:.4g} mT "
+            f"in {region}, homogeneous to {ppm(best.peak_to_peak_ppm)} ppm peak to peak and "
+            f"{ppm(best.rms_ppm)} ppm rms. They weigh {best.mass_kg:.3g} kg."]
+    stronger = [one for one in found.front if one.mean_T > best.mean_T]
+    if stronger:
+        text.append(f"{1e3 * stronger[0].mean_T:.4g} mT are possible with "
+                    f"{ppm(stronger[0].peak_to_peak_ppm)} ppm peak to peak.")
+    return Answer(
+        f"Which rings make a homogeneous field in {region}?", " ".join(text),
+        ("It is the best that the search found, which does not prove that there is no better one. "
+         "These are blocks as ordered: their tolerances leave more.")
+        if found.reached else "It is not what was asked for: the limits of [design] exclude it.",
+        "See what the tolerances of the blocks leave of it." if found.reached else
+        "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
+        f"halbach-fe {'homogeneity ' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
+        found.reached)
+
+
+def _count(design: RingDesign) -> str:
+    """Return the number of rings in words."""
+    rings = sum((1 if z == 0 else 2) * sum(ring is not None for ring in option)
+                for z, option in zip(design.z_m, design.rings, strict=True))
+    return f"{rings} rings"
+
+
+def design_rows(found: Designed) -> list[dict[str, str]]:
+    """Return a row of text for every design, by its field."""
+    return [{
+        "design": "best" if one is found.best else "", "mean field": f"{1e3 * one.mean_T:.5g} mT",
+        "peak to peak in ppm": ppm(one.peak_to_peak_ppm), "rms in ppm": ppm(one.rms_ppm),
+        "blocks": str(one.blocks), "mass": f"{one.mass_kg:.4g} kg"} for one in found.front]
+
+
+def ring_rows(found: Designed) -> list[dict[str, str]]:
+    """Return a row of text for every place of the best design, from the middle upwards."""
+    best = found.best
+    rows = []
+    for z, option in zip(best.z_m, best.rings, strict=True):
+        row = {"z": f"{'±' if z else ''}{1e3 * z:.4g} mm"}
+        for layer, ring in enumerate(option, start=1):
+            name = f"layer {layer}" if len(option) > 1 else "ring"
+            row[name] = "empty" if ring is None else (
+                f"{ring.blocks} blocks of {1e3 * ring.size_m:.4g} mm at {1e3 * ring.radius_m:.6g} "
+                "mm")
+        rows.append(row)
+    return rows
+
+
+def design_summary(found: Designed) -> dict[str, object]:
+    """Return the content of design.json."""
+    def plain(one: RingDesign) -> dict[str, object]:
+        values = {"mean_T": one.mean_T, "rms_ppm": one.rms_ppm,
+                  "peak_to_peak_ppm": one.peak_to_peak_ppm, "mass_kg": one.mass_kg,
+                  "blocks": one.blocks}
+        places = [{"z_m": float(z), "rings": [ring and asdict(ring) for ring in option]}
+                  for z, option in zip(one.z_m, one.rings, strict=True)]
+        return values | {"places": places}
+
+    return {"study": found.study.name, "region": asdict(found.region), "reached": found.reached,
+            "best": plain(found.best), "designs": [plain(one) for one in found.front]}
+
+
+def columns(found: Designed) -> dict[str, Iterable[object]]:
+    """Return the columns of rings.csv, with a row for every ring."""
+    rings = found.study.array.ring
+    return {"ring": range(1, len(rings) + 1),
+            **{name: [getattr(ring, name) for ring in rings] for name in (
+                "z_m", "inner_radius_m", "outer_radius_m", "ring_length_m", "blocks_per_ring")}}
+
+
+def front_figure(found: Designed) -> Figure:
+    """Draw the deviation of all designs over their field."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axis = figure.subplots()
+    field = [1e3 * one.mean_T for one in found.front]
+    axis.plot(field, [one.peak_to_peak_ppm for one in found.front], "o-", color=PRIOR,
+              label="peak to peak")
+    axis.plot(field, [one.rms_ppm for one in found.front], "s--", color=PUBLISHED, label="rms")
+    axis.plot(1e3 * found.best.mean_T, found.best.peak_to_peak_ppm, "o", ms=11, color=POSTERIOR,
+              label="the best design")
+    axis.set(xlabel="mean field in mT", ylabel="deviation in ppm", yscale="log")
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
+    axis.grid(alpha=0.3)
+    axis.legend(frameon=False)
+    return figure
+
+
+def side_figure(found: Designed) -> Figure:
+    """Draw the rings of the best design from the side, and the region."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for ring in found.study.array.ring:
+        assert ring.z_m is not None  # those of a design are not stacked
+        assert ring.ring_length_m is not None
+        assert ring.inner_radius_m is not None
+        assert ring.outer_radius_m is not None
+        axis.add_patch(Rectangle(
+            (1e3 * (ring.z_m - ring.ring_length_m / 2), 1e3 * ring.inner_radius_m),
+            1e3 * ring.ring_length_m, 1e3 * (ring.outer_radius_m - ring.inner_radius_m),
+            facecolor=PRIOR, edgecolor="white"))
+        axis.annotate(str(ring.blocks_per_ring), (1e3 * ring.z_m, 1e3 * ring.outer_radius_m),
+                      ha="center", va="bottom", fontsize=7, color=PUBLISHED)
+    centre, half = found.region.centre_m, found.region.half_axes_m
+    t = np.linspace(0, np.pi, 91)
+    if found.region.shape == "cylinder":
+        z, r = np.array([-1, -1, 1, 1]), np.array([0, 1, 1, 0])
+    else:
+        z, r = np.cos(t), np.sin(t)
+    axis.fill(1e3 * (centre[2] + half[2] * z), 1e3 * half[0] * r, color=POSTERIOR, alpha=0.2,
+              label=found.region.text)
+    axis.set(xlabel="z in mm", ylabel="radius in mm")
+    axis.set_ylim(bottom=0)
+    axis.set_aspect("equal")
+    axis.autoscale_view()
+    axis.legend(frameon=False, loc="lower left")
+    return figure
+
+
+@own_style
+def write_design(
+    found: Designed, text: str, folder: Path, provenance: Mapping[str, str]
+) -> None:
+    """Write study.designed.toml, rings.csv, design.json, design.html and its figures.
+
+    ``text`` is that of the study file.
+    """
+    write_edited(folder / STUDY_FILE, text, [(found.study, "found by halbach-fe design")])
+    write_text(folder / "design.json",
+               json.dumps(design_summary(found), indent=1, allow_nan=False) + "\n")
+    with atomic(folder / "rings.csv") as temporary:
+        write_csv(columns(found), {"study": found.study.name}, temporary)
+    pictures = save({
+        "rings.png": (side_figure(found), "The rings of the best design from the side, with their "
+                      "numbers of blocks, and the region whose field is to be homogeneous"),
+        "slices.png": (slices_figure(found.slices, found.best.mean_T),
+                       "Deviation of |B| from its mean, in planes through the region's centre"),
+        "front.png": (front_figure(found), "What more field costs: designs of larger fields")},
+        folder)
+    write_page(folder / "design.html", "design.html.j2", pictures, study=found.study,
+               provenance=provenance, answer=answer(found), rows=design_rows(found),
+               rings=ring_rows(found), settings=found.study.design)

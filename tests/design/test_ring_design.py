@@ -1,0 +1,221 @@
+"""Designs of rings beside magpylib's field, and the search beside all choices."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+
+import magpylib
+import numpy as np
+import pytest
+import tomlkit
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import StudyError
+from halbach_fe.design.ring_catalogue import Catalogue, largest_number
+from halbach_fe.design.ring_design import design_rings, task_of
+from halbach_fe.design.ring_search import search
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.notebook import html_of
+from halbach_fe.report.result_files import write_report
+from halbach_fe.report.ring_design import STUDY_FILE, answer
+from halbach_fe.response.homogeneity import PPM, Region
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study, read_study
+
+REGION = Region.sphere(0.025)
+DENSITY = 7500.0
+
+DOCUMENT = {
+    "name": "designed", "dimension": 3,
+    "array": {
+        "blocks_per_ring": 16, "inner_radius_m": 0.06, "outer_radius_m": 0.07,
+        "ring_length_m": 0.01, "remanence_T": 1.37, "recoil_permeability": 1.0,
+        "block": {"shape": "cuboid", "width_m": 0.01, "orientation": "magnetization"}},
+    "design": {"rings": 10, "spacing_m": 0.017, "layer": [
+        {"radii_m": [0.058, 0.063, 0.068]}]},
+    "mesh": {"block_size_m": 0.006},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "points", "points_m": [[0, 0, 0]]}}}
+
+
+def study(array=None, **design):
+    """The study with other keys of the design, or of the array."""
+    return parse_study(DOCUMENT | {
+        "array": DOCUMENT["array"] | (array or {}), "design": DOCUMENT["design"] | design})
+
+
+def cubes(blocks):
+    """The blocks as magpylib's cuboids."""
+    return magpylib.Collection(*(magpylib.magnet.Cuboid(
+        dimension=(0.01, 0.01, 0.01), position=block.middle,
+        polarization=(block.remanence, 0, 0)).rotate_from_angax(
+            block.facing_deg, "z", anchor=None) for block in blocks))
+
+
+def deviations(found, count=4000):
+    """Mean field in T, and ppm peak to peak and rms, at random points by magpylib."""
+    generator = np.random.default_rng(1)
+    direction = generator.standard_normal((count, 3))
+    surface = 0.025 * direction / np.linalg.norm(direction, axis=1)[:, None]
+    inside = surface * generator.uniform(0, 1, count)[:, None]**(1 / 3)
+    source = cubes(build_magnet(found.study).blocks)
+    on, within = (source.getB(points)[:, 0] for points in (surface, inside))
+    mean = within.mean()
+    return mean, PPM * np.ptp(on) / mean, PPM * np.std(within) / mean
+
+
+@pytest.fixture(scope="module")
+def designed(getdp, tmp_path_factory):
+    return design_rings(study(), Session(getdp, tmp_path_factory.mktemp("designed")), REGION)
+
+
+def test_the_field_is_that_of_magpylib(designed):
+    mean, whole, rms = deviations(designed)
+    assert designed.best.mean_T == pytest.approx(mean, rel=1e-4)
+    # random points, 1 degree apart, and those 7.5 degrees apart miss the extremes by a little
+    assert designed.best.peak_to_peak_ppm == pytest.approx(whole, rel=0.02)
+    assert designed.best.rms_ppm == pytest.approx(rms, rel=0.1)
+
+
+def test_the_search_finds_the_best_of_all_choices():
+    catalogue = Catalogue.of(study(), REGION, DENSITY)
+    task = task_of(catalogue, np.zeros(len(catalogue.sample.points)))
+    places, options = task.table.shape[:2]
+    every = [float(task.value(task.total(np.array(chosen))))
+             for chosen in product(range(options), repeat=places)]
+    found = search(task, np.zeros(places, int), 20, np.random.default_rng(0))
+    assert found.ppm == pytest.approx(min(every))
+    assert found.ppm < np.quantile(every, 0.02)  # a random choice would not do
+
+
+def test_points_that_are_alike_count_once_and_lose_nothing():
+    catalogue = Catalogue.of(study(), REGION, DENSITY)
+    _, weights = REGION.points(47)
+    assert len(catalogue.sample.points) < len(weights) / 3
+    assert catalogue.sample.weights.sum() == pytest.approx(1)
+
+
+def test_a_least_field_costs_homogeneity(designed, session):
+    asked = 1.1 * designed.best.mean_T
+    stronger = design_rings(study(least_field_T=asked), session, REGION)
+    assert stronger.reached
+    assert stronger.best.mean_T >= asked
+    assert stronger.best.peak_to_peak_ppm > designed.best.peak_to_peak_ppm
+    fields = [one.mean_T for one in designed.front]
+    ppm = [one.peak_to_peak_ppm for one in designed.front]
+    assert fields == sorted(fields)
+    assert ppm == sorted(ppm)
+    assert designed.best is designed.front[0]
+
+
+def test_what_cannot_be_reached_is_said(session):
+    found = design_rings(study(least_field_T=5.0), session, REGION)
+    assert not found.reached
+    assert answer(found).said.startswith("No design reaches")
+
+
+def test_a_largest_mass_leaves_places_empty(designed, session):
+    layer = DOCUMENT["design"]["layer"][0] | {"may_be_empty": True}
+    light = design_rings(study(layer=[layer], most_mass_kg=0.6 * designed.best.mass_kg), session,
+                         REGION)
+    assert light.reached
+    assert light.best.mass_kg <= 0.6 * designed.best.mass_kg
+    assert any(option == (None,) for option in light.best.rings)
+    blocks = build_magnet(light.study).blocks
+    assert len(blocks) == light.best.blocks
+    assert light.best.mass_kg == pytest.approx(DENSITY * sum(block.volume for block in blocks))
+
+
+def test_limits_that_only_an_empty_bore_keeps(session):
+    layer = DOCUMENT["design"]["layer"][0] | {"may_be_empty": True}
+    with pytest.raises(StudyError, match="some rings can keep"):
+        design_rings(study(layer=[layer], most_mass_kg=1e-3), session, REGION)
+
+
+def test_radii_between_those_of_the_list_do_better(designed, session):
+    found = design_rings(study(between_radii=True), session, REGION)
+    assert found.best.peak_to_peak_ppm < 0.8 * designed.best.peak_to_peak_ppm
+    assert deviations(found)[1] == pytest.approx(found.best.peak_to_peak_ppm, rel=0.05)
+    radii = [ring.radius_m for option in found.best.rings for ring in option]
+    assert min(radii) >= 0.058 - 1e-9
+    assert max(radii) <= 0.068 + 1e-9
+
+
+def test_the_reaction_of_permeable_blocks_is_in_the_result(session):
+    found = design_rings(study(array={"recoil_permeability": 1.1}), session, REGION)
+    mean, _, _ = deviations(found)  # in vacuum
+    assert 0.002 < abs(found.best.mean_T / mean - 1) < 0.1
+
+
+def test_layers_together_take_radii_of_the_same_number(session):
+    layers = [{"radii_m": [0.058, 0.062, 0.066]}, {"radii_m": [0.075, 0.079, 0.083]}]
+    found = design_rings(study(layer=layers, layers_together=True), session, REGION)
+    for inner, outer in found.best.rings:
+        assert outer.radius_m - inner.radius_m == pytest.approx(0.017)
+
+
+def test_numbers_of_blocks_are_the_largest_that_fit():
+    array = study().array
+    for orientation, gap in product(("magnetization", "position"), (0.0, 1e-3)):
+        block = array.block.with_(orientation=orientation)
+        own = array.with_(block=block)
+        number = largest_number(own, 0.06, 0.01, gap)
+        build_magnet(study(array={"block": block.model_dump(), "inner_radius_m": 0.055,
+                                  "outer_radius_m": 0.065, "blocks_per_ring": number}))
+        if orientation == "position" and not gap:  # one more would overlap
+            with pytest.raises(StudyError, match="overlap"):
+                build_magnet(study(array={
+                    "block": block.model_dump(), "inner_radius_m": 0.055,
+                    "outer_radius_m": 0.065, "blocks_per_ring": number + 1}))
+
+
+@pytest.mark.parametrize(("changes", "region", "message"), [
+    ({"spacing_m": 0.009}, REGION, "the length of a ring"),
+    ({"layer": [{"radii_m": [0.06]}, {"radii_m": [0.062]}]}, REGION, "fit inside one another"),
+    ({"layer": [{"radii_m": [0.004]}]}, REGION, "so large that four blocks fit"),
+    ({}, Region.sphere(0.06), "reaches"), ({}, Region.sphere(0.01, (-0.055, 0, 0)), "reaches"),
+    ({}, Region.sphere(0.003, (0, 0.062, 0.0765)), "reaches"),
+    ({}, Region("cylinder", (0.02, 0.02, 0.06)), None)])
+def test_impossible_designs_are_refused(changes, region, message, session):
+    if message is None:
+        assert design_rings(study(**changes), session, region).reached
+        return
+    with pytest.raises(StudyError, match=message):
+        design_rings(study(**changes), session, region)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"design": None}, "the rings to choose from"), ({"dimension": 2}, "dimension"),
+    ({"iron_ring": {"inner_radius_m": 0.1, "outer_radius_m": 0.12,
+                    "relative_permeability": 1000.0}}, "without iron"),
+    ({"array": DOCUMENT["array"] | {"multipole_order": 2}}, "multipole_order"),
+    ({"array": DOCUMENT["array"] | {"exceptions": [{"ring": 1, "remanence_T": 1.2}]}},
+     "without exceptions")])
+def test_studies_that_cannot_be_designed_are_refused(changes, message, session):
+    other = parse_study({key: value for key, value in (DOCUMENT | changes).items()
+                         if value is not None})
+    with pytest.raises(StudyError, match=message):
+        design_rings(other, session, REGION)
+
+
+def test_command_line(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DOCUMENT), encoding="utf-8")
+    output = tmp_path / "results"
+    assert main(["design", str(path), "-o", str(output), "--sphere-m", "0.025"]) == 0
+    summary = json.loads((output / "design.json").read_text(encoding="utf-8"))
+    again = read_study(output / STUDY_FILE)
+    assert len(build_magnet(again).blocks) == summary["best"]["blocks"]
+    assert main(["homogeneity", str(output / STUDY_FILE), "-o", str(tmp_path / "h"), "--sphere-m",
+                 "0.025"]) == 0
+    known = json.loads((tmp_path / "h" / "homogeneity.json").read_text(encoding="utf-8"))
+    # |B| there, the component along the main field here: they differ by squares of the deviations
+    assert known["prior"]["peak_to_peak_ppm"] == pytest.approx(
+        summary["best"]["peak_to_peak_ppm"], rel=0.1)  # its points are farther apart
+
+
+def test_pages(designed, tmp_path):
+    page = write_report(designed, tmp_path)
+    assert "peak to peak" in page.read_text(encoding="utf-8")
+    assert "<table" in html_of(designed)

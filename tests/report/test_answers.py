@@ -1,0 +1,210 @@
+"""What every page says first: its numbers are those of the result, and its command exists."""
+
+from __future__ import annotations
+
+import ast
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+import halbach_fe as hf
+from halbach_fe.cli import main
+from halbach_fe.cli.verbs import parser
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.report import (
+    campaign,
+    demagnetization,
+    forces,
+    homogeneity,
+    inference_answer,
+    multipoles,
+    plan,
+    prior,
+    shimming,
+    solution,
+    sorting,
+    tolerance,
+    verification,
+)
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.words import decimals, flux_density, ppm, with_error
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.simulate import simulate_campaign
+from tests.conftest import ROOT
+from tests.support.pages import answer_of
+
+MAGNET = {
+    "name": "answers", "dimension": 3,
+    "array": {"blocks_per_ring": 8, "rings": 2, "inner_radius_m": 0.05, "outer_radius_m": 0.07,
+              "ring_length_m": 0.02, "ring_gap_m": 0.01, "remanence_T": 1.3,
+              "block": {"shape": "cuboid", "width_m": 0.02, "orientation": "magnetization"}},
+    "mesh": {"block_size_m": 0.01},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": 0.03, "angles": 8, "z_min_m": -0.03, "z_max_m": 0.03,
+        "count": 5}},
+    "noise": {"regions": [{"name": "all", "sigma_T": 1e-5}]},
+    "prior": {"magnitude_sd": 0.01, "direction_sd_deg": 1.0,
+              "types": {"a": list(range(1, 9))}},
+    "demagnetization": {
+        "intrinsic_coercivity_A_per_m": 9.55e5, "remanence_coefficient_per_K": -0.0012,
+        "coercivity_coefficient_per_K": -0.006, "temperature_C": 60}}
+"""Sixteen cubes in vacuum, where nothing has to be solved."""
+
+
+class Given:
+    """The magnet, and what the commands need."""
+
+    def __init__(self, folder):
+        self.study = parse_study(MAGNET)
+        self.magnet = build_magnet(self.study)
+        self.session = Session.open(folder)
+        self.campaign = simulate_campaign(self.study, 3)
+        self.updated = hf.infer(self.magnet, self.campaign.readings, self.session)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    return Given(tmp_path_factory.mktemp("answers"))
+
+
+def of_solve(given):
+    found = hf.solve(given.magnet, given.session)
+    size = np.linalg.norm(found.flux_density, axis=1)
+    return solution.answer(found), [flux_density(size.max(), 4), "exact", "homogeneity STUDY"]
+
+
+def of_verify(given):
+    found = hf.verify(given.magnet, given.session)
+    return verification.answer(found), [flux_density(found.main_field_T, 4), "exact"]
+
+
+def of_multipoles(given):
+    tables = hf.multipoles(given.magnet, given.session).tables
+    known = [magnets["prior"] for _, magnets in tables]
+    return multipoles.answer(tables, 50.0), [
+        *(with_error(1e3 * one.main, 1e3 * one.main_sd) for one in known), "within 50 units",
+        "as ordered"]
+
+
+def of_homogeneity(given):
+    found = hf.homogeneity(given.magnet, given.session, degrees=2)
+    known = found.by_name["prior"]
+    return homogeneity.answer(found), [f"{ppm(known.rms_ppm)} ppm rms", "exact", "as ordered"]
+
+
+def of_forces(given):
+    found = hf.forces(given.magnet, given.session)
+    return forces.answer(found), [f"{decimals(found.in_place.magnitude.max())} N", "of 16",
+                                  f"{found.mass_kg.sum():.4g} kg"]
+
+
+def of_plan(given):
+    found = hf.plan(given.magnet, given.session, points=6)
+    left = np.sqrt(np.mean(found.planned_sd**2) / np.mean(found.prior_sd**2))
+    return plan.answer(found), ["6 positions", f"{100 * left:.1f}"]
+
+
+def of_prior(given):
+    found = prior_from_blocks(given.magnet, given.campaign.blocks)
+    spread = np.sqrt(np.mean(found.gaussian.sd**2) / np.mean(found.nominal**2))
+    return prior.answer(found), ["16 measured blocks", f"{100 * spread:.1f}"]
+
+
+def of_sort(given):
+    found = hf.sort(given.magnet, given.campaign.blocks, given.session)
+    size = np.sqrt(np.mean(found.best.sizes**2))
+    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv"]
+
+
+def of_shim(given):
+    found = hf.shim(given.updated, given.session, swaps=1, turns=0)
+    after = np.sqrt(found.after.expected_square / len(found.after.orders))
+    return shimming.answer(found, given.updated), [
+        f"{after:.3g} units", f"{len(found.steps)} move" if found.steps else "No move"]
+
+
+def of_tolerance(given):
+    found = hf.tolerance(given.magnet, given.session, draws=200, limit_units=100.0)
+    return tolerance.answer(found), [f"{100 * found.share:.3g} ±", "200 magnets"]
+
+
+def of_demagnetization(given):
+    found = hf.demagnetization(given.magnet, given.session, across=2)
+    return demagnetization.answer(found), [
+        f"{1e-3 * found.margin.min():+.0f} kA/m", "At 60 °C", "ring "]
+
+
+def of_simulate(given):
+    readings = given.campaign.readings
+    return (campaign.answer(given.study, readings, given.campaign.held_out,
+                            len(given.campaign.blocks)),
+            ["40 points", "16 single blocks", flux_density(
+                float(np.nanmax(np.abs(readings["B_T"].values))), 4), "10\u00a0µT"])
+
+
+def of_infer(given):
+    off = given.updated.readings - given.updated.prediction_posterior.mean
+    return inference_answer.answer(given.updated), [
+        flux_density(float(np.sqrt(np.mean(off**2)))), f"{given.updated.prior_conflict:.3g}"]
+
+
+ANSWERS = (of_solve, of_verify, of_multipoles, of_homogeneity, of_forces, of_plan, of_prior,
+           of_sort, of_shim, of_tolerance, of_demagnetization, of_simulate, of_infer)
+
+
+@pytest.mark.parametrize("of", ANSWERS, ids=lambda of: of.__name__)
+def test_the_answer_has_the_numbers_of_its_result(given, of):
+    found, numbers = of(given)
+    check(found, numbers)
+    with pytest.raises(AssertionError):  # the control: a number of no result
+        check(found, ["123456.789"])
+
+
+def check(found, numbers):
+    text = " ".join(found.sentences) + found.command
+    for number in numbers:
+        assert number in text, number
+    assert found.question.endswith("?")
+    assert found.sound
+    for word in ("nan", "None", "e-0", "e+0", "r01s", "nats"):
+        assert word not in text, word
+    program, *words = shlex.split(found.command)
+    assert program == "halbach-fe"
+    assert parser(words[:1]).parse_args(words).verb == words[0]
+
+
+def test_every_page_has_an_answer():
+    found = {path.stem: answers_in(path.read_text())
+             for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
+    assert not [name for name, answers in found.items() if not all(answers)]
+    assert sum(map(len, found.values())) > 20
+    assert not all(answers_in("write_page(path, template, pictures, study)"))  # the control
+
+
+def answers_in(code):
+    """Whether each call of write_page in a text has an answer."""
+    return [any(key.arg == "answer" for key in node.keywords) for node in ast.walk(ast.parse(code))
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "write_page"]
+
+
+def test_page_and_terminal_say_the_same(tmp_path, capsys):
+    """With the paths of the files in the command."""
+    study = ROOT / "studies" / "quadrupole" / "study.toml"
+    blocks = study.parent / "campaign" / "blocks.csv"
+    assert main(["prior", str(study), str(blocks), "-o", str(tmp_path)]) == 0
+    said, shown = capsys.readouterr().err, answer_of(tmp_path / "prior.html")
+    for part in ("said", "trust", "step"):
+        assert shown[part] in said
+    assert f"infer {study} --measurements MAP --blocks {blocks}" in said
+    assert "12 measured blocks" in shown["said"]
+    assert json.loads((tmp_path / "prior.json").read_text())["blocks"] == 12
+
+
+def test_paths_in_a_command_are_quoted():
+    found = Answer("?", "", "", "", "halbach-fe infer STUDY --measurements MAP -o DIR").with_paths(
+        {"STUDY": "my study.toml", "MAP": None})
+    assert found.command == "halbach-fe infer 'my study.toml' --measurements MAP -o DIR"

@@ -1,0 +1,465 @@
+"""One page of all results of a magnet: what it says, what it refuses, and what it doubts."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+import tomlkit
+
+import halbach_fe as hf
+from halbach_fe.cli import main
+from halbach_fe.cli.verbs import VERBS
+from halbach_fe.core.files import write_text
+from halbach_fe.core.result_folder import RECORD, result_folder
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
+from halbach_fe.report.campaign_report import read_campaign
+from halbach_fe.report.page import write_page
+from halbach_fe.report.page_record import PAGE_RECORD, Picture
+from halbach_fe.report.result_files import OWNERS
+from tests.conftest import changed, parse_study
+from tests.support.results import STUDY, TINY, results
+
+
+class Parts(HTMLParser):
+    """Elements with the names of their attributes, links, anchors, sources, and all text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.links, self.anchors, self.sources, self.text = [], [], [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.elements.append((tag, *named))
+        self.links += [named["href"]] if "href" in named else []
+        self.anchors += [named["id"]] if "id" in named else []
+        self.sources += [named["src"]] if "src" in named else []
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def parts_of(path):
+    return Parts(path.read_text(encoding="utf-8"))
+
+
+def unresolved(path):
+    """Links that lead nowhere."""
+    page = parts_of(path)
+    return [link for link in page.links
+            if not (link[1:] in page.anchors if link.startswith("#")
+                    else (path.parent / unquote(link)).is_file())]
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """A measured magnet, as the commands leave it."""
+    home = tmp_path_factory.mktemp("campaign")
+    study, made = home / "study.toml", home / "results" / "simulated"
+    study.write_text(tomlkit.dumps(TINY))
+
+    def run(verb, folder, *options, of=study):
+        assert main([verb, str(of), "-o", str(home / "results" / folder), "--json", *map(
+            str, options)]) == 0
+
+    run("simulate-measurement", "simulated")
+    run("solve", "field")
+    run("infer", "inferred", "--measurements", made / "map.csv")
+    run("multipoles", "multipoles", "--posterior", home / "results" / "inferred" / "posterior.h5")
+    return home / "results"
+
+
+def test_every_answer_is_on_the_page(campaign, capsys):
+    folders = [campaign / name for name in ("multipoles", "inferred", "simulated", "field")]
+    capsys.readouterr()
+    assert main(["report", *map(str, folders), "-o", str(campaign / "all.html"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [one["folder"] for one in found["results"]] == [
+        "field", "simulated", "inferred", "multipoles"]
+    assert (found["doubts"], found["versions"]) == ([], [])
+    page = parts_of(campaign / "all.html")
+    for one in found["results"]:
+        said = json.loads((campaign / one["folder"] / PAGE_RECORD).read_text())
+        assert one["answer"] == said["answer"]
+        for key in ("question", "said", "trust", "step"):
+            assert said["answer"][key] in page.text
+    assert "4 results of one magnet. The answers may be used as they stand." in page.text
+    assert "1 ring of 4 sectors" in page.text
+    assert [one for one in page.links if one.startswith("#")] == [
+        *(f"#part-{number}" for number in (1, 2, 3, 4, 4, 3, 4))]  # contents, next steps
+    assert unresolved(campaign / "all.html") == []
+    assert "inferred/report.html" in page.links
+    assert len(page.sources) == 5  # the magnet, and a figure of each
+    assert all(one.startswith("data:image/png;base64,") for one in page.sources)
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, *_ in page.elements}
+    assert str(campaign) not in page.text
+
+
+def test_the_page_may_be_elsewhere(campaign, tmp_path):
+    """Its links start from where it is; in a folder, that is owned."""
+    path = hf.campaign_report([campaign / "field", str(campaign / "inferred")], tmp_path / "of all")
+    assert path == tmp_path / "of all" / "report.html"
+    assert unresolved(path) == []
+    (path.parent / "deeper").mkdir()
+    moved = path.rename(path.parent / "deeper" / "report.html")
+    assert len(unresolved(moved)) > 10  # the control
+    assert json.loads((tmp_path / "of all" / RECORD).read_text())["command"] == "halbach-fe report"
+
+
+def test_what_a_person_sees(campaign, capsys):
+    assert main(["report", str(campaign / "field"), "-o", str(campaign / "one.html")]) == 0
+    shown = capsys.readouterr()
+    assert "nominal magnet" in " ".join(shown.out.split())
+    assert f"Report: {campaign / 'one.html'}" in shown.err
+
+
+def test_results_are_not_replaced(campaign, capsys):
+    before = (campaign / "inferred" / "report.html").read_bytes()
+    for output, said in (("inferred/report.html", "is a result of `halbach-fe infer`"),
+                         ("inferred", "holds results of `halbach-fe infer`")):
+        assert main(["report", str(campaign / "field"), "-o", str(campaign / output)]) == 8
+        assert said in capsys.readouterr().err
+    assert (campaign / "inferred" / "report.html").read_bytes() == before
+
+
+def test_its_own_folder_is_left_out(tmp_path):
+    """As wildcards may name it when it is written again."""
+    folders = [results(tmp_path / "field", "solve"), tmp_path / "all"]
+    for _ in range(2):
+        assert hf.campaign_report(folders, tmp_path / "all").is_file()
+    with pytest.raises(hf.HalbachError, match="halbach-fe report"):
+        hf.campaign_report(folders, tmp_path / "other")
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def another(**keys):
+    return parse_study(changed(TINY, **keys))
+
+
+@pytest.mark.parametrize(("study", "said"), [
+    (another(name="other"), "study tiny and .*two of study other"),
+    (another(array__inner_radius_m=0.12), "another `array.inner_radius_m`"),
+    (another(array__blocks_per_ring=8), "another `array.blocks_per_ring`"),
+    (another(array__multipole_order=2), "another `array.multipole_order`"),
+    (another(dimension=3, array__ring_length_m=0.1), "another `dimension`")])
+def test_results_of_two_magnets(tmp_path, study, said):
+    folders = [results(tmp_path / "one", "solve"), results(tmp_path / "two", "infer", study)]
+    with pytest.raises(hf.HalbachError, match=said) as refused:
+        hf.campaign_report(folders, tmp_path / "all.html")
+    assert refused.value.exit_code == 8
+    assert not (tmp_path / "all.html").exists()
+
+
+@pytest.mark.parametrize("keys", [
+    {"array__remanence_T": 1.2}, {"array__inner_radius_m": 0.1045},
+    {"array__exceptions": [{"ring": 1, "slot": 2, "magnetization_factor": 0.0}]},
+    {"array__exceptions": [{"shift_m": [0.002, 0, 0]}]}, {"prior": {"common_mode_sd": 0.01}}])
+def test_deviations_make_no_other_magnet(keys):
+    """The control."""
+    assert is_same_magnet(STUDY, another(**keys))
+    assert not is_same_magnet(STUDY, another(array__blocks_per_ring=8, **keys))
+
+
+def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
+    """Whatever a diagnosis has changed; without its folder nobody knows."""
+    first = results(tmp_path / "field", "solve")
+    found = results(tmp_path / "diagnosis", "diagnose", files=["study.diagnosed.toml"])
+    after = results(tmp_path / "better", "infer", another(array__inner_radius_m=0.12),
+                    [found / "study.diagnosed.toml"])
+    page = parts_of(hf.campaign_report([first, after, found], tmp_path / "all.html"))
+    assert ("better is of diagnosis/study.diagnosed.toml, which halbach-fe diagnose wrote: "
+            "array.inner_radius_m is 0.12 instead of 0.104.") in page.text
+    assert re.findall(r"folder (\w+),", page.text) == [
+        "field", "diagnosis", "better"]
+    with pytest.raises(hf.HalbachError, match="of one magnet"):
+        hf.campaign_report([first, after], tmp_path / "all.html")
+
+
+def no_page(folder):
+    with result_folder(folder, "halbach-fe solve", "tiny"):
+        write_text(folder / "field.csv", "1")
+
+
+def edited_record(**keys):
+    def make(folder):
+        path = results(folder, "solve") / RECORD
+        path.write_text(json.dumps(json.loads(path.read_text()) | keys))
+    return make
+
+
+def edited_page(content):
+    return lambda folder: (results(folder, "solve") / PAGE_RECORD).write_text(content)
+
+
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda folder: None, "does not exist"), (lambda folder: folder.write_text("1"), "a file"),
+    (lambda folder: folder.mkdir(), "no run.json"), (no_page, "no page.json"),
+    (edited_record(ended=""), "failed, was killed"), (edited_record(files={}), "no page.json"),
+    (edited_record(command="rm -rf /"), "of `rm -rf /`"),
+    (edited_record(command="halbach-fe report"), "halbach-fe report"),
+    (edited_record(study="other"), "with a page of tiny"),
+    (edited_page(""), "page.json"), (edited_page("[" * 100_000), "page.json"),
+    (edited_page('{"page": "page.html", "title": "", "unknown": 1}'), "another version"),
+    (edited_page('{"page": "../../field/page.html", "title": ""}'), "whose .* is none"),
+    (lambda folder: results(folder, "check", None), "without a study only")])
+def test_folders_that_are_none(tmp_path, make, said):
+    make(tmp_path / "field")
+    with pytest.raises(hf.HalbachError, match=said):
+        hf.campaign_report([tmp_path / "field"], tmp_path / "all.html")
+    assert not (tmp_path / "all.html").exists()
+
+
+def test_a_stray_file_and_a_folder_twice(tmp_path, capsys):
+    folder = results(tmp_path / "field", "solve")
+    (tmp_path / "notes.txt").write_text("mine")
+    for words, said in (([folder, tmp_path / "notes.txt"], "notes.txt, a file. Leave it out."),
+                        ([folder, folder / "."], "twice")):
+        assert main(["report", *map(str, words), "-o", str(tmp_path / "all.html")]) == 8
+        assert said in capsys.readouterr().err
+    with pytest.raises(hf.HalbachError, match="a list of folders"):
+        hf.campaign_report([], tmp_path / "all.html")
+    with pytest.raises(hf.HalbachError, match="a list of folders"):
+        hf.campaign_report(str(folder), tmp_path / "all.html")
+
+
+def test_a_folder_in_use(tmp_path):
+    folder = results(tmp_path / "field", "solve")
+    with (folder / RECORD).open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(hf.HalbachError, match="in use by a run"):
+            hf.campaign_report([folder], tmp_path / "all.html")
+    assert hf.campaign_report([folder], tmp_path / "all.html").is_file()
+
+
+# --- what does not fit together -----------------------------------------------------------------
+
+
+@pytest.fixture
+def home(tmp_path):
+    """A study, a map, and results of them that fit together."""
+    for name in ("study.toml", "map.csv"):
+        (tmp_path / name).write_text(name)
+    study, readings = tmp_path / "study.toml", tmp_path / "map.csv"
+    results(tmp_path / "field", "solve", reads=[study])
+    results(tmp_path / "check", "check", None, [readings])
+    results(tmp_path / "inferred", "infer", reads=[study, readings], files=["posterior.h5"])
+    posterior = tmp_path / "inferred" / "posterior.h5"
+    results(tmp_path / "ppm", "homogeneity", reads=[study, posterior])
+    return tmp_path
+
+
+def found_in(home, *names):
+    names = names or sorted(path.parent.name for path in home.glob(f"*/{RECORD}"))
+    return read_campaign([home / name for name in names])
+
+
+def test_what_fits(home):
+    """The control of all that follow."""
+    assert found_in(home).doubts == found_in(home).versions == []
+    assert found_in(home).answer.sound
+
+
+def another_posterior(home):
+    with result_folder(home / "inferred", "halbach-fe infer", "tiny", [home / "map.csv"]):
+        write_text(home / "inferred" / "posterior.h5", "another")
+        write_page(home / "inferred" / "page.html", "calibration.html.j2", [], STUDY, results={})
+
+
+def another_map(home):
+    (home / "map.csv").write_text("another")
+    results(home / "inferred", "infer", reads=[home / "study.toml", home / "map.csv"],
+            files=["posterior.h5"])
+
+
+def unused_finding(home, finds=True):
+    results(home / "diagnosis", "diagnose", reads=[home / "study.toml"],
+            files=["study.diagnosed.toml"], finds=finds)
+
+
+def another_material(home):
+    results(home / "ppm", "homogeneity", another(array__remanence_T=1.2),
+            [home / "study.toml", home / "inferred" / "posterior.h5"])
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda home: (home / "field" / "solve.png").write_text("x"),
+     "Changed since the run in field: solve.png."),
+    (another_posterior, "ppm is out of date: it was computed with another posterior.h5 than "
+     "inferred holds."),
+    (another_map, "check and inferred read different files called map.csv."),
+    (another_map, "check is of a file that no other result here is of: "),
+    (unused_finding, "No result here is of diagnosis/study.diagnosed.toml: inferred and ppm are "
+     "without what halbach-fe diagnose has found."),
+    (another_material, "ppm is of another version of the study than field: array.remanence_T is "
+     "1.2 instead of 1.06.")])
+def test_what_does_not_fit(home, change, said):
+    change(home)
+    campaign = found_in(home)
+    assert any(sentence.startswith(said) for sentence in campaign.doubts)
+    assert not campaign.answer.sound
+    page = parts_of(hf.campaign_report([one.folder for one in campaign.chapters],
+                                       home / "all.html"))
+    assert said in page.text
+    assert "What does not fit together" in page.text
+
+
+def test_a_diagnosis_that_found_nothing(home):
+    unused_finding(home, finds=False)
+    assert found_in(home).doubts == []
+
+
+def test_other_settings_are_said_but_no_doubt(home):
+    results(home / "field", "solve", another(mesh__block_size_m=0.01), [home / "study.toml"])
+    campaign = found_in(home)
+    assert campaign.doubts == []
+    assert campaign.versions == ["inferred and ppm are of another version of the study than field: "
+                                 "mesh.block_size_m is 0.02 instead of 0.01."]
+
+
+def test_a_better_answer_replaces_one_that_is_not_sound(home):
+    """Which the diagnosis of it led to; alone it makes the whole page doubtful."""
+    study = home / "study.toml"
+    results(home / "inferred", "infer", reads=[study, home / "map.csv"],
+            files=["posterior.h5"], answer=Answer(
+                "Like what?", "Bad.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False))
+    unused_finding(home)
+    alone = found_in(home, "field", "inferred").answer
+    assert (alone.sound, alone.step) == (False, "Diagnose.")
+    assert "Not to be trusted as they are: inferred." in alone.said
+    results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),
+            [home / "diagnosis" / "study.diagnosed.toml", home / "map.csv"])
+    campaign = found_in(home, "field", "inferred", "better", "diagnosis")
+    assert [one.label for one in campaign.chapters] == ["field", "inferred", "diagnosis", "better"]
+    assert campaign.answer.said.endswith("may be used as they stand. Use better instead of "
+                                         "inferred.")
+    assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
+
+
+def test_the_order_is_that_of_the_data(tmp_path):
+    """And every command has its place in it."""
+    for number, verb in enumerate(reversed(ORDER)):
+        results(tmp_path / f"{number:02}", verb)
+    results(tmp_path / "99", "of-later-versions")
+    assert [one.verb for one in found_in(tmp_path).chapters] == [*ORDER, "of-later-versions"]
+    assert {verb for verb, _ in OWNERS.values()} <= set(ORDER) <= set(VERBS)
+    assert set(TELLING) <= set(ORDER)
+
+
+# --- files are data -----------------------------------------------------------------------------
+
+PLANTED = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "</title></style><b>",
+           "{{ 7*7 }}", "javascript:alert(1)", "\x1b[31m\u202e")
+
+
+def everywhere(home, text):
+    """Results with a text in every place where there may be any, past what writes them."""
+    folder = results(home / "field", "solve", files=["a.csv"])
+    said = json.loads((folder / PAGE_RECORD).read_text())
+    said |= {"title": text, "rows": [{text or "x": text}], "provenance": {"programs": text},
+             "answer": {key: text if key != "sound" else False for key in said["answer"]}}
+    said["figures"][0]["caption"] = text
+    said["study"]["description"] = text.replace("\x1b", "").replace("\u202e", "")
+    (folder / PAGE_RECORD).write_text(json.dumps(said))
+    record = json.loads((folder / RECORD).read_text())
+    record |= {"ended": text, "inputs": {f"{text}.csv": text}}
+    (folder / RECORD).write_text(json.dumps(record))
+    return folder
+
+
+@pytest.mark.parametrize("text", PLANTED)
+def test_planted_texts_stay_texts(tmp_path, text):
+    """The page has the elements of one with harmless texts."""
+    def page(word, name):
+        (tmp_path / name).mkdir()
+        return parts_of(hf.campaign_report([everywhere(tmp_path / name, word)],
+                                           tmp_path / name / "all.html"))
+
+    planted, harmless = page(text, "planted"), page("harmless", "harmless")
+    assert planted.elements == harmless.elements
+    assert len(planted.sources) == 2
+    assert "\x1b" not in planted.text
+    assert "\u202e" not in planted.text
+    if text.isprintable():
+        assert planted.text.count(text) >= 10
+    assert Parts(text).elements or "<" not in text  # the control: it would be an element
+
+
+@pytest.mark.parametrize("name", ["javascript:alert(1)", '"><b>', "a b#c?d", "%2e%2e", "Größe",
+                                  os.fsdecode(b"\xff")])
+def test_names_of_folders_are_no_markup(tmp_path, name):
+    path = hf.campaign_report([results(tmp_path / name, "solve")], tmp_path / "all.html")
+    page = parts_of(path)
+    assert not {"script", "b"} & {tag for tag, *_ in page.elements}
+    assert not any(":" in link for link in page.links)
+    files = [link for link in page.links if not link.startswith("#")]
+    assert all(os.path.isfile(os.fsencode(tmp_path) + b"/" + unquote_bytes(link))
+               for link in files)
+    assert len(files) == 4  # the page, and three files
+
+
+def unquote_bytes(link):
+    return os.fsencode(unquote(link, errors="surrogateescape"))
+
+
+@pytest.fixture
+def secret(tmp_path):
+    path = tmp_path / "secret.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\nsecret")
+    return path
+
+
+def pointing(name):
+    def change(folder, secret):
+        said = json.loads((folder / PAGE_RECORD).read_text())
+        said["figures"][0]["file"] = name.replace("SECRET", str(secret))
+        (folder / PAGE_RECORD).write_text(json.dumps(said))
+    return change
+
+
+def linked(folder, secret):
+    (folder / "solve.png").unlink()
+    (folder / "solve.png").symlink_to(secret)
+
+
+def no_picture(folder, secret):
+    (folder / "solve.png").write_text("<svg onload='alert(1)'>secret")
+
+
+def endless(folder, secret):
+    (folder / "solve.png").unlink()
+    os.mkfifo(folder / "solve.png")
+
+
+@pytest.mark.parametrize("change", [
+    pointing("../secret.png"), pointing("SECRET"), pointing("a.csv"), pointing(""), linked,
+    no_picture, endless])
+def test_figures_are_png_of_the_folder(tmp_path, secret, change):
+    """Nothing else gets into the page."""
+    folder = results(tmp_path / "field", "solve", files=["a.csv"])
+    assert len(parts_of(hf.campaign_report([folder], tmp_path / "all.html")).sources) == 2
+    change(folder, secret)
+    assert len(parts_of(hf.campaign_report([folder], tmp_path / "all.html")).sources) == 1
+
+
+def test_page_records_are_of_what_is_on_the_page(tmp_path):
+    """What a page says, it says to machines too."""
+    write_page(tmp_path / "one.html", "calibration.html.j2", [Picture("", "what is seen", "a.png")],
+               STUDY, {"map": "m.csv"}, Answer("q", "s", "t", "n"), [{"a": "1"}], results={})
+    said = json.loads(Path(tmp_path, PAGE_RECORD).read_text())
+    assert said["provenance"].pop("programs").startswith("halbach-fe")
+    assert said.pop("study")["name"] == "tiny"
+    assert said == {
+        "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
+        "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
+        "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
+                   "sound": True}}
