@@ -568,13 +568,13 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
     """Say the answer of a command, the command to go on with, and where its page is."""
     named = answer.with_paths({
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
-        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None))})
-    output = getattr(arguments, "output", None)
+        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
+        "POSTERIOR": getattr(arguments, "posterior", None),
+        "DIR": getattr(arguments, "output", None)})
     for sentence in named.sentences:
         say(sentence)
     if named.command:
-        command = named.command if output is None else named.command.replace("DIR/", f"{output}/")
-        say(f"  {command}")
+        say(f"  {named.command}")
     if page is not None:
         say(f"Report: {page}")
 

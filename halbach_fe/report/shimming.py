@@ -136,7 +136,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements MAP -o DIR") if shim.steps else
             ("See the multipoles of the magnet as it is.",
-             "halbach-fe multipoles STUDY --posterior DIR/posterior.h5 -o DIR")))
+             "halbach-fe multipoles STUDY --posterior POSTERIOR -o DIR")))
 
 
 @own_style
