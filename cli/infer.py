@@ -75,8 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
 
             write_inference(result, arguments.output)  # to be kept even if the chains fail
             with common.workers(arguments) as pool:
-                sampled = sample_posterior(result, session, arguments.samples,
-                                           seed=arguments.seed or 1, say=common.say, mapped=pool.map)
+                sampled = sample_posterior(
+                    result, session, arguments.samples, seed=arguments.seed or 1, say=common.say,
+                    mapped=pool.map)
             result = with_samples(result, sampled)
             write_sampled(sampled, arguments.output)
     if result.response.reused:

@@ -48,10 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--most", type=common.positive, metavar="N",
                         help="largest number of poses that are fitted with the blocks (default: "
                         "4, or 8 on a line, of those that the search finds)")
-    parser.add_argument("--across-m", type=common.within(common.positive_number, 0, MOST_ACROSS_M), metavar="SD",
+    parser.add_argument("--across-m", metavar="SD",
+                        type=common.within(common.positive_number, 0, MOST_ACROSS_M),
                         help="prior standard deviation of the map's distance from the axis, for a "
                         "map that does not determine it (default: the blocks' outer radius)")
-    parser.add_argument("--turn-rad", type=common.within(common.positive_number, 0, math.pi / 2), metavar="SD",
+    parser.add_argument("--turn-rad", metavar="SD",
+                        type=common.within(common.positive_number, 0, math.pi / 2),
                         help="prior standard deviation of the map's turns from right angles, for a "
                         "map that does not determine them (default: 0.1)")
 
