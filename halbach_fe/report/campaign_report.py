@@ -106,10 +106,10 @@ class Campaign:
         """Return the answer whose next step is the one to take.
 
         It is that of an answer which may not be used; or else of the last one about the measured
-        magnet, if there is any.
+        magnet, if there is any. Its command names the folder of that answer.
         """
-        left = [(chapter, answer) for chapter, _, answer in self.answered
-                if self.continued(chapter, answer) is None]
+        left = [(chapter, answer.with_paths({"DIR": chapter.folder}))
+                for chapter, _, answer in self.answered if self.continued(chapter, answer) is None]
         unsound = [answer for chapter, answer in left
                    if not answer.sound and self.replaced(chapter) is None]
         measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]

@@ -56,7 +56,7 @@ def answer(found: HomogeneityResult) -> Answer:
             question, f"{text} (95 % of what the {name} allows: {low} to {high} ppm rms).",
             f"Yes, as far as the update agrees with its map, which its own page says. {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior DIR/posterior.h5 -o DIR", small)
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
     return Answer(
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",

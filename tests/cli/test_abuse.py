@@ -381,3 +381,24 @@ def test_an_endless_file(monkeypatch):
     with pytest.raises(OSError, match="A pipe or device of more than"):
         InputFile("/dev/zero").read_bytes()
     assert InputFile("/dev/null").read_bytes() == b""
+
+
+def test_rods_that_leave_no_wall(campaign, tmp_path, capsys):
+    """It is not the pockets that are too near to each other."""
+    study, _, _ = campaign
+    study.write_text(tomlkit.dumps(changed(BASE, holder={
+        "clearance_m": 0.0, "rods": {"count": 100, "diameter_m": 0.02}})))
+    code, sentence = refused(["cad", study, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert "between rod 1 and rod 2" in sentence
+    assert "take fewer or thinner rods" in sentence
+
+
+def test_a_folder_is_refused_before_the_check(tmp_path, capsys, monkeypatch):
+    """Which may take a minute."""
+    file = tmp_path / "map.csv"
+    file.write_text("x_m,y_m,z_m,Bx_T,By_T,Bz_T\n0,0,0,1,0,0\n")
+    monkeypatch.setattr("halbach_fe.measurement.map_check.check_map", None)
+    code, sentence = refused(["check", file, "-o", file], capsys)
+    assert code == 8
+    assert "Cannot make folder" in sentence

@@ -208,3 +208,23 @@ def test_paths_in_a_command_are_quoted():
     found = Answer("?", "", "", "", "halbach-fe infer STUDY --measurements MAP -o DIR").with_paths(
         {"STUDY": "my study.toml", "MAP": None})
     assert found.command == "halbach-fe infer 'my study.toml' --measurements MAP -o DIR"
+
+
+def test_the_command_has_the_files_of_the_user(tmp_path):
+    """Quoted for a shell; a folder for other results is not that of these."""
+    command = "halbach-fe homogeneity STUDY --posterior POSTERIOR --blocks DIR/b.csv -o DIR"
+    answer = Answer("?", "", "", "", command)
+    assert answer.with_paths({"DIR": None}).command == command
+    found = answer.with_paths({"STUDY": tmp_path / "my study.toml", "DIR": "a b", "POSTERIOR": "p"})
+    assert shlex.split(found.command)[2:] == [
+        str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
+
+
+def test_commands_name_the_posterior_that_was_read(given):
+    """It lies in the folder of the update, not in that of the command which read it."""
+    for found in (homogeneity.answer(hf.homogeneity(given.magnet, given.session,
+                                                    posterior=given.updated)),
+                  shimming.answer(hf.shim(given.updated, given.session, swaps=0, turns=0),
+                                  given.updated)):
+        assert "DIR/posterior.h5" not in found.command
+        assert "--posterior POSTERIOR" in found.command
