@@ -547,7 +547,7 @@ def demagnetization(
 
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
@@ -566,6 +566,9 @@ def simulate_measurement(
         Number of further hidden effects that are drawn at random.
     progress : callable, optional
         Called with the amount of work that magpylib has done and its total.
+    placed : BlockTable, optional
+        The blocks of an earlier simulation with this seed in the places in which they are to be
+        assembled: the table that `sort` returns.
 
     Returns
     -------
@@ -593,4 +596,4 @@ def simulate_measurement(
     check_number("hide_random", "simulate_measurement", hide_random, 0, whole=True)
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress)
+                             hide_random=hide_random, progress=progress, placed=placed)
