@@ -94,7 +94,7 @@ results/mri4all/measured/report.html: results/mri4all/registered/registration.ht
 	.venv/bin/halbach-fe infer results/mri4all/registered/study.registered.toml -o $(@D) \
 	    --measurements results/mri4all/check/corrected_map.csv
 
-# Everything between the wish and the shimmed magnet; a run that was cut short goes on.
+# Everything between the wish and the shimmed magnet, on one page.
 study-mri: setup-test
 	.venv/bin/python studies/mri/run.py -o results/mri
 

@@ -152,9 +152,7 @@ def simulate_campaign(
             "Leave [instrument] out. What the mapper does wrong is told by --hide."))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
-    # separate streams of random numbers: a further draw from one does not change the others
-    blocks, coil, noise, effects, faults = (
-        np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5))
+    blocks, coil, noise, effects, faults = _streams(seed)
     nominal = magnet_of(study)
     site = site_of(study, nominal)
     hidden = choose_effects(site, hide, hide_random, effects)
@@ -188,6 +186,21 @@ def simulate_campaign(
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
     return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact)
+
+
+def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:
+    """Return the measured single blocks of `simulate_campaign`, without hidden effects or a map."""
+    blocks, coil, *_ = _streams(seed)
+    nominal = magnet_of(study)
+    return coil_table(study, nominal, draw_magnet(study, nominal, blocks).single, coil_sd, coil)[0]
+
+
+def _streams(seed: int) -> list[np.random.Generator]:
+    """Return separate streams of random numbers for blocks, coil, noise, effects and instrument.
+
+    A further draw from one does not change the others.
+    """
+    return [np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5)]
 
 
 def measured(

@@ -17,7 +17,7 @@ from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.simulate import simulate_campaign
+from halbach_fe.synthetic.simulate import simulate_campaign, simulate_delivery
 
 SIDE_M, COIL_SD, NOISE_T = 0.012, 1e-6, 1e-9
 
@@ -58,18 +58,17 @@ types = {{ cube = [1, 2, 3, 4, 5, 6, 7, 8] }}
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """The study's file, its delivered blocks, and the same in the order of `sort`."""
+    """A folder with the campaign of sorted blocks, the delivered table, and the sorted one."""
     folder = tmp_path_factory.mktemp("placed")
     study = folder / "study.toml"
     study.write_text(STUDY)
     options = ["--coil-sd", str(COIL_SD), "--seed", "3"]
-    delivered, sorted_ = folder / "delivered", folder / "sorted"
-    assert main(["simulate-measurement", str(study), *options, "-o", str(delivered)]) == 0
-    assert main(["sort", str(study), str(delivered / "blocks.csv"), "-o", str(sorted_)]) == 0
-    placed = sorted_ / "blocks.sorted.csv"
+    delivered, placed = folder / "delivered.csv", folder / "sorted" / "blocks.sorted.csv"
+    write_blocks(simulate_delivery(parse_study(tomllib.loads(STUDY)), 3, COIL_SD), delivered)
+    assert main(["sort", str(study), str(delivered), "-o", str(placed.parent)]) == 0
     assert main(["simulate-measurement", str(study), *options, "--placed", str(placed),
                  "-o", str(folder / "built")]) == 0
-    return folder, delivered / "blocks.csv", placed
+    return folder, delivered, placed
 
 
 def field_of(table, points):
