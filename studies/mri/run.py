@@ -2,8 +2,8 @@
 
 Every stage is a command of halbach-fe: rings are designed, tolerances foretold, delivered cubes
 measured one by one and sorted, the magnet mapped, updated and diagnosed, and a shim tray filled.
-The delivery and the map are simulated by magpylib; in the map one ring is displaced, which the study
-does not say. One page links all results::
+The delivery and the map are simulated by magpylib; in the map one ring is displaced, of which the
+study says nothing. One page links all results::
 
     python studies/mri/run.py -o results/mri
 """
