@@ -35,6 +35,9 @@ from halbach_fe.synthetic.simulate import true_field
 STUDIES = Path(__file__).parents[1] / "studies"
 
 MAGNETS = 20
+CELLS = 1000
+"""Of a cube in magpylib's integral of the force."""
+
 NOISE_T, STRENGTH_SD = 2e-6, 0.02
 MAGNITUDE_SD, DIRECTION_SD_DEG = 0.01, 1.0
 SIDE_M, SHIM_T = 0.05, 1.2
@@ -164,12 +167,14 @@ def all_forces(note: Note, session: Session) -> None:
     found = forces(magnet, session).in_place
     sources = [nominal_cuboid(block, block.remanence * np.array(block.easy_axis))
                for block in magnet.blocks]
-    other = np.array([magpylib.getFT(sources[:n] + sources[n + 1:], source, meshing=1000).reshape(
-        -1, 2, 3).sum(axis=0) for n, source in enumerate(sources)])
+    other = np.array([
+        [np.reshape(each, (-1, 3)).sum(axis=0) for each in magpylib.getFT(
+            sources[:n] + sources[n + 1:], source, meshing=CELLS)]
+        for n, source in enumerate(sources)])
     difference = [float(np.abs(own - theirs).max() / np.linalg.norm(theirs, axis=1).max())
                   for own, theirs in ((found.force_N, other[:, 0]), (found.torque_Nm, other[:, 1]))]
     note("force.error", max(difference), "of the largest",
-         f"magpylib's getFT with 1000 cells, {len(sources)} cubes; forces {difference[0]:.1e}, "
+         f"magpylib's getFT with {CELLS} cells, {len(sources)} cubes; forces {difference[0]:.1e}, "
          f"torques {difference[1]:.1e}")
 
 
