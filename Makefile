@@ -9,7 +9,7 @@
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke
 # make study-cubes         the same of an MRI array of 96 cubes
-# make study-mri           an MRI magnet of 2 941 cubes, from its design to its shim tray
+# make study-mri           an MRI magnet of 3 009 cubes, from its design to its shim tray
 # make study-emphatic      a stepped dipole of three bores and two layers, from its drawing
 # make study-mri4all       an MRI magnet of 990 cubes, from the table of its design
 # make study-mri-large     an MRI magnet of 4 032 cubes in three layers

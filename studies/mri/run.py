@@ -1,4 +1,4 @@
-"""A low-field MRI magnet of 2 941 cubes, from the wish to the shimmed magnet.
+"""A low-field MRI magnet of 3 009 cubes, from the wish to the shimmed magnet.
 
 Every stage is a command of halbach-fe: rings are designed, tolerances foretold, delivered cubes
 measured one by one and sorted, the magnet mapped, updated and diagnosed, and a shim tray filled.
