@@ -555,7 +555,7 @@ def demagnetization(
 @typed
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
@@ -574,6 +574,9 @@ def simulate_measurement(
         Number of further hidden effects that are drawn at random.
     progress : callable, optional
         Called with the amount of work that magpylib has done and its total.
+    placed : BlockTable, optional
+        The blocks of an earlier simulation with this seed in the places in which they are to be
+        assembled: the table that `sort` returns.
 
     Returns
     -------
@@ -604,4 +607,4 @@ def simulate_measurement(
                                  "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress)
+                             hide_random=hide_random, progress=progress, placed=placed)

@@ -226,8 +226,15 @@ def tables_of(study: Study, z_m: Floats, chosen: Sequence[Option]) -> list[Ring]
 
 
 def designed(study: Study, rings: Sequence[Ring]) -> Study:
-    """Return the study with the rings of a design in place of its own."""
-    return study.with_(array=study.array.with_(ring=tuple(rings), rings=len(rings)))
+    """Return the study with the rings of a design in place of its own.
+
+    If all blocks are of one type, they are so in the new rings too.
+    """
+    types, array = study.prior.types, study.array
+    if len(types) == 1:
+        most = max(ring.blocks_per_ring or array.blocks_per_ring for ring in rings)
+        types = {label: tuple(range(1, most + 1)) for label in types}
+    return study.with_(array=array.with_(ring=tuple(rings), rings=len(rings)), prior__types=types)
 
 
 def blocks_of(study: Study, rings: Sequence[Ring]) -> tuple[MagnetBlock, ...]:

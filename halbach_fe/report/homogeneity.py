@@ -149,8 +149,8 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
 def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
     """Draw the deviation of |B| in three planes through the centre, in ppm.
 
-    The colours span what lies in the ellipse within each slice: beyond it, in the corners, the
-    field of a homogeneous magnet deviates many times more.
+    Colours and lines are of what lies in the ellipse within each slice: beyond it, in the corners,
+    the field of a homogeneous magnet deviates many times more.
     """
     figure = Figure(figsize=(8.4, 3.0), layout="constrained")
     deviations = [PPM * (each.size_T / mean_T - 1) for each in slices]
@@ -163,7 +163,8 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
         names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
                       extend="both")
-        lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels[::4],
+        lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
+                             np.where(within, deviation, np.nan), levels[::4],
                              colors="black", linewidths=0.5)
         axis.clabel(lines, fmt=ppm, fontsize=7)
         axis.set_aspect("equal")
