@@ -9,6 +9,7 @@ import argparse
 import os
 import shutil
 
+import gmsh
 import pytest
 import tomlkit
 
@@ -425,3 +426,21 @@ def test_a_report_on_its_own_folder(tmp_path, capsys):
     code, sentence = refused(["report", tmp_path, "-o", tmp_path], capsys)
     assert code == 8
     assert f"other than its own; instead received {tmp_path}." in sentence
+
+
+@pytest.mark.parametrize("kept", [0, 3000])
+def test_no_space_for_a_solid(campaign, tmp_path, capsys, monkeypatch, kept):
+    """Gmsh blames nothing, or the file; the radii of the study are right."""
+    write = gmsh.write
+
+    def cut(name):
+        write(name)
+        os.truncate(name, kept)
+
+    assert main(["cad", str(campaign[0]), "-o", str(tmp_path / "whole")]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr("gmsh.write", cut)
+    code, sentence = refused(["cad", campaign[0], "-o", tmp_path / "out"], capsys)
+    assert code == 8
+    assert f"File too large; {kept} bytes could be written" in sentence
+    assert not (tmp_path / "out" / "blocks.step").exists()
