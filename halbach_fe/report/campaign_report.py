@@ -134,8 +134,9 @@ def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> 
         path for path in map(as_path, folders) if output is None
         or path.resolve() != output.resolve()]
     if not paths:
-        raise OutputError(must_be("folders", "the report", "a list of folders of results",
-                                  repr(folders)))
+        raise OutputError(must_be(
+            "folders", "the report", "a list of folders of results other than its own",
+            repr(folders) if isinstance(folders, str) else ", ".join(map(str, folders)) or "none"))
     return Campaign(tuple(read_chapters(paths)))
 
 

@@ -222,9 +222,10 @@ def test_the_command_has_the_files_of_the_user(tmp_path):
 
 def test_commands_name_the_posterior_that_was_read(given):
     """It lies in the folder of the update, not in that of the command which read it."""
+    still = hf.shim(given.updated, given.session, swaps=0, turns=0)
+    assert still.stop == "budget"  # other blocks would fit
     for found in (homogeneity.answer(hf.homogeneity(given.magnet, given.session,
                                                     posterior=given.updated)),
-                  shimming.answer(hf.shim(given.updated, given.session, swaps=0, turns=0),
-                                  given.updated)):
+                  shimming.answer(still, given.updated)):
         assert "DIR/posterior.h5" not in found.command
         assert "--posterior POSTERIOR" in found.command
