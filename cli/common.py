@@ -13,6 +13,7 @@ import json
 import math
 import multiprocessing
 import os
+import shlex
 import sys
 import threading
 import time
@@ -570,10 +571,15 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
         "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None))})
     output = getattr(arguments, "output", None)
+    posterior = getattr(arguments, "posterior", None)
     for sentence in named.sentences:
         say(sentence)
     if named.command:
-        command = named.command if output is None else named.command.replace("DIR/", f"{output}/")
+        command = named.command
+        if posterior is not None:  # which this command has read, not written
+            command = command.replace("DIR/posterior.h5", shlex.quote(str(posterior)))
+        if output is not None:
+            command = command.replace("DIR/", f"{shlex.quote(str(output))}/")
         say(f"  {command}")
     if page is not None:
         say(f"Report: {page}")

@@ -225,8 +225,12 @@ def tables_of(study: Study, z_m: Floats, chosen: Sequence[Option]) -> list[Ring]
 
 
 def designed(study: Study, rings: Sequence[Ring]) -> Study:
-    """Return the study with the rings of a design in place of its own."""
-    return study.with_(array=study.array.with_(ring=tuple(rings), rings=len(rings)))
+    """Return the study with the rings of a design in place of its own.
+
+    The slots of its types are those of the old rings, so that they go.
+    """
+    return study.with_(array=study.array.with_(ring=tuple(rings), rings=len(rings)),
+                       prior=study.prior.with_(types={}))
 
 
 def blocks_of(study: Study, rings: Sequence[Ring]) -> tuple[MagnetBlock, ...]:
