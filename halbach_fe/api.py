@@ -39,7 +39,7 @@ from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.same_magnet import distributions_of
+from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
@@ -73,6 +73,9 @@ class MultipoleTables(ShownInNotebook):
         The linear model of each reference, and its multipoles by the name of the distribution of
         the magnetizations: ``prior``, or ``prior`` and ``posterior``. A 2D magnet has a single
         table. A 3D magnet has two: of the field integrated along z, and of one circle.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
 
     Examples
     --------
@@ -85,6 +88,7 @@ class MultipoleTables(ShownInNotebook):
 
     magnet: Magnet
     tables: Sequence[tuple[MultipoleModel, Mapping[str, Multipoles]]]
+    disagreement: str | None = None
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,9 @@ class HomogeneityResult(ShownInNotebook):
         ``posterior``.
     distributions : mapping of str to Gaussian
         These distributions, in A/m.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
 
     Examples
     --------
@@ -115,6 +122,7 @@ class HomogeneityResult(ShownInNotebook):
     model: HomogeneityModel
     by_name: Mapping[str, Homogeneity]
     distributions: Mapping[str, Gaussian]
+    disagreement: str | None = None
 
 
 @alone
@@ -237,7 +245,7 @@ def multipoles(
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
-        for model in models])
+        for model in models], disagreement_of(posterior))
 
 
 @alone
@@ -287,7 +295,7 @@ def homogeneity(
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
-        distributions)
+        distributions, disagreement_of(posterior))
 
 
 @alone

@@ -52,3 +52,17 @@ class Answer:
             return shlex.quote(str(Path(str(path), rest)))
 
         return replace(self, command=" ".join(map(known, self.command.split(" "))))
+
+
+def agreement(disagreement: str | None) -> str:
+    """Say that an answer may be trusted whose update agrees with its map, or is not known to."""
+    return ("Yes, as far as the update agrees with its map, which its own page says."
+            if disagreement is None else "Yes: the update agrees with its map.")
+
+
+def of_a_conflict(question: str, said: str, disagreement: str) -> Answer:
+    """Return an answer from an update that disagrees with its map, which is not to be trusted."""
+    return Answer(
+        question, said, f"No. It is that of an update that disagrees with its map. {disagreement}",
+        "Look for what the study lacks, and update again, before you use these numbers.",
+        "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)

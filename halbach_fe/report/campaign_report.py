@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 import os
 import re
+import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -65,9 +66,10 @@ class Campaign:
 
     @property
     def answered(self) -> list[tuple[Chapter, Page, Answer]]:
-        """All answers."""
-        return [(chapter, page, page.said.answer) for chapter in self.chapters
-                for page in chapter.pages if page.said.answer is not None]
+        """All answers, with the folders that hold what their commands name."""
+        return [(chapter, page, _with_folder(page.said.answer, chapter))
+                for chapter in self.chapters for page in chapter.pages
+                if page.said.answer is not None]
 
     def continued(self, chapter: Chapter, answer: Answer) -> Chapter | None:
         """Return the later chapter of the command that an answer names as the next step."""
@@ -123,6 +125,15 @@ class Campaign:
                      "ended": chapter.record.ended, "page": page.path,
                      "answer": None if page.said.answer is None else asdict(page.said.answer)}
                     for chapter in self.chapters for page in chapter.pages]}
+
+
+def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
+    """Return an answer whose command has the folder of the files that its own command wrote."""
+    def named(found: re.Match[str]) -> str:
+        return (shlex.quote(f"{chapter.label}/{found[1]}") if found[1] in chapter.record.files
+                else found[0])
+
+    return replace(answer, command=re.sub(r"DIR/(\S+)", named, answer.command))
 
 
 def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> Campaign:
@@ -213,7 +224,7 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
     first = {chapter.label: number for number, (chapter, _) in reversed(list(enumerate(pages, 1)))}
     found = []
     for number, (chapter, page) in enumerate(pages, 1):
-        answer, rows = page.said.answer, page.said.rows
+        answer, rows = page.said.answer and _with_folder(page.said.answer, chapter), page.said.rows
         later = campaign.continued(chapter, answer) if answer else None
         files = {name: _link(chapter.folder / name, output) for name in chapter.record.files
                  if (chapter.folder / name).exists()}

@@ -563,8 +563,9 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     def text(known: Multipoles, number: int) -> str:
         if known.mean[number] > MAIN_UNITS:
             return "main"
-        value = round(float(known.mean[number]), 2)
-        return f"{value:+.2f} ± {known.sd[number]:.2f}" if value else f"0 ± {known.sd[number]:.2f}"
+        value, sd = round(float(known.mean[number]), 2), float(known.sd[number])
+        spread = "<0.01" if 0 < sd < 0.005 else f"{sd:.2f}"
+        return f"{value:+.2f} ± {spread}" if value else f"0 ± {spread}"
 
     first = next(iter(columns.values()))
     rows = []
