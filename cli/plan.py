@@ -1,5 +1,6 @@
 """Choose the positions whose readings carry most information about the block magnetizations.
 
+If the study has a table [homogeneity], they tell most about the deviation of |B| in its region.
 Positions are added one at a time from the study's plan.candidates (default: the positions that the
 study measures). Their information is compared with that of the study's positions. Writes plan.csv,
 plan.json, plan.html and its figures.

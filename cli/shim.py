@@ -1,8 +1,9 @@
-"""Choose blocks to swap, turn or replace so that unwanted multipoles become small.
+"""Choose blocks to swap, turn or replace: for small multipoles, or a homogeneous field.
 
-The moves are chosen from the posterior of the block magnetizations, which is computed as by
-`halbach-fe infer`. Writes shim.json, shim.html and its figures, and study.shimmed.toml, the study
-with the blocks in their new places.
+It is a homogeneous field if the study has a table [homogeneity] with its region. The moves are
+chosen from the posterior of the block magnetizations, which is computed as by `halbach-fe infer`.
+Writes shim.json, shim.html and its figures, and study.shimmed.toml, the study with the blocks in
+their new places.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--blocks", type=common.input_file, metavar="CSV",
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
-    common.add_multipole_arguments(parser)
+    common.add_objective_arguments(parser)
     parser.add_argument("--swaps", type=common.count, default=8, metavar="N",
                         help="largest number of swaps of two blocks (default: %(default)s)")
     parser.add_argument("--turns", type=common.count, default=8, metavar="N",
@@ -37,15 +38,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Infer, choose the moves, write the results, print moves and multipoles."""
+    """Infer, choose the moves, write the results, print moves and what they change."""
     from halbach_fe.api import shim
+    from halbach_fe.design.objective import check_objective
     from halbach_fe.design.shimming import check_shimming, check_stock
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.campaign import refuse_several_maps
-    from halbach_fe.report.shimming import answer, move_table, shim_summary, write_shim
-    from halbach_fe.response.multipoles import MultipoleReference, text_table, unwanted_orders
+    from halbach_fe.report.shimming import (
+        answer,
+        move_table,
+        shim_summary,
+        table_title,
+        value_table,
+        write_shim,
+    )
     from halbach_fe.study.reader import read_study
 
     if arguments.stock and not arguments.replace:
@@ -57,14 +65,15 @@ def run(arguments: argparse.Namespace) -> int:
     data, blocks, _ = common.measurements(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     # refuse before the solves, which may take long, what does not fit the study
-    unwanted_orders(magnet, common.reference(arguments) or MultipoleReference())
+    check_objective(magnet, common.reference(arguments), arguments.limit_units,
+                    arguments.limit_ppm)
     if stock:
         check_stock(magnet, stock, blocks.serial if blocks else None)
     with common.session(arguments, magnet.study) as session:
         result = infer(magnet, data, session, blocks)
         moves = shim(result, session, common.reference(arguments), arguments.swaps,
                      arguments.turns, arguments.replace, arguments.limit_units, stock,
-                     arguments.seed)
+                     arguments.seed, arguments.limit_ppm)
     if result.disagreement:
         common.say(f"warning: Model and measurement disagree. {result.disagreement}")
     write_shim(moves, result, arguments.study.read_text(encoding="utf-8-sig"), arguments.output)
@@ -72,7 +81,6 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(shim_summary(moves, result))
     else:
         common.print_table(move_table(moves), "Moves")
-        common.print_table(text_table(before=moves.before, after=moves.after),
-                           "Multipoles in units of 1e-4")
+        common.print_table(value_table(moves), table_title(moves))
         common.say_answer(arguments, answer(moves, result), arguments.output / "shim.html")
     return 0

@@ -16,7 +16,7 @@ import xarray as xr
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.core.numbers import ACROSS, DRAWS, LIMIT_UNITS, check_number
+from halbach_fe.core.numbers import ACROSS, DRAWS, check_number
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -52,7 +52,6 @@ from halbach_fe.response.multipoles import (
     MultipoleModel,
     MultipoleReference,
     Multipoles,
-    multipole_model,
     multipole_models,
 )
 from halbach_fe.solver.session import Progress, Session, alone
@@ -332,9 +331,11 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
 def shim(
     result: InferenceResult, session: Session, reference: MultipoleReference | None = None,
     swaps: int = 8, turns: int = 8, replacements: int = 0, limit_units: float | None = None,
-    stock: BlockTable | None = None, seed: int = 1,
+    stock: BlockTable | None = None, seed: int = 1, limit_ppm: float | None = None,
 ) -> Shim:
     """Choose blocks to swap, turn or replace so that unwanted multipoles become small.
+
+    If the study has a table ``homogeneity``, the deviation of |B| in that region becomes small.
 
     Parameters
     ----------
@@ -354,17 +355,20 @@ def shim(
         study's prior. Needs ``replacements``.
     seed : int
         Seed of the random draws that estimate the probability of meeting the limit.
+    limit_ppm : float, optional
+        Largest rms deviation of |B| that is allowed, in ppm, if the study asks for homogeneity. The
+        search ends when it is met.
 
     Returns
     -------
     Shim
-        The moves in their order, and the multipoles before and after.
+        The moves in their order, and the multipoles or the field before and after.
 
     Raises
     ------
     StudyError
-        If ``stock`` is given without ``replacements``, a number is out of its range, or the
-        reference does not fit the study.
+        If ``stock`` is given without ``replacements``, a number is out of its range, reference,
+        limit or region do not fit the study, or it has too many blocks for this search.
     MeasurementError
         If the stock does not fit the study, or its blocks are in the magnet.
 
@@ -380,15 +384,15 @@ def shim(
     for name, value in (("swaps", swaps), ("turns", turns), ("replacements", replacements),
                         ("seed", seed)):
         check_number(name, "shim", value, 0, whole=True)
-    if limit_units is not None:
-        check_number("limit_units", "shim", limit_units, *LIMIT_UNITS)
     if stock is not None and not replacements:
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
                          "replaced; instead replacements is 0. Give replacements.")
-    model = multipole_model(result.magnet, reference or MultipoleReference(),
-                            session.within("multipoles"))
+    check_objective(result.magnet, reference, limit_units, limit_ppm)
+    model = objective_of(result.magnet, reference, session.within("objective"),
+                         result.posterior.mean)
     budget: dict[Kind, int] = {"swap": swaps, "turn": turns, "replace": replacements}
-    return choose_moves(result, model, np.random.default_rng(seed), budget, limit_units, stock)
+    return choose_moves(result, model, np.random.default_rng(seed), budget,
+                        limit_units or limit_ppm, stock)
 
 
 @alone

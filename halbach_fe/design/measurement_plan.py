@@ -1,6 +1,8 @@
-"""Measurement plans: positions with the most information about the magnetizations of a study.
+"""Measurement plans: positions with the most information about what a study asks for.
 
-Positions are chosen by greedy D-optimal design, and compared with the study's own positions.
+That are the magnetizations (D-optimal design), or, if the study has a table ``homogeneity``, the
+deviations of |B| in its region: the sum of their variances is made small (A-optimal design).
+Positions are chosen one after another, and compared with the study's own positions.
 """
 
 from __future__ import annotations
@@ -18,13 +20,37 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import study_prior
+from halbach_fe.response.deviations import Deviations, deviation_model
+from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.d_optimal import greedy, information
+from halbach_fe.stats.d_optimal import greedy, information, variance_left
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior
 from halbach_fe.stats.noise import NoiseCovariance
+
+
+@dataclass(frozen=True)
+class UnknownDeviation:
+    """The rms uncertainty of the deviation of |B| in the study's region, in ppm.
+
+    Attributes
+    ----------
+    region : Region
+    prior : float
+        Without any readings.
+    planned : ndarray, shape (count,)
+        After the first 1, 2, ... chosen positions.
+    baseline : ndarray
+        After the evenly spread subsets of the study's positions.
+    """
+
+    region: Region
+    prior: float
+    planned: Floats
+    baseline: Floats
+
 
 CURVE_POINTS = 100
 """Number of subsets, of increasing size, of the study's positions whose information is computed."""
@@ -56,6 +82,8 @@ class MeasurementPlan(ShownInNotebook):
     prior_sd, planned_sd, baseline_sd : ndarray, shape (parameters,), in A/m
         Standard deviation of the prior, of the posterior for the plan, and of the posterior for
         equally many evenly spread positions of the study (all of them if the plan has more).
+    deviation : UnknownDeviation or None
+        What is left unknown of the deviation of |B|, if the study asks for a homogeneous field.
 
     Examples
     --------
@@ -78,14 +106,17 @@ class MeasurementPlan(ShownInNotebook):
     prior_sd: Floats
     planned_sd: Floats
     baseline_sd: Floats
+    deviation: UnknownDeviation | None
 
     @property
     def same_information(self) -> int | None:
-        """Smallest number of chosen positions with the information of all the study's positions.
+        """Smallest number of chosen positions that tell as much as all the study's positions.
 
-        None if all chosen positions together have less information.
+        None if all chosen positions together tell less.
         """
-        enough = np.flatnonzero(self.gain >= self.baseline_gain[-1])
+        enough = np.flatnonzero(
+            self.gain >= self.baseline_gain[-1] if self.deviation is None else
+            self.deviation.planned <= self.deviation.baseline[-1])
         return int(enough[0]) + 1 if len(enough) else None
 
     @property
@@ -131,6 +162,8 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
             f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
     check_points(magnet, baseline)
     check_points(magnet, candidates, "plan.candidates")
+    if magnet.study.homogeneity is not None:
+        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
     farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
     if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
         raise StudyError(must_be(
@@ -145,21 +178,38 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     prior = study_prior(magnet, len(model.parameters) - len(magnet.parameter_names))
     size = len(observation) // len(points)  # readings per point; only these may be correlated
     whitened = errors.whiten(model.whole @ prior.root).reshape(len(points), size, -1)
-    chosen, gain = greedy(whitened[len(baseline):], wanted)
+    values = _values(magnet, prior, session.within("objective"))
+    choice = greedy(whitened[len(baseline):], wanted, None if values is None else values.root)
+    chosen = choice.chosen
     same = min(wanted, len(baseline))
     counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))
-    own = [information(whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2]))
-           for number in counts]
+    subsets = [whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2])
+               for number in counts]
     rows = np.arange(len(observation)).reshape(len(points), size)
 
     def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
         return _posterior(model.matrix[index], errors.subset(index), prior).sd
 
+    deviation = None
+    if values is not None:
+        before = float(np.sum(values.root**2))
+        # rounding leaves less than nothing where everything is known
+        deviation = UnknownDeviation(
+            default_region(magnet), np.sqrt(before),
+            np.sqrt(np.maximum(before - choice.fall, 0.0)),
+            np.sqrt(np.maximum([variance_left(subset, values.root) for subset in subsets], 0.0)))
     return MeasurementPlan(
-        magnet, model.parameters, candidates, candidates[chosen], baseline, gain, counts,
-        np.array(own), model.nominal, prior.sd, sd_after(chosen + len(baseline)),
-        sd_after(spread(len(baseline), same)))
+        magnet, model.parameters, candidates, candidates[chosen], baseline, choice.gain, counts,
+        np.array([information(subset) for subset in subsets]), model.nominal, prior.sd,
+        sd_after(chosen + len(baseline)), sd_after(spread(len(baseline), same)), deviation)
+
+
+def _values(magnet: Magnet, prior: Gaussian, session: Session) -> Deviations | None:
+    """Return the deviations of |B| that the prior allows, if the study asks for them."""
+    if magnet.study.homogeneity is None:
+        return None
+    return deviation_model(homogeneity_model(magnet, default_region(magnet), session)).of(prior)
 
 
 def spread(total: int, count: int) -> Ints:

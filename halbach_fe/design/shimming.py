@@ -1,12 +1,13 @@
-"""Shimming: which blocks to swap, turn or replace so that unwanted multipoles become small.
+"""Shimming: which blocks to swap, turn or replace so that the field becomes better.
 
-The multipole coefficients are linear in the magnetizations, and a moved block keeps its
-magnetization in its own axes. The effect of a move is therefore a product of matrices that are
-computed once, and the effects of moves in different slots add up, so that a hundred thousand swaps
-are evaluated quickly. A slot takes part in at most one move. Moves are added one after another,
-each time the one with the largest expected decrease of ``sum |c_n|^2``, until this decrease is no
-larger than its own standard deviation. Then each move is replaced by a better one as long as that
-lowers the sum.
+What is to become small are the values of an `halbach_fe.design.objective`: unwanted multipoles in
+units of 1e-4, or deviations of |B| in ppm. They are linear in the magnetizations, and a moved block
+keeps its magnetization in its own axes. The effect of a move is therefore a product of matrices
+that are computed once, and the effects of moves in different slots add up, so that a hundred
+thousand swaps are evaluated quickly. A slot takes part in at most one move. Moves are added one
+after another, each time the one with the largest expected decrease of the sum of squares, until
+this decrease is no larger than its own standard deviation. Then each move is replaced by a better
+one as long as that lowers the sum.
 
 The distribution of the moved blocks is the transformed posterior, which is exact. If the blocks
 were measured before they were mounted, the magnetization of a mounted block is ``p = w + u``. Here
@@ -24,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg as linalg
@@ -33,14 +34,16 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.design.objective import Known, Objective
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.response.multipoles import Complexes, MultipoleModel, Multipoles, met
-from halbach_fe.stats.gaussian import nominal_prior, rotation_roots
+from halbach_fe.response.deviations import DeviationModel
+from halbach_fe.response.homogeneity import Homogeneity
+from halbach_fe.stats.gaussian import Gaussian, nominal_prior, rotation_roots
 from halbach_fe.study.model import Study
 
 Kind = Literal["swap", "turn", "replace"]
@@ -50,7 +53,7 @@ GAIN_SDS = 1.0
 the move is made."""
 
 SURE = 0.95
-"""Probability that all multipoles are within the limit, at which the search ends."""
+"""Probability that the limit is met, at which the search ends."""
 
 DRAWS = 4000
 """Number of samples from which that probability is estimated, with a standard error of 0.3 %."""
@@ -60,6 +63,9 @@ SHORTLIST = 24
 
 AT_ONCE = 100_000
 """Number of moves that are evaluated at a time, which limits the memory."""
+
+MOST_NUMBERS = 3e8
+"""Largest number of values of all placements together, and of possible swaps: 2.4 GB."""
 
 BETTER = 1e-6
 """Smallest relative decrease of the sum for which a move is replaced by another."""
@@ -100,61 +106,66 @@ class Move:
 
 @dataclass(frozen=True)
 class Step:
-    """A move, its expected gain, and the multipoles after it.
+    """A move, its expected gain, and the values after it.
 
-    The gain is the decrease of ``sum |c_n|^2`` in units^2, with its standard deviation.
+    The gain is the decrease of the sum of squares in units^2, or of the mean square deviation in
+    ppm^2, with its standard deviation.
     """
 
     move: Move
     gain: float
     gain_sd: float
-    after: Multipoles
+    after: Known
 
 
 @dataclass(frozen=True)
 class Shim(ShownInNotebook):
-    """Moves of blocks in their order, and the multipoles before and after.
+    """Moves of blocks in their order, and the multipoles, or the field, before and after.
 
     Attributes
     ----------
     result : InferenceResult
         The inference from which the moves are chosen.
-    model : MultipoleModel
+    model : MultipoleModel or DeviationModel
+        What the study asks for: small multipoles, or a homogeneous field.
     mounts : Mounts
         The slots of the magnet.
     spares : tuple of str
         Names of the spare blocks.
-    before : Multipoles
+    before : Multipoles or Deviations
     steps : tuple of Step
     stop : str
         Reason for the end of the search, a key of `STOPS`.
     tried : dict
         Number of possible moves of each kind.
     limit : float or None
-        Limit of all |c_n| in units of 1e-4.
+        Limit of all |c_n| in units of 1e-4, or of the rms deviation in ppm.
     within : tuple of two floats, or None
-        Probabilities that all multipoles are within the limit, before and after the moves; None
-        without a limit.
-    after : Multipoles
-        Multipoles after all moves.
+        Probabilities that the limit is met, before and after the moves; None without a limit.
+    fields : tuple of two Homogeneity, or None
+        The field in the study's region before and after the moves; None if the study asks for
+        multipoles.
+    after : Multipoles or Deviations
+        The same as ``before``, after all moves.
     shimmed_study : Study or None
         The study with the moves of blocks as exceptions; None if a study cannot express them.
     """
 
     result: InferenceResult
-    model: MultipoleModel
+    model: Any
     mounts: Mounts
     spares: tuple[str, ...]
-    before: Multipoles
+    before: Any
     steps: tuple[Step, ...]
     stop: str
     tried: dict[str, int]
     limit: float | None
     within: tuple[float, float] | None
+    fields: tuple[Homogeneity, Homogeneity] | None
 
     @property
-    def after(self) -> Multipoles:
-        """Multipoles after all moves."""
+    def after(self) -> Any:
+        """Multipoles or deviations after all moves."""
         return self.steps[-1].after if self.steps else self.before
 
     @property
@@ -215,17 +226,17 @@ class SpareBlocks:
 
 @dataclass(frozen=True)
 class _Goal:
-    """The limit of every |c_n|, and standard normal numbers (draws, 2 k) to test it with."""
+    """The limit of the values, and standard normal numbers (draws, k) to test it with."""
 
     limit: float | None
     normals: Floats
 
-    def within(self, known: Multipoles) -> float:
-        """Return the probability that no multipole is above the limit; 0 without a limit."""
-        return 0.0 if self.limit is None else met(known.sizes_of(self.normals), self.limit)
+    def within(self, known: Known) -> float:
+        """Return the probability that the limit is met; 0 without a limit."""
+        return 0.0 if self.limit is None else known.share_within(self.limit, self.normals)
 
-    def met(self, known: Multipoles) -> bool:
-        """Return whether the multipoles are within the limit with sufficient probability."""
+    def met(self, known: Known) -> bool:
+        """Return whether the values are within the limit with sufficient probability."""
         return self.within(known) >= SURE
 
 
@@ -237,7 +248,7 @@ class _MoveModel:
 
     Attributes
     ----------
-    model : MultipoleModel
+    model : Objective
     mounts : Mounts
     mean : ndarray, shape (S, D), in A/m
         Posterior mean of the mounted blocks, along the axes of the magnet.
@@ -254,7 +265,7 @@ class _MoveModel:
         Which blocks fit which slots by which turns.
     """
 
-    model: MultipoleModel
+    model: Objective
     mounts: Mounts
     mean: Floats
     placed: Floats
@@ -269,13 +280,13 @@ class _MoveModel:
         return self.mean.shape[1]
 
     @cached_property
-    def columns(self) -> Complexes:
-        """The matrix of the multipole model, shape (1 + k, S, D)."""
+    def columns(self) -> Any:
+        """The matrix of the objective, shape (1 + k, S, D)."""
         return self.model.matrix.reshape(len(self.model.matrix), *self.mean.shape)
 
     @cached_property
-    def start(self) -> tuple[Complexes, Complexes]:
-        """Mean (1 + k,) and covariance factor (1 + k, q) of C_n without moves."""
+    def start(self) -> tuple[Any, Any]:
+        """Mean (1 + k,) and root (1 + k, q) of the products with the matrix, without moves."""
         matrix = self.model.matrix
         return (self.model.offset + matrix @ self.mean.ravel(),
                 matrix @ self.placed.reshape(self.mean.size, -1))
@@ -284,16 +295,14 @@ class _MoveModel:
         """Return `Mounts.carried` reduced to the dimension of the magnet, (n, D, D)."""
         return self.mounts.carried(to, turn)[:, :self.size, :self.size]
 
-    def coefficients(self, moves: Sequence[Move]) -> tuple[Complexes, Complexes]:
-        """Return mean and covariance factor of C_n after moves, which are exact."""
+    def products(self, moves: Sequence[Move]) -> tuple[Any, Any]:
+        """Return mean and root of the products with the matrix after moves, which are exact."""
         return reduce(self.moved, moves, self.start)
 
-    def moved(
-        self, before: tuple[Complexes, Complexes], move: Move
-    ) -> tuple[Complexes, Complexes]:
-        """Return mean and covariance factor of C_n after a further move.
+    def moved(self, before: tuple[Any, Any], move: Move) -> tuple[Any, Any]:
+        """Return mean and root of the products with the matrix after a further move.
 
-        The independent errors of the newly mounted blocks are appended to the factor as columns.
+        The independent errors of the newly mounted blocks are appended to the root as columns.
         """
         mean, root = before
         width = self.start[1].shape[1]
@@ -307,15 +316,27 @@ class _MoveModel:
             fresh.append(carried @ self.own[block])
         return mean, np.hstack([root, *fresh])
 
-    def multipoles(self, moves: Sequence[Move]) -> Multipoles:
-        """Return the multipoles after moves."""
-        return self.model.known(*self.coefficients(moves))
+    def after(self, moves: Sequence[Move]) -> Any:
+        """Return the values after moves."""
+        return self.model.known(*self.products(moves))
+
+    def magnetizations(self, moves: Sequence[Move]) -> Gaussian:
+        """Return the distribution of the mounted blocks after moves, in A/m."""
+        mean, root = self.mean.copy(), self.placed.copy()
+        fresh = []
+        for placement in (placement for move in moves for placement in move.placements):
+            to, block = placement.to, placement.block
+            carried = self.carried(np.array([to]), np.array([placement.turn]))[0]
+            mean[to], root[to] = carried @ self.loose_mean[block], carried @ self.loose[block]
+            fresh.append(np.zeros((*mean.shape, self.size)))
+            fresh[-1][to] = carried @ self.own[block]
+        return Gaussian(mean.ravel(), np.concatenate([root, *fresh], axis=2).reshape(mean.size, -1))
 
     def gains(
         self, chosen: Sequence[Move], further: Sequence[Move]
     ) -> list[tuple[float, float]]:
         """Return expected gain and its standard deviation of each further move (see `gain`)."""
-        state = self.coefficients(chosen)
+        state = self.products(chosen)
         now = self.model.known(*state)
         return [gain(now, self.model.known(*self.moved(state, move))) for move in further]
 
@@ -343,11 +364,10 @@ class _Placements:
     ----------
     to, block, turn : ndarray of int, shape (n,)
         See `Placement`.
-    change : ndarray, shape (n, 2 k)
-        Change of the mean of b_n and a_n, in units.
+    change : ndarray, shape (n, k)
+        Change of the means of the values.
     noise : ndarray, shape (n,)
-        Variance that the independent error of the mounted block adds to ``sum |c_n|^2``, in
-        units^2.
+        Variance that the independent error of the mounted block adds to their sum of squares.
     """
 
     to: Ints
@@ -363,24 +383,24 @@ class _Placements:
 
 
 def shim(
-    result: InferenceResult, model: MultipoleModel, generator: np.random.Generator,
+    result: InferenceResult, model: Objective, generator: np.random.Generator,
     budget: Mapping[Kind, int], limit: float | None = None, stock: BlockTable | None = None,
 ) -> Shim:
-    """Choose moves that make the unwanted multipoles of a measured magnet small.
+    """Choose moves that make the multipoles, or the deviations of |B|, of a measured magnet small.
 
     Parameters
     ----------
     result : InferenceResult
         The inference whose posterior describes the blocks.
-    model : MultipoleModel
-        Multipoles of the same study.
+    model : MultipoleModel or DeviationModel
+        What the same study asks for; |B| linearized about the posterior mean.
     generator : numpy.random.Generator
         Draws the samples from which the probability of meeting the limit is estimated.
     budget : mapping
         Largest number of moves of each kind.
     limit : float, optional
-        Limit of every |c_n|, in units of 1e-4. The search ends when it is met. Without a limit it
-        ends when further moves would gain too little.
+        Limit of every |c_n| in units of 1e-4, or of the rms deviation in ppm. The search ends when
+        it is met. Without a limit it ends when further moves would gain too little.
     stock : BlockTable, optional
         Measured blocks that may replace others. Default: new blocks that are distributed as in the
         study's prior.
@@ -388,7 +408,7 @@ def shim(
     Raises
     ------
     StudyError
-        If the study has variations inside blocks.
+        If the study has variations inside blocks, or there are too many possible moves.
     MeasurementError
         If the stock does not fit the study, or its blocks are in the magnet.
     """
@@ -411,8 +431,12 @@ def shim(
     within = None
     if limit is not None:
         within = goal.within(before), goal.within(steps[-1].after if steps else before)
+    fields = None
+    if isinstance(model, DeviationModel):
+        shimmed = move_model.magnetizations([step.move for step in steps])
+        fields = model.homogeneity.of(result.posterior), model.homogeneity.of(shimmed)
     return Shim(result, model, mounts, spares.names, before, steps, stop,
-                {moves.kind: len(moves.parts) for moves in candidates}, limit, within)
+                {moves.kind: len(moves.parts) for moves in candidates}, limit, within, fields)
 
 
 def check_shimming(study: Study) -> None:
@@ -515,7 +539,7 @@ def _covariance_root(covariance: Floats) -> Floats:
 
 
 def _build_move_model(
-    result: InferenceResult, model: MultipoleModel, mounts: Mounts, spares: SpareBlocks
+    result: InferenceResult, model: Objective, mounts: Mounts, spares: SpareBlocks
 ) -> _MoveModel:
     """Transform the posterior of the mounted blocks to own axes, and append the spare blocks."""
     size, count = result.study.dimension, len(mounts.places)
@@ -586,6 +610,7 @@ def _possible_placements(move_model: _MoveModel) -> _Placements:
     every = np.arange(len(move_model.mean))
     stay[0, every, every] = True
     turn, to, block = np.nonzero(move_model.fits & ~stay)
+    _refuse_too_many(move_model, turn, to, block)
     carried = move_model.carried(to, turn)
     main = float(abs(move_model.start[0][0]))
     scaled = move_model.model.scaled(main).reshape(-1, *move_model.mean.shape)
@@ -598,6 +623,23 @@ def _possible_placements(move_model: _MoveModel) -> _Placements:
         error = columns @ (carried[part] @ move_model.own[block[part]])
         noise[part] = np.sum(error**2, axis=(1, 2))
     return _Placements(to, block, turn, change, noise)
+
+
+def _refuse_too_many(move_model: _MoveModel, turn: Ints, to: Ints, block: Ints) -> None:
+    """Raise a StudyError if the placements need more memory than `MOST_NUMBERS` allows."""
+    slots = len(move_model.mean)
+    pair = slots * np.minimum(to, block) + np.maximum(to, block)
+    moved = (block < slots) & (block != to)
+    up, down = (np.bincount(pair[moved & side]) for side in (to < block, to > block))
+    shared = min(len(up), len(down))
+    swaps = float(up[:shared].astype(float) @ down[:shared])
+    numbers = float(len(to) * (len(move_model.model.matrix) - 1) + 2 * swaps)
+    if numbers > MOST_NUMBERS:
+        raise StudyError(must_be(
+            "magnet", "shim", "one of a few hundred blocks",
+            f"one of {slots} with {len(to)} possible placements and {swaps:.0f} swaps",
+            "Sort its blocks before it is assembled (halbach-fe sort), and fill a tray with small "
+            "magnets after it is measured (halbach-fe shim-tray)."))
 
 
 def _candidate_moves(placements: _Placements, slots: int) -> list[_CandidateMoves]:
@@ -647,7 +689,7 @@ def _add_moves(
 ) -> tuple[list[Move], str]:
     """Add the moves of largest expected gain one by one; return them and why no more are added."""
     while True:
-        now = move_model.multipoles(chosen)
+        now = move_model.after(chosen)
         if goal.met(now):
             return chosen, "target"
         left = [moves for moves in candidates
@@ -677,8 +719,8 @@ def _exchange_moves(
             others = [other for other in chosen if other is not move]
             kind = next(moves for moves in candidates if moves.kind == move.kind)
             found = _best_moves(move_model, placements, kind, others, 1)
-            now = move_model.multipoles(chosen).expected_square
-            if found and move_model.multipoles([*others, found[0]]).expected_square < (
+            now = move_model.after(chosen).expected_square
+            if found and move_model.after([*others, found[0]]).expected_square < (
                     1 - BETTER) * now:
                 chosen, better = [*others, found[0]], True
     return chosen
@@ -699,8 +741,9 @@ def _best_moves(
     parts = candidates.parts[free[candidates.parts].all(axis=1)]
     if not len(parts):
         return []
-    mean, _ = move_model.coefficients(chosen)
-    # Moves hardly change the main multipole: use that by which `_Placements.change` is scaled.
+    mean, _ = move_model.products(chosen)
+    # Moves hardly change the main multipole or mean field: use that by which
+    # `_Placements.change` is scaled.
     now = move_model.model.units(np.concatenate([[abs(move_model.start[0][0])], mean[1:]]))
     score = np.empty(len(parts))
     for first in range(0, len(parts), AT_ONCE):
@@ -721,21 +764,21 @@ def _steps_by_gain(
     (see `GAIN_SDS`) are left out.
     """
     left, steps = list(moves), []
-    now = move_model.multipoles([])
+    now = move_model.after([])
     done: list[Move] = []
     while left and not goal.met(now):
         gains = move_model.gains(done, left)
         best = int(np.argmax([expected for expected, _ in gains]))
         done.append(left.pop(best))
-        now = move_model.multipoles(done)
+        now = move_model.after(done)
         steps.append(Step(done[-1], *gains[best], now))
     while steps and steps[-1].gain <= GAIN_SDS * steps[-1].gain_sd:
         steps.pop()
     return tuple(steps)
 
 
-def gain(before: Multipoles, after: Multipoles) -> tuple[float, float]:
-    """Return the expected decrease of ``sum |c_n|^2`` in units^2, and its standard deviation.
+def gain(before: Known, after: Known) -> tuple[float, float]:
+    """Return the expected decrease of the sum of squares, and its standard deviation.
 
     The decrease is a quadratic form ``x' A x`` of the normal vector x = (before, after) with mean m
     and covariance C. Its mean is ``m' A m + tr(A C)`` and its variance ``4 m' A C A m +

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, fraction
+from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import is_nonlinear
 
 
@@ -42,15 +43,39 @@ def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
         "mean_sd_over_study_with_as_many_points": plan.volume_ratio,
         "rms_sd_prior": _rms(plan.prior_sd), "rms_sd_plan": _rms(plan.planned_sd),
         "rms_sd_study_with_as_many_points": _rms(plan.baseline_sd),
+        **_deviation_summary(plan),
     }
+
+
+def _deviation_summary(plan: MeasurementPlan) -> dict[str, object]:
+    """Return what is left unknown of the deviation of |B| as entries of plan.json."""
+    if plan.deviation is None:
+        return {}
+    return {"region": asdict(plan.deviation.region),
+            "deviation_sd_ppm": {"prior": plan.deviation.prior, "plan": plan.deviation.planned[-1],
+                                 "study_with_as_many_points": _of_study(plan)}}
+
+
+def _of_study(plan: MeasurementPlan) -> float:
+    """Return the uncertainty in ppm that as many positions of the study leave."""
+    assert plan.deviation is not None
+    count = min(len(plan.points), len(plan.baseline))
+    return float(plan.deviation.baseline[np.searchsorted(plan.baseline_counts, count)])
 
 
 def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
     left, of_study = (_rms(sd) / _rms(plan.prior_sd) for sd in (plan.planned_sd, plan.baseline_sd))
     points, same = len(plan.points), plan.same_information
-    said = (f"At the {counted(points, 'position')} of plan.csv. They leave {fraction(left)} of the "
-            f"blocks' prior uncertainty, as many of the study's positions {fraction(of_study)}. ")
+    said = f"At the {counted(points, 'position')} of plan.csv. "
+    if plan.deviation is None:
+        said += (f"They leave {fraction(left)} of the blocks' prior uncertainty, as many of the "
+                 f"study's positions {fraction(of_study)}. ")
+    else:
+        said += (f"The deviation of |B| in {plan.deviation.region.text} is then known to "
+                 f"{ppm(plan.deviation.planned[-1])} ppm rms, after as many of the study's "
+                 f"positions to {ppm(_of_study(plan))}, and before to "
+                 f"{ppm(plan.deviation.prior)}. ")
     said += (f"{counted(same, 'position')} of the plan tell as much as all {len(plan.baseline)} of "
              f"the study." if same else f"All {len(plan.baseline)} positions of the study together "
              "tell more: plan more points for that.")
@@ -80,7 +105,11 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
             "the order of choice, and the study's own positions as rings"),
         "plan_information.png": (
             _expected_information_figure(plan), "Expected information against the number of "
-            "points, for the plan and for evenly spread positions of the study"),
+            "points, for the plan and for evenly spread positions of the study")
+        if plan.deviation is None else (
+            _deviation_figure(plan), "Uncertainty of the deviation of |B| in the study's region "
+            "against the number of points, for the plan and for evenly spread positions of the "
+            "study"),
         "plan_blocks.png": (
             _block_sd_figure(magnet, plan), "Posterior over prior standard deviation of the "
             "blocks' magnetizations by slot, for the plan and for equally many positions of the "
@@ -102,7 +131,10 @@ def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
          "plan": fraction(_rms(plan.planned_sd) / prior),
          "the study's": fraction(_rms(plan.baseline_sd) / prior)},
         {"": "mean uncertainty of all patterns of blocks, with equally many", "plan":
-         f"{fraction(plan.volume_ratio)} of the study's", "the study's": ""}]
+         f"{fraction(plan.volume_ratio)} of the study's", "the study's": ""},
+        *([] if plan.deviation is None else [
+            {"": "uncertainty of the deviation of |B| in ppm rms, with equally many",
+             "plan": ppm(plan.deviation.planned[-1]), "the study's": ppm(_of_study(plan))}])]
 
 
 def _rms(values: Floats) -> float:
@@ -154,6 +186,22 @@ def _expected_information_figure(plan: MeasurementPlan) -> Figure:
               label="positions of the study")
     axis.axhline(plan.baseline_gain[-1], color=PUBLISHED, lw=0.8, ls=":")
     axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def _deviation_figure(plan: MeasurementPlan) -> Figure:
+    """Draw what is left unknown of the deviation of |B| against the number of points."""
+    assert plan.deviation is not None
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(range(1, len(plan.gain) + 1), plan.deviation.planned, color=POSTERIOR, label="plan")
+    axis.plot(plan.baseline_counts, plan.deviation.baseline, color=PRIOR,
+              label="positions of the study")
+    axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":")
+    axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
+             yscale="log")
     axis.grid(alpha=0.3)
     axis.legend()
     return figure

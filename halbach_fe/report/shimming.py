@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
     main_in_words,
     multipole_figure,
@@ -30,17 +32,16 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, probability
+from halbach_fe.report.words import counted, ppm, probability
+from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
 
 
 def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
     """Return the content of shim.json."""
-    unit = shim.model.unit
     return {
-        "study": shim.study.name, "reference": reference_summary(shim.model, shim.limit),
-        "before": plain(shim.before, unit), "after": plain(shim.after, unit),
+        "study": shim.study.name, **_content(shim),
         "moves": [_step_summary(shim, step) for step in shim.steps],
         "stop": shim.stop, "moves_there_are": shim.tried,
         "probability_within_limit": None if shim.within is None else {
@@ -50,12 +51,28 @@ def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
     }
 
 
+def _content(shim: Shim) -> dict[str, object]:
+    """Return multipoles or homogeneity, and what they refer to, as entries of shim.json."""
+    if shim.fields is not None:
+        before, after = map(plain_homogeneity, shim.fields)
+        return {"region": asdict(shim.model.homogeneity.region), "limit_ppm": shim.limit,
+                "before": before, "after": after}
+    unit = shim.model.unit
+    return {"reference": reference_summary(shim.model, shim.limit),
+            "before": plain(shim.before, unit), "after": plain(shim.after, unit)}
+
+
+def _unit(shim: Shim) -> str:
+    """Return the unit of the values in names of shim.json."""
+    return "units" if shim.fields is None else "ppm"
+
+
 def _step_summary(shim: Shim, step: Step) -> dict[str, object]:
     """Return a move and its gain as entries of shim.json."""
     return {"kind": step.move.kind,
             "blocks": [_placement_summary(shim, placement) for placement in step.move.placements],
-            "gain_units2": step.gain, "gain_sd_units2": step.gain_sd,
-            "rms_after_units": _rms(step)}
+            f"gain_{_unit(shim)}2": step.gain, f"gain_sd_{_unit(shim)}2": step.gain_sd,
+            f"rms_after_{_unit(shim)}": step.after.rms}
 
 
 def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
@@ -67,18 +84,27 @@ def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
             "turn_deg": list(shim.mounts.turn_deg(placement.turn))}
 
 
-def _rms(step: Step) -> float:
-    """Return the rms of the unwanted multipoles after a step in units, with uncertainty."""
-    return float(np.sqrt(step.after.expected_square / len(step.after.orders)))
-
-
 def move_table(shim: Shim) -> list[dict[str, str]]:
     """Return the rows of the table of moves, as text."""
     return [{"move": f"{number}: {step.move.kind}",
              "blocks": "; ".join(_placement_text(shim, placement)
                                  for placement in step.move.placements),
-             "gain in units²": f"{step.gain:.0f} ± {step.gain_sd:.0f}",
-             "rms after": f"{_rms(step):.3g}"} for number, step in enumerate(shim.steps, start=1)]
+             f"gain in {_unit(shim)}²": f"{step.gain:.0f} ± {step.gain_sd:.0f}",
+             f"rms after in {_unit(shim)}": f"{step.after.rms:.3g}"}
+            for number, step in enumerate(shim.steps, start=1)]
+
+
+def table_title(shim: Shim) -> str:
+    """Return the title of `value_table`."""
+    return ("Multipoles in units of 1e-4" if shim.fields is None else
+            f"Deviations of |B| in {shim.model.homogeneity.region.text}")
+
+
+def value_table(shim: Shim) -> list[dict[str, str]]:
+    """Return the rows of the table of multipoles or fields before and after, as text."""
+    if shim.fields is None:
+        return text_table(before=shim.before, after=shim.after)
+    return homogeneity_rows(dict(zip(("before", "after"), shim.fields, strict=True)))
 
 
 def _placement_text(shim: Shim, placement: Placement) -> str:
@@ -112,18 +138,27 @@ def _place_text(shim: Shim, number: int) -> str:
 def answer(shim: Shim, result: InferenceResult) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
     question = "Which blocks should be swapped, turned or replaced?"
-    before, after = (float(np.sqrt(known.expected_square / len(known.orders)))
-                     for known in (shim.before, shim.after))
-    if shim.steps:
-        said = (f"{counted(len(shim.steps), 'move')}: the unwanted multipoles are expected to fall "
-                f"from {before:.3g} to {after:.3g} units of 1e-4 rms, including their uncertainty.")
+    if shim.fields is None:
+        before, after = (f"{known.rms:.3g}" for known in (shim.before, shim.after))
+        what, unit = "the unwanted multipoles are", "units of 1e-4 rms"
+        within = "All unwanted multipoles are within {:g} units"
+        see = "multipoles"
     else:
-        said = (f"No move is worthwhile. Leave it as it is: {before:.3g} units of 1e-4 rms, "
-                "including their uncertainty.")
+        region = shim.model.homogeneity.region.text
+        before, after = ppm(shim.before.rms), ppm(shim.after.rms)
+        what, unit = f"the deviation of |B| in {region} is", "ppm rms"
+        within = "The deviation is within {:g} ppm rms"
+        see = "homogeneity"
+    if shim.steps:
+        said = (f"{counted(len(shim.steps), 'move')}: {what} expected to fall from {before} to "
+                f"{after} {unit}, including the uncertainty.")
+    else:
+        said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
+                "uncertainty.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
-        said += (f" All unwanted multipoles are within {shim.limit:g} units with a probability of "
-                 f"{first} before and {last} after.")
+        said += (f" {within.format(shim.limit)} with a probability of {first} before and {last} "
+                 "after.")
     ended = f"The search ended because {STOPS[shim.stop]}."
     if result.disagreement:
         return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",
@@ -135,8 +170,8 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
              if shim.shimmed_study else "Make the moves in their order, and measure again.",
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements MAP -o DIR") if shim.steps else
-            ("See the multipoles of the magnet as it is.",
-             "halbach-fe multipoles STUDY --posterior DIR/posterior.h5 -o DIR")))
+            (f"See the {see} of the magnet as it is.",
+             f"halbach-fe {see} STUDY --posterior DIR/posterior.h5 -o DIR")))
 
 
 @own_style
@@ -153,7 +188,7 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
     if shimmed:
         write_edited(folder / "study.shimmed.toml", text, [(shimmed, note)])
     write_text(folder / "shim.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    figures = {"shim_multipoles.png": (
+    figures = {} if shim.fields is not None else {"shim_multipoles.png": (
         multipole_figure({"before": shim.before, "after": shim.after}, shim.limit),
         "Unwanted multipoles before and after the moves, normal (left) and skew (right); bars are "
         "two standard deviations")}
@@ -164,13 +199,29 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
                 "swapped, circles mark blocks that are turned in place, squares mark blocks that "
                 "are replaced"),
             "shim_gain.png": (
-                _gain_figure(shim), "Root mean square of the unwanted multipoles after each move, "
-                "including their uncertainty")}
+                _gain_figure(shim), f"Root mean square of {_values_text(shim)} after each move, "
+                "including the uncertainty")}
     write_page(folder / "shim.html", "shim.html.j2", save(figures, folder), study=shim.study,
                shim=shim, summary=summary, moves=move_table(shim), answer=answer(shim, result),
-               reference=reference_text(shim.model),
-               mains=[main_in_words(shim.model, known) for known in (shim.before, shim.after)],
-               rows=text_table(before=shim.before, after=shim.after))
+               title=table_title(shim), text=_convention(shim), rows=value_table(shim))
+
+
+def _values_text(shim: Shim) -> str:
+    """Return what is shimmed for."""
+    return "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
+
+
+def _convention(shim: Shim) -> str:
+    """Return sentences about the table of the page."""
+    if isinstance(shim.model, DeviationModel):
+        return (f"{SIZES} Ranges contain the uncertainty of the blocks after the update; after the "
+                "moves also that of mounting and of replaced blocks.")
+    before, after = (main_in_words(shim.model, known) for known in (shim.before, shim.after))
+    first, last = (f"{1e3 * known.roll:.3g} ± {1e3 * known.roll_sd:.2g} mrad"
+                   for known in (shim.before, shim.after))
+    return (f"{reference_text(shim.model)} ± is the standard deviation, including the error of the "
+            f"solver. Main multipole: {before} before, {after} after. It is rotated about the z "
+            f"axis by {first} before, {last} after.")
 
 
 def _moves_figure(shim: Shim) -> Figure:
@@ -208,14 +259,13 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
 
 
 def _gain_figure(shim: Shim) -> Figure:
-    """Draw the rms of the unwanted multipoles against the number of moves."""
+    """Draw the rms of the values against the number of moves."""
     figure = Figure(figsize=(8, 3.4), layout="constrained")
     axis = figure.subplots()
-    size = len(shim.before.orders)
-    squares = [known.expected_square
-               for known in (shim.before, *(step.after for step in shim.steps))]
-    axis.plot(np.sqrt(np.array(squares) / size), "-o", color=POSTERIOR)
-    axis.set(xlabel="moves", ylabel="rms of |c$_n$| in units", ylim=(0, None))
-    axis.set_xticks(range(len(squares)))
+    sizes = [known.rms for known in (shim.before, *(step.after for step in shim.steps))]
+    axis.plot(sizes, "-o", color=POSTERIOR)
+    axis.set(xlabel="moves", ylim=(0, None), ylabel="rms of |c$_n$| in units of 1e-4"
+             if shim.fields is None else "rms deviation of |B| in ppm")
+    axis.set_xticks(range(len(sizes)))
     axis.grid(alpha=0.3)
     return figure

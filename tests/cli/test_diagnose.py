@@ -136,7 +136,7 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
                  "--effects", CHOICE]
     assert main(arguments) == 0
     shown = capsys.readouterr()
-    assert "arm_sag" in shown.out
+    assert "sag of the" in shown.out  # its name in words, in a narrow column
     assert re.search(r"0\.\d+ ± 0\.\d+ mm", shown.out)
     assert "held out, fringe" in shown.out
     assert "The map is explained by: sag of the mapper's arm" in shown.err

@@ -20,11 +20,12 @@ from halbach_fe.response.multipoles import MultipoleReference, Multipoles, multi
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.bodies import magnet_of, vector
+from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.simulate import simulate_campaign, true_field
 from tests.conftest import DIPOLE, changed
+from tests.support.moved_blocks import moved, unturned
 
 RADIUS, ORDERS = 0.07, (2, 3, 4, 5)
 SQUARES = {
@@ -62,37 +63,6 @@ def true_multipoles(bodies, main, turn, orders=ORDERS, radius=RADIUS):
     found = {n: np.mean(field * np.exp(-1j * (n - 1) * angle)) for n in (main, *orders)}
     relative = 1e4 * np.array([found[n] for n in orders]) / abs(found[main])
     return np.concatenate([relative.real, relative.imag]), abs(found[main])
-
-
-def moved(bodies, loose, shimmed, remount=None):
-    """True bodies once the moves are done by hand: each body goes, as it is before it is mounted,
-    to its new place, turned into that slot's direction and about its own axes; ``remount`` draws
-    the turn of its new mounting.
-    """
-    result = list(bodies)
-    for step in shimmed.steps:
-        for one in step.move.placements:
-            body, slot = loose[one.block], bodies[one.to]
-            facing = slot.angle + getattr(slot.shape, "turn", 0.0)
-            own = Rotation.from_rotvec(np.radians(shimmed.mounts.turn_deg(one.turn)))
-            axes = Rotation.from_euler("z", facing)
-            there = replace(
-                body, ring=slot.ring, slot=slot.slot, centre=slot.centre,
-                angle=facing - getattr(body.shape, "turn", 0.0),
-                rotation=vector((axes * own * axes.inv()).as_rotvec()))
-            if remount is not None:
-                there = there.with_magnetization(remount().apply(there.magnetization))
-            result[one.to] = there
-    return result
-
-
-def unturned(bodies, loose, shimmed):
-    """The same moves done wrongly: magnetizations go to their slots without being turned."""
-    result = list(bodies)
-    for step in shimmed.steps:
-        for one in step.move.placements:
-            result[one.to] = bodies[one.to].with_magnetization(loose[one.block].magnetization)
-    return result
 
 
 def chi2(known, truth):

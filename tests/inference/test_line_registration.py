@@ -84,7 +84,7 @@ def test_a_profile_beside_the_axis_with_a_wrong_step(magnet, generator, tmp_path
     assert by_hypothesis(found)["nothing open"] < 1e-3
     assert odds(found).sum() == pytest.approx(1.0)
     said = " ".join([answer(found).trust, *sentences(found)])
-    assert "7 other answers" in said
+    assert "7 other poses" in said
     assert "does not determine the" in said
 
 

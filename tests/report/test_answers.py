@@ -98,7 +98,7 @@ def of_homogeneity(given):
 
 def of_forces(given):
     found = hf.forces(given.magnet, given.session)
-    return forces.answer(found), [f"{decimals(found.in_place.magnitude.max())} N", "of 16",
+    return forces.answer(found), [f"{decimals(found.in_place.magnitude.max())}\u00a0N", "of 16",
                                   f"{found.mass_kg.sum():.4g} kg"]
 
 

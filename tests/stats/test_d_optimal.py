@@ -15,7 +15,7 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.stats.d_optimal import greedy, information
+from halbach_fe.stats.d_optimal import greedy, information, variance_left
 from halbach_fe.stats.gaussian import nominal_prior
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
@@ -32,7 +32,8 @@ def test_gain_is_the_mutual_information(generator):
 
 def test_running_gain_is_that_of_the_chosen(generator):
     design = generator.standard_normal((30, 2, 5))
-    chosen, gain = greedy(design, 12)
+    choice = greedy(design, 12)
+    chosen, gain = choice.chosen, choice.gain
     assert len(set(chosen)) == 12
     for count in (1, 5, 12):
         assert gain[count - 1] == pytest.approx(information(np.vstack(design[chosen[:count]])))
@@ -42,12 +43,34 @@ def test_greedy_is_near_the_best(generator):
     """At least 1 - 1/e of the best of all choices; most other choices are worse."""
     for _ in range(5):
         design = generator.standard_normal((12, 2, 4)) * generator.uniform(0.2, 2, (12, 1, 1))
-        chosen, gain = greedy(design, 4)
+        choice = greedy(design, 4)
+        chosen, gain = choice.chosen, choice.gain
         every = [information(np.vstack(design[list(some)]))
                  for some in itertools.combinations(range(12), 4)]
         assert gain[-1] >= (1 - 1 / np.e) * max(every)
         assert gain[-1] > np.quantile(every, 0.95)
         assert chosen[0] == np.argmax([information(one) for one in design])
+
+
+def test_the_variance_of_values_falls_as_foretold(generator):
+    """By the dense posterior; the control is the choice for information, which leaves more."""
+    design = generator.standard_normal((30, 2, 5)) * generator.uniform(0.2, 2, (30, 1, 5))
+    values = generator.standard_normal((3, 5)) * [3, 1, 0.1, 0.1, 0.1]
+
+    def left(some):
+        inner = np.eye(5) + sum(one.T @ one for one in design[some])
+        return np.trace(values @ np.linalg.inv(inner) @ values.T)
+
+    choice = greedy(design, 6, values)
+    for count in (1, 2, 6):
+        assert np.sum(values**2) - choice.fall[count - 1] == pytest.approx(
+            left(choice.chosen[:count]))
+        assert choice.gain[count - 1] == pytest.approx(
+            information(np.vstack(design[choice.chosen[:count]])))
+    assert choice.chosen[0] == np.argmin([left([number]) for number in range(30)])
+    assert left(greedy(design, 6).chosen) > 1.05 * left(choice.chosen)
+    for some in ([3], [0, 1, 2, 7, 11]):  # fewer readings than parameters, and more
+        assert variance_left(np.vstack(design[some]), values) == pytest.approx(left(some))
 
 
 def test_plan_in_a_cross_section(dipole, session):
