@@ -34,10 +34,12 @@ def run(arguments: argparse.Namespace) -> int:
     magnet = build_magnet(study)
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
     with common.session(arguments, study) as session:
-        tables = multipoles(magnet, session, common.reference(arguments), posterior).tables
+        found = multipoles(magnet, session, common.reference(arguments), posterior)
+    tables = found.tables
     write_multipoles(study, tables, limit, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(
-            {"study file": arguments.study, "posterior": arguments.posterior})})
+            {"study file": arguments.study, "posterior": arguments.posterior})},
+        found.disagreement)
     if arguments.json:
         common.print_json(multipoles_summary(study, tables, limit))
     else:
@@ -45,5 +47,6 @@ def run(arguments: argparse.Namespace) -> int:
             common.print_table(text_table(**columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
                 "of the cross-section" if model.z is None else f"on {place_of(model)}"))
-        common.say_answer(arguments, answer(tables, limit), arguments.output / "multipoles.html")
+        common.say_answer(arguments, answer(tables, limit, found.disagreement),
+                          arguments.output / "multipoles.html")
     return 0

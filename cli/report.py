@@ -34,5 +34,5 @@ def run(arguments: argparse.Namespace) -> int:
                         for chapter, _, answer in campaign.answered], campaign.study.name)
     for sentence in (*campaign.versions, *campaign.doubts):
         common.say(sentence)
-    common.say_answer(arguments, campaign.answer, page)
+    common.say_answer(argparse.Namespace(), campaign.answer, page)
     return 0

@@ -8,6 +8,7 @@ shim_tray.json, shim_tray.html and its figures.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from halbach_fe.cli import common
 from halbach_fe.cli.homogeneity import add_region_arguments, region_of
@@ -38,9 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     magnet, region = build_magnet(study), region_of(arguments)
-    posterior = read_posterior(magnet, arguments.posterior)["posterior"]
+    stored = read_posterior(magnet, arguments.posterior)
     with common.session(arguments, study) as session:
-        found = shim_tray(magnet, session, posterior, region)
+        found = replace(shim_tray(magnet, session, stored["posterior"], region),
+                        disagreement=stored.disagreement)
     write_shim_tray(found, arguments.output, {"GetDP": session.getdp.version, **common.digests(
         {"study file": arguments.study, "posterior": arguments.posterior})})
     if arguments.json:

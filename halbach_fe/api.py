@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.core.numbers import ACROSS, DRAWS, check_number
+from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -38,7 +39,7 @@ from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.same_magnet import distributions_of
+from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
@@ -72,6 +73,9 @@ class MultipoleTables(ShownInNotebook):
         The linear model of each reference, and its multipoles by the name of the distribution of
         the magnetizations: ``prior``, or ``prior`` and ``posterior``. A 2D magnet has a single
         table. A 3D magnet has two: of the field integrated along z, and of one circle.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
 
     Examples
     --------
@@ -84,6 +88,7 @@ class MultipoleTables(ShownInNotebook):
 
     magnet: Magnet
     tables: Sequence[tuple[MultipoleModel, Mapping[str, Multipoles]]]
+    disagreement: str | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,9 @@ class HomogeneityResult(ShownInNotebook):
         ``posterior``.
     distributions : mapping of str to Gaussian
         These distributions, in A/m.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
 
     Examples
     --------
@@ -114,6 +122,7 @@ class HomogeneityResult(ShownInNotebook):
     model: HomogeneityModel
     by_name: Mapping[str, Homogeneity]
     distributions: Mapping[str, Gaussian]
+    disagreement: str | None = None
 
 
 @alone
@@ -236,7 +245,7 @@ def multipoles(
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
-        for model in models])
+        for model in models], disagreement_of(posterior))
 
 
 @alone
@@ -281,12 +290,12 @@ def homogeneity(
     True
     """
     known = None if posterior is None else distributions_of(magnet, posterior)
-    check_number("degrees", "homogeneity", degrees, 1, whole=True)
+    check_number("degrees", "homogeneity", degrees, 1, HIGHEST_DEGREE, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
-        distributions)
+        distributions, disagreement_of(posterior))
 
 
 @alone
@@ -445,6 +454,8 @@ def sort(
     2
     """
     check_number("seed", "sort", seed, 0, whole=True)
+    if not isinstance(turns, bool):
+        raise StudyError(must_be("turns", "sort", "True or False", turns))
     check_objective(magnet, reference, None, None)
     blocks = sortable(magnet, blocks)  # before the solves, which may take long
     model = objective_of(magnet, reference, session)
@@ -549,6 +560,7 @@ def demagnetization(
     return demagnetization_room.demagnetization_map(magnet, session, across)
 
 
+@typed
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
     progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
@@ -598,6 +610,9 @@ def simulate_measurement(
     """
     check_number("seed", "simulate_measurement", seed, 0, whole=True)
     check_number("hide_random", "simulate_measurement", hide_random, 0, whole=True)
+    if isinstance(hide, str):
+        raise StudyError(must_be("hide", "simulate_measurement", "a list of texts, one for each "
+                                 "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
                              hide_random=hide_random, progress=progress, placed=placed)

@@ -14,6 +14,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.overlaps import overlapping_blocks
 from halbach_fe.response.homogeneity import Region
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.array import Array, Ring
@@ -311,7 +312,13 @@ def _rings(study: Study, layer: DesignLayer) -> Iterator[RingOfBlocks]:
                     "`design.layer.radii_m`", f"study {study.name}",
                     "so large that four blocks fit",
                     f"{radius:g} with blocks of {1e3 * size:g} mm"))
-            yield RingOfBlocks(radius, size, blocks)
+            ring = RingOfBlocks(radius, size, blocks)
+            if blocks > most and overlapping_blocks(blocks_of(study, [ring.table(array, 0.0)])):
+                raise StudyError(must_be(
+                    "`design.layer.blocks_per_ring`", f"study {study.name}",
+                    f"so small that blocks of {1e3 * size:g} mm fit at the radius {radius:g} m",
+                    blocks, f"{most} do."))
+            yield ring
 
 
 def fields_with_images(study: Study, ring: RingOfBlocks, z: Floats, points: Floats) -> Floats:

@@ -110,6 +110,9 @@ class FilledTray(ShownInNotebook):
     places_m : ndarray, shape (places, 3), in m
     left : dict of str to int
         Number of magnets of each kind that remain in the inventory.
+    disagreement : str or None
+        Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
+        if that is not known.
     """
 
     magnet: Magnet
@@ -122,6 +125,7 @@ class FilledTray(ShownInNotebook):
     filled: tuple[Filled, ...]
     places_m: Floats
     left: dict[str, int]
+    disagreement: str | None = None
 
 
 @alone

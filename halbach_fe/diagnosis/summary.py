@@ -5,6 +5,7 @@ changes.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -450,11 +451,18 @@ def limits_in_words(limits: DetectionLimits) -> str:
     for values, unit, most in ((100 * limits.loss, "%", 100.0),
                                (1e3 * limits.displacement_m, "mm", MOST_DISPLACED_MM)):
         parts.append((amount(float(np.median(values)), unit, most),
-                      amount(float(values.max()), unit, most), limits.worst(values)))
+                      amount(float(values.max()), unit, most),
+                      _name_in_words(limits.worst(values))))
     (loss, most_loss, weak), (moved, most_moved, far) = parts
     return (f"It would have shown the loss of {loss} of a block's magnetization (median; "
-            f"{most_loss} of block {weak}, which shows least), or its displacement by {moved} in "
-            f"any direction ({most_moved} of block {far}).")
+            f"{most_loss} of {weak}, which shows least), or its displacement by {moved} in "
+            f"any direction ({most_moved} of {far}).")
+
+
+def _name_in_words(name: str) -> str:
+    """Describe a block by its name: r03s05 is ring 3, slot 5, and others are labels of the user."""
+    place = re.fullmatch(r"r(\d+)s(\d+)", name)
+    return block_in_words(int(place[1]), int(place[2])) if place else f"block {name}"
 
 
 def _entry(identified: IdentifiedEffect) -> dict[str, object]:

@@ -70,6 +70,14 @@ def distributions_of(
     return {name: distribution_of(magnet, one, name) for name, one in posterior.items()}
 
 
+def disagreement_of(posterior: Mapping[str, Gaussian] | InferenceResult | None) -> str | None:
+    """Return how the update of a posterior disagrees with its map; None if that is not known.
+
+    A posterior that is read from a file knows it as the result of `infer` does.
+    """
+    return getattr(posterior, "disagreement", None)
+
+
 def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian:
     """Return a distribution of a magnet's parameters in A/m.
 

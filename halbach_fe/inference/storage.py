@@ -13,7 +13,7 @@ import xarray as xr
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import MeasurementError, OutputError, must_be
+from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.tables import csv_text
@@ -23,14 +23,30 @@ from halbach_fe.inference.same_magnet import check_same_magnet
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.study.model import Study
 
+MAX_SENTENCES = 4000
+"""Number of characters of a file's sentences that are shown."""
+
 WRITTEN_COVARIANCE = 2000
 """Largest number of parameters for which the full covariance (then 32 MB) is written too."""
+
+
+class StoredPosterior(dict[str, Gaussian]):
+    """Distributions of the magnetizations in A/m by name, ``prior`` and ``posterior``, of a file.
+
+    Attributes
+    ----------
+    disagreement : str or None
+        `InferenceResult.disagreement` of the update; None if the file does not state it.
+    """
+
+    disagreement: str | None = None
 
 
 def write_inference(update: InferenceResult, folder: Path) -> None:
     """Write posterior.h5, prediction.csv and summary.json."""
     magnetization = update.magnetizations
     magnetization.attrs["study"] = update.study.model_dump_json()
+    magnetization.attrs["disagreement"] = update.disagreement
     distributions = {"prior": update.prior, "posterior": update.posterior}
     for name, distribution in distributions.items():
         magnetization.update(_stored_root(name, distribution, update.prior))
@@ -45,7 +61,7 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
     write_text(folder / "summary.json", text + "\n")
 
 
-def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
+def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
     """Read ``prior`` and ``posterior`` of the magnetizations in A/m from a file posterior.h5.
 
     Raises
@@ -55,11 +71,13 @@ def read_posterior(magnet: Magnet, path: Path) -> dict[str, Gaussian]:
     OutputError
         If its content is not what was written.
     """
-    distributions: dict[str, Gaussian] = {}
+    distributions = StoredPosterior()
     try:
         data = read_hdf5(path)
         own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
         study = Study.model_validate_json(data.attrs["study"])
+        if "disagreement" in data.attrs:
+            distributions.disagreement = printable(str(data.attrs["disagreement"]), MAX_SENTENCES)
         for name in ("prior", "posterior"):
             distributions[name] = Gaussian(
                 untrusted.finite_array(data[f"{name}_mean"], own.shape),

@@ -111,7 +111,8 @@ def _map_row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:
     sigma = _noise(study, data)
     return {"points of": name, "number": str(len(z)),
             "components": ", ".join(f"B{name}" for name in observed_components(study)),
-            "z in mm": " to ".join(dict.fromkeys(f"{1e3 * end:g}" for end in (z.min(), z.max()))),
+            "z in mm": " to ".join(dict.fromkeys(
+                f"{1e3 * round(end, 9):.4g}" for end in (z.min(), z.max()))),
             "largest reading": flux_density(float(np.nanmax(np.abs(fields))), 5),
             "sd of the noise": " to ".join(dict.fromkeys(
                 flux_density(float(end), 2) for end in (np.nanmin(sigma), np.nanmax(sigma))))}

@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 import os
 import re
+import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -65,9 +66,10 @@ class Campaign:
 
     @property
     def answered(self) -> list[tuple[Chapter, Page, Answer]]:
-        """All answers."""
-        return [(chapter, page, page.said.answer) for chapter in self.chapters
-                for page in chapter.pages if page.said.answer is not None]
+        """All answers, with the folders that hold what their commands name."""
+        return [(chapter, page, _with_folder(page.said.answer, chapter))
+                for chapter in self.chapters for page in chapter.pages
+                if page.said.answer is not None]
 
     def continued(self, chapter: Chapter, answer: Answer) -> Chapter | None:
         """Return the later chapter of the command that an answer names as the next step."""
@@ -106,10 +108,10 @@ class Campaign:
         """Return the answer whose next step is the one to take.
 
         It is that of an answer which may not be used; or else of the last one about the measured
-        magnet, if there is any.
+        magnet, if there is any. Its command names the folder of that answer.
         """
-        left = [(chapter, answer) for chapter, _, answer in self.answered
-                if self.continued(chapter, answer) is None]
+        left = [(chapter, answer.with_paths({"DIR": chapter.folder}))
+                for chapter, _, answer in self.answered if self.continued(chapter, answer) is None]
         unsound = [answer for chapter, answer in left
                    if not answer.sound and self.replaced(chapter) is None]
         measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]
@@ -125,6 +127,15 @@ class Campaign:
                     for chapter in self.chapters for page in chapter.pages]}
 
 
+def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
+    """Return an answer whose command has the folder of the files that its own command wrote."""
+    def named(found: re.Match[str]) -> str:
+        return (shlex.quote(f"{chapter.label}/{found[1]}") if found[1] in chapter.record.files
+                else found[0])
+
+    return replace(answer, command=re.sub(r"DIR/(\S+)", named, answer.command))
+
+
 def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> Campaign:
     """Read the results of one magnet; see `campaign_report`.
 
@@ -134,8 +145,9 @@ def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> 
         path for path in map(as_path, folders) if output is None
         or path.resolve() != output.resolve()]
     if not paths:
-        raise OutputError(must_be("folders", "the report", "a list of folders of results",
-                                  repr(folders)))
+        raise OutputError(must_be(
+            "folders", "the report", "a list of folders of results other than its own",
+            repr(folders) if isinstance(folders, str) else ", ".join(map(str, folders)) or "none"))
     return Campaign(tuple(read_chapters(paths)))
 
 
@@ -212,7 +224,7 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
     first = {chapter.label: number for number, (chapter, _) in reversed(list(enumerate(pages, 1)))}
     found = []
     for number, (chapter, page) in enumerate(pages, 1):
-        answer, rows = page.said.answer, page.said.rows
+        answer, rows = page.said.answer and _with_folder(page.said.answer, chapter), page.said.rows
         later = campaign.continued(chapter, answer) if answer else None
         files = {name: _link(chapter.folder / name, output) for name in chapter.record.files
                  if (chapter.folder / name).exists()}

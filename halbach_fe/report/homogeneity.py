@@ -11,12 +11,13 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
@@ -51,12 +52,14 @@ def answer(found: HomogeneityResult) -> Answer:
             f"rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
     low, middle, high = map(ppm, best.rms_range_ppm)
     trust, small = solver_error_text(found.model, best.rms_ppm)
+    if name != "prior" and found.disagreement:
+        return of_a_conflict(question, f"{text}.", found.disagreement)
     if name != "prior":
         return Answer(
-            question, f"{text} (95 % of what the {name} allows: {low} to {high} ppm rms).",
-            f"Yes, as far as the update agrees with its map, which its own page says. {trust}",
+            question, f"{text} (with a probability of 95 %, {low} to {high} ppm rms).",
+            f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior DIR/posterior.h5 -o DIR", small)
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
     return Answer(
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
@@ -158,13 +161,14 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
     within = x**2 + y**2 <= 1
     largest = max(float(np.nanquantile(np.abs(each[within]), 0.98)) for each in deviations) or 1.0
     levels = np.linspace(-largest, largest, 21)
+    round_levels = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(-largest, largest)
     axes = figure.subplots(1, 3)
     for axis, each, deviation in zip(axes, slices, deviations, strict=True):
         names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
                       extend="both")
         lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
-                             np.where(within, deviation, np.nan), levels[::4],
+                             np.where(within, deviation, np.nan), round_levels,
                              colors="black", linewidths=0.5)
         axis.clabel(lines, fmt=ppm, fontsize=7)
         axis.set_aspect("equal")

@@ -63,9 +63,9 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
             f"{ppm(most)} ({ppm(widest)}). With all blocks as ordered it is "
             f"{ppm(found.ordered.rms_ppm)} ppm rms.")
     share, prior = found.share, found.study.prior
-    if share is not None:
+    if share is not None and found.limit is not None:
         said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
-                f"are within {found.limit:g} ppm rms. {said}")
+                f"are within {ppm(found.limit)} ppm rms. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
     enough = share is not None and share >= ENOUGH

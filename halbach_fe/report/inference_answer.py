@@ -7,7 +7,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.words import flux_density, fraction, place_of
+from halbach_fe.report.words import flux_density, fraction, place_of, with_error
 
 
 def answer(result: InferenceResult) -> Answer:
@@ -77,7 +77,7 @@ def _blocks(result: InferenceResult) -> str:
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
     return (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
             f"rms, the most {place_of(block)} by "
-            f"{100 * mean[worst]:+.1f}\u00a0±\u00a0{100 * sd:.1f}\u00a0%.")
+            f"{'+' if mean[worst] > 0 else ''}{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
 
 
 def _rms(values: Floats) -> float:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, own_style, save, write_page
 from halbach_fe.report.words import probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
@@ -130,7 +130,9 @@ def _probability_within(known: Multipoles, limit: float) -> float:
     return met(known.sizes_of(normals), limit)
 
 
-def answer(tables: Sequence[MultipoleTable], limit: float | None) -> Answer:
+def answer(
+    tables: Sequence[MultipoleTable], limit: float | None, disagreement: str | None = None
+) -> Answer:
     """Say how large the unwanted multipoles of the best known magnet are, and what to do next."""
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
@@ -141,9 +143,10 @@ def answer(tables: Sequence[MultipoleTable], limit: float | None) -> Answer:
             "tolerances of its blocks (the study's prior) and the solver leave open.",
             "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
             "halbach-fe infer STUDY --measurements MAP -o DIR")
+    if disagreement:
+        return of_a_conflict(question, said, disagreement)
     return Answer(
-        question, said, "Yes, as far as the update agrees with its map, which its own page says: ± "
-        "is what map, prior and solver leave open.",
+        question, said, f"{agreement(disagreement)} ± is what map, prior and solver leave open.",
         "If that is too much, look for blocks to swap or to turn.",
         "halbach-fe shim STUDY --measurements MAP -o DIR")
 
@@ -182,7 +185,7 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
 @own_style
 def write_multipoles(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
-    provenance: Mapping[str, str],
+    provenance: Mapping[str, str], disagreement: str | None = None,
 ) -> None:
     """Write multipoles.csv, multipoles.json, multipoles.html and its figures."""
     write_multipole_csv(study, tables, folder / "multipoles.csv")
@@ -197,5 +200,5 @@ def write_multipoles(
               "rows": text_table(**magnets), "picture": picture}
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, answer=answer(tables, limit), parts=parts,
+               provenance=provenance, answer=answer(tables, limit, disagreement), parts=parts,
                rows=text_table(**tables[0][1]))

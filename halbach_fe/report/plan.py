@@ -31,6 +31,9 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import is_nonlinear
 
+NEARLY = 1.2
+"""Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
+
 
 def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
     """Return the content of plan.json: information in nats, standard deviations in A/m."""
@@ -56,6 +59,16 @@ def _deviation_summary(plan: MeasurementPlan) -> dict[str, object]:
                                  "study_with_as_many_points": _of_study(plan)}}
 
 
+def _nearly(plan: MeasurementPlan) -> int:
+    """Return how many positions leave at most `NEARLY` times the uncertainty of all of them.
+
+    It is that of the deviation of |B|, or of all patterns of blocks in the geometric mean.
+    """
+    left = (np.exp(-plan.gain / len(plan.parameters)) if plan.deviation is None
+            else plan.deviation.planned)
+    return int(np.argmax(left <= NEARLY * left[-1])) + 1
+
+
 def _of_study(plan: MeasurementPlan) -> float:
     """Return the uncertainty in ppm that as many positions of the study leave."""
     assert plan.deviation is not None
@@ -76,16 +89,25 @@ def answer(plan: MeasurementPlan) -> Answer:
                  f"{ppm(plan.deviation.planned[-1])} ppm rms, after as many of the study's "
                  f"positions to {ppm(_of_study(plan))}, and before to "
                  f"{ppm(plan.deviation.prior)}. ")
-    said += (f"{counted(same, 'position')} of the plan tell as much as all {len(plan.baseline)} of "
-             f"the study." if same else f"All {len(plan.baseline)} positions of the study together "
-             "tell more: plan more points for that.")
+    everything = points == len(plan.candidates)
+    if everything:
+        said += ("These are all the candidates, so that the plan only orders "
+                 f"them. The first {_nearly(plan)} leave at most {NEARLY:g} times the uncertainty "
+                 "of all.")
+    else:
+        said += (f"{counted(same, 'position')} of the plan tell as much as all "
+                 f"{len(plan.baseline)} of the study." if same else
+                 f"All {len(plan.baseline)} positions of the study together tell more: plan more "
+                 "points for that.")
     return Answer(
         "Where should the magnet be measured?", said,
         "As far as the study's prior and noise are right: the readings themselves do not matter. "
         "Chosen one after another, the positions are nearly the best ones."
         + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
            else ""),
-        "Measure there, and update the blocks.", "halbach-fe infer STUDY --measurements MAP -o DIR")
+        "Set plan.points for a shorter plan, or name other places in plan.candidates. Measure "
+        "there, and update the blocks." if everything else "Measure there, and update the blocks.",
+        "halbach-fe infer STUDY --measurements MAP -o DIR")
 
 
 @own_style
@@ -125,7 +147,8 @@ def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
     return [
         {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
         {"": "positions that tell as much as all of the study's",
-         "plan": str(same) if same else f"more than {len(plan.points)}",
+         "plan": str(same) if same else str(len(plan.points)) if _is_the_study(plan)
+         else f"more than {len(plan.points)}",
          "the study's": str(len(plan.baseline))},
         {"": "uncertainty that remains of a block, with equally many positions",
          "plan": fraction(_rms(plan.planned_sd) / prior),
@@ -135,6 +158,13 @@ def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
         *([] if plan.deviation is None else [
             {"": "uncertainty of the deviation of |B| in ppm rms, with equally many",
              "plan": ppm(plan.deviation.planned[-1]), "the study's": ppm(_of_study(plan))}])]
+
+
+def _is_the_study(plan: MeasurementPlan) -> bool:
+    """Tell whether the plan has all positions of the study, which then tell as much to rounding."""
+    chosen, study = (set(map(tuple, points.round(9).tolist()))
+                     for points in (plan.points, plan.baseline))
+    return study <= chosen
 
 
 def _rms(values: Floats) -> float:
@@ -157,6 +187,7 @@ def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
             [1e3 * points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
         axis.set(xlabel="z in mm", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 
 
@@ -173,7 +204,6 @@ def _draw_points(
                          zorder=3)
     axis.plot(*place(plan.baseline).T, "o", mfc="none", color=PRIOR, ms=7, mew=0.8,
               label="positions of the study")
-    axis.legend(loc="upper right", fontsize="small")
     return shown
 
 
@@ -225,7 +255,7 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
                                     ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
         axis.bar(places + shift, by_slot(sd) / before, 0.4, color=colour, label=name)
-    axis.set(xlabel="slot", ylabel="posterior sd / prior sd", ylim=(0, 1))
+    axis.set(xlabel="slot", ylabel="sd after the plan / before", ylim=(0, None))
     axis.set_xticks(places[::max(1, len(places) // 16)])
     axis.legend()
     return figure

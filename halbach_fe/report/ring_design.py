@@ -43,7 +43,7 @@ def answer(found: Designed) -> Answer:
         if found.reached else "It is not what was asked for: the limits of [design] exclude it.",
         "See what the tolerances of the blocks leave of it." if found.reached else
         "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
-        f"halbach-fe {'homogeneity ' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
+        f"halbach-fe {'homogeneity DIR/' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
         found.reached)
 
 

@@ -14,7 +14,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import plain_homogeneity, slices_figure
 from halbach_fe.report.page import PUBLISHED, own_style, save, write_page
 from halbach_fe.report.words import ppm
@@ -32,6 +32,13 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 
 def answer(found: FilledTray) -> Answer:
     """Say what the tray does, with how many magnets, and what to do next."""
+    said = _answer(found)
+    return (of_a_conflict(said.question, said.said, found.disagreement) if found.disagreement
+            else said)
+
+
+def _answer(found: FilledTray) -> Answer:
+    """Return the answer of an update that agrees with its map."""
     region, tray = found.model.region.text, found.magnet.study.shim_tray
     question = f"Which magnets in the tray make the field in {region} homogeneous?"
     measured = "halbach-fe infer STUDY --measurements MAP -o DIR"
@@ -41,7 +48,7 @@ def answer(found: FilledTray) -> Answer:
             f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(tray),
             "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
             "comes from: its harmonics tell.",
-            "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
+            "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
     text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
@@ -53,7 +60,7 @@ def answer(found: FilledTray) -> Answer:
         return Answer(
             question, f"{text} That is hardly less.", _ranges(tray),
             "Take larger magnets or more places, or look for what the deviation comes from: its "
-            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
+            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     if after > 2 * found.after.rms_ppm:
         return Answer(
             question, text, "What remains is mostly what the measurement and the strength of the "

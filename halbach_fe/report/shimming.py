@@ -32,7 +32,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, ppm, probability
+from halbach_fe.report.words import counted, place_of, ppm, probability
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
@@ -67,6 +67,11 @@ def _unit(shim: Shim) -> str:
     return "units" if shim.fields is None else "ppm"
 
 
+def _size(shim: Shim, rms: float) -> str:
+    """Return an rms of the values as text."""
+    return f"{rms:.3g}" if shim.fields is None else ppm(rms)
+
+
 def _step_summary(shim: Shim, step: Step) -> dict[str, object]:
     """Return a move and its gain as entries of shim.json."""
     return {"kind": step.move.kind,
@@ -89,8 +94,8 @@ def move_table(shim: Shim) -> list[dict[str, str]]:
     return [{"move": f"{number}: {step.move.kind}",
              "blocks": "; ".join(_placement_text(shim, placement)
                                  for placement in step.move.placements),
-             f"gain in {_unit(shim)}²": f"{step.gain:.0f} ± {step.gain_sd:.0f}",
-             f"rms after in {_unit(shim)}": f"{step.after.rms:.3g}"}
+             f"rms after in {_unit(shim)}": _size(shim, step.after.rms),
+             "gain in its sd": f"{step.gain / step.gain_sd:.1f}" if step.gain_sd else "exact"}
             for number, step in enumerate(shim.steps, start=1)]
 
 
@@ -111,8 +116,8 @@ def _placement_text(shim: Shim, placement: Placement) -> str:
     """Return where a block comes from, where it goes and how it is turned, in words."""
     spare = placement.block - len(shim.mounts.places)
     source = (f"spare {shim.spares[spare]}" if spare >= 0 else _place_text(shim, placement.block))
-    where = ("in place" if placement.block == placement.to
-             else f"to {_place_text(shim, placement.to)}")
+    stays = placement.block == placement.to
+    where = "in place" if stays else f"to {_place_text(shim, placement.to)}"
     vector = np.array(shim.mounts.turn_deg(placement.turn))
     angle = float(np.linalg.norm(vector))
     if not angle:
@@ -126,28 +131,28 @@ def _placement_text(shim: Shim, placement: Placement) -> str:
     names = [name for name, part in zip(own, axis, strict=True) if abs(part) > 1 - 1e-6]
     about = names[0] if names else "(" + ", ".join(f"{part:.3g}" for part in axis) + ")"
     sign = -1 if names and axis.sum() < 0 else 1
-    return f"{source} {where}, then turned by {sign * angle:.0f}° about its {about} axis"
+    return (f"{source} {where}, {'' if stays else 'then '}turned by {sign * angle:.0f}° about its "
+            f"{about} axis")
 
 
 def _place_text(shim: Shim, number: int) -> str:
     """Return the place of a block in words: the block's name if it is a free block."""
     block = shim.magnet.blocks[number]
-    return block.label or f"ring {block.ring} slot {block.slot}"
+    return place_of(block)
 
 
 def answer(shim: Shim, result: InferenceResult) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
     question = "Which blocks should be swapped, turned or replaced?"
+    before, after = (_size(shim, known.rms) for known in (shim.before, shim.after))
     if shim.fields is None:
-        before, after = (f"{known.rms:.3g}" for known in (shim.before, shim.after))
         what, unit = "the unwanted multipoles are", "units of 1e-4 rms"
-        within = "All unwanted multipoles are within {:g} units"
+        within = "All unwanted multipoles are within {} units"
         see = "multipoles"
     else:
         region = shim.model.homogeneity.region.text
-        before, after = ppm(shim.before.rms), ppm(shim.after.rms)
         what, unit = f"the deviation of |B| in {region} is", "ppm rms"
-        within = "The deviation is within {:g} ppm rms"
+        within = "The deviation is within {} ppm rms"
         see = "homogeneity"
     if shim.steps:
         said = (f"{counted(len(shim.steps), 'move')}: {what} expected to fall from {before} to "
@@ -157,7 +162,8 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
                 "uncertainty.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
-        said += (f" {within.format(shim.limit)} with a probability of {first} before and {last} "
+        limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
+        said += (f" {within.format(limit)} with a probability of {first} before and {last} "
                  "after.")
     ended = f"The search ended because {STOPS[shim.stop]}."
     if result.disagreement:
@@ -169,9 +175,9 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             ("Make the moves in their order, measure again, and update study.shimmed.toml."
              if shim.shimmed_study else "Make the moves in their order, and measure again.",
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
-             "--measurements MAP -o DIR") if shim.steps else
+             "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
-             f"halbach-fe {see} STUDY --posterior DIR/posterior.h5 -o DIR")))
+             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")))
 
 
 @own_style
@@ -237,6 +243,7 @@ def _moves_figure(shim: Shim) -> Figure:
         where = np.array(shim.mounts.places, float)
         axis.plot(*where.T, ".", color="#cccccc", ms=3)
         axis.set(xlabel="ring", ylabel="slot")
+        axis.margins(0.06, 0.12)
         for numbers in (axis.xaxis, axis.yaxis):
             numbers.set_major_locator(MaxNLocator(integer=True))
     for number, step in enumerate(shim.steps, start=1):

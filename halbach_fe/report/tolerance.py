@@ -23,6 +23,9 @@ from halbach_fe.report.multipoles import main_in_words, reference_summary, refer
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.response.multipoles import plain
 
+LEAST_OF_SD = 5e-3
+"""Part of its standard deviation below which a mean is 0 in the table."""
+
 
 def tolerance_summary(found: Tolerance | HomogeneityTolerance) -> dict[str, object]:
     """Return the content of tolerance.json."""
@@ -60,7 +63,7 @@ def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, st
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
-        row = {"n": str(order), "|c_n| of the mean": f"{found.known.sizes[i]:.3g}",
+        row = {"n": str(order), "|c_n| of the mean": _size(found, i),
                "sd of b_n": f"{sd[i]:.3g}", "sd of a_n": f"{sd[size + i]:.3g}"}
         row |= {f"{100 * q:g} % below": f"{value:.3g}"
                 for q, value in zip(QUANTILES, found.quantiles[:, i], strict=True)}
@@ -68,6 +71,15 @@ def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, st
             row["within the limit"] = f"{100 * found.shares[i]:.3g} %"
         rows.append(row)
     return rows
+
+
+def _size(found: Tolerance, number: int) -> str:
+    """Return |c_n| of the mean as text: 0 if it is small beside what the tolerances make.
+
+    What symmetry forbids is 0 but for the mesh.
+    """
+    size, sd = found.known.sizes[number], found.known.sd.reshape(2, -1)[:, number].max()
+    return "0" if size < LEAST_OF_SD * sd else f"{size:.3g}"
 
 
 def answer(found: Tolerance | HomogeneityTolerance) -> Answer:

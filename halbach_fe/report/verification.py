@@ -66,8 +66,9 @@ def answer(found: Verification) -> Answer:
     measure = ("Measure the magnet, and update its blocks with the map.",
                "halbach-fe infer STUDY --measurements MAP -o DIR")
     if found.error_pointwise < ROUNDING:
-        return Answer(question, "Not at all: no finite elements are needed, the field is the exact "
-                      f"one of the blocks in vacuum ({flux_density(main, 4)} at most).",
+        return Answer(question, "The computed field is not off at all: no finite elements are "
+                      "needed, it is the exact one of the blocks in vacuum "
+                      f"({flux_density(main, 4)} at most).",
                       "Yes, to the rounding of the computer: it is a closed form.", *measure)
     said = (f"At the study's positions B is off by {flux_density(error)} at most, by estimate. "
             f"That is {ppm(1e6 * found.error_pointwise)} ppm of the largest field there "

@@ -14,6 +14,7 @@ from halbach_fe.cli import main
 from halbach_fe.cli.verbs import parser
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.report import (
     campaign,
     demagnetization,
@@ -208,3 +209,66 @@ def test_paths_in_a_command_are_quoted():
     found = Answer("?", "", "", "", "halbach-fe infer STUDY --measurements MAP -o DIR").with_paths(
         {"STUDY": "my study.toml", "MAP": None})
     assert found.command == "halbach-fe infer 'my study.toml' --measurements MAP -o DIR"
+
+
+def test_the_command_has_the_files_of_the_user(tmp_path):
+    """Quoted for a shell; a folder for other results is not that of these."""
+    command = "halbach-fe homogeneity STUDY --posterior POSTERIOR --blocks DIR/b.csv -o DIR"
+    answer = Answer("?", "", "", "", command)
+    assert answer.with_paths({"DIR": None}).command == command
+    found = answer.with_paths({"STUDY": tmp_path / "my study.toml", "DIR": "a b", "POSTERIOR": "p"})
+    assert shlex.split(found.command)[2:] == [
+        str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
+
+
+def test_commands_name_the_posterior_that_was_read(given):
+    """It lies in the folder of the update, not in that of the command which read it."""
+    still = hf.shim(given.updated, given.session, swaps=0, turns=0)
+    assert still.stop == "budget"  # other blocks would fit
+    for found in (homogeneity.answer(hf.homogeneity(given.magnet, given.session,
+                                                    posterior=given.updated)),
+                  shimming.answer(still, given.updated)):
+        assert "DIR/posterior.h5" not in found.command
+        assert "--posterior POSTERIOR" in found.command
+
+
+def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_path):
+    wrong = given.campaign.readings.copy(deep=True)
+    wrong["B_T"][::2] *= 1.02  # which no magnet makes at every second point
+    off = hf.infer(given.magnet, wrong, given.session)
+    assert off.disagreement
+    for name, update, sound in (("right", given.updated, True), ("wrong", off, False)):
+        (folder := tmp_path / name).mkdir()
+        write_inference(update, folder)
+        stored = read_posterior(given.magnet, folder / "posterior.h5")
+        assert stored.disagreement == update.disagreement
+        found = hf.multipoles(given.magnet, given.session, posterior=stored)
+        said = multipoles.answer(found.tables, None, found.disagreement)
+        even = homogeneity.answer(hf.homogeneity(given.magnet, given.session, posterior=update))
+        for one in (said, even):
+            assert one.sound == sound
+            assert one.trust.startswith("Yes: " if sound else "No. ")
+            assert ("diagnose" in one.command) != sound
+    unknown = hf.multipoles(given.magnet, given.session, posterior=dict(stored))
+    assert "which its own page says" in multipoles.answer(unknown.tables, None,
+                                                          unknown.disagreement).trust
+
+
+def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
+    everything = hf.plan(given.magnet, given.session)
+    said = plan.answer(everything)
+    few = int(said.said.split("The first ")[1].split()[0])
+    assert 0 < few < len(everything.points)
+    left = np.exp(-everything.gain / len(everything.parameters))
+    assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
+    assert "tell more" not in said.said
+    assert "plan.points" in said.step
+    assert "more than" not in str(plan.plan_table(everything))
+    assert "plan.points" not in plan.answer(hf.plan(given.magnet, given.session, points=6)).step
+
+
+def test_means_that_are_zero_but_for_the_mesh_are_zero(given):
+    found = hf.tolerance(given.magnet, given.session, draws=50)
+    rows = {row["n"]: row["|c_n| of the mean"] for row in tolerance.quantile_table(found)}
+    assert rows["2"] == "0"  # forbidden by the symmetry
+    assert float(rows["9"]) > 1  # which eight cubes do make

@@ -326,6 +326,15 @@ def test_other_settings_are_said_but_no_doubt(home):
                                  "mesh.block_size_m is 0.02 instead of 0.01."]
 
 
+def test_the_next_command_names_the_folder_of_its_answer(home):
+    """Neither that of the page, nor a word."""
+    unused_finding(home)
+    results(home / "diagnosis", "diagnose", answer=Answer(
+        "What?", "That.", "Yes.", "Update.", "halbach-fe verify DIR/new.toml -o DIR", False))
+    assert found_in(home, "field", "diagnosis").answer.command == (
+        f"halbach-fe verify {home / 'diagnosis' / 'new.toml'} -o DIR")
+
+
 def test_a_better_answer_replaces_one_that_is_not_sound(home):
     """Which the diagnosis of it led to; alone it makes the whole page doubtful."""
     study = home / "study.toml"
@@ -378,13 +387,13 @@ def everywhere(home, text):
 
 @pytest.mark.parametrize("text", PLANTED)
 def test_planted_texts_stay_texts(tmp_path, text):
-    """The page has the elements of one with harmless texts of the same length and folders."""
+    """The page has the elements of one with harmless texts of the same words and folders."""
     def page(word, name):
         (tmp_path / name).mkdir()
         return parts_of(hf.campaign_report([everywhere(tmp_path / name, word)],
                                            tmp_path / name / "all.html"))
 
-    planted, harmless = page(text, "planted"), page(re.sub("[^/]", "x", text), "harmless")
+    planted, harmless = page(text, "planted"), page(re.sub("[^/ ]", "x", text), "harmless")
     assert planted.elements == harmless.elements
     assert len(planted.sources) == 2
     assert "\x1b" not in planted.text
