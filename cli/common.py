@@ -576,6 +576,10 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
         say(sentence)
     if named.command:
         command = named.command
+        blocks = getattr(arguments, "blocks", None)
+        if blocks is not None and "--measurements" in command and not {
+                "--blocks", "NEW_MAP"} & set(command.split()):
+            command = command.replace(" -o ", f" --blocks {shlex.quote(str(blocks))} -o ")
         if posterior is not None:  # which this command has read, not written
             command = command.replace("DIR/posterior.h5", shlex.quote(str(posterior)))
         if output is not None:
