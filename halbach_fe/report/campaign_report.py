@@ -274,10 +274,14 @@ def _date(ended: str) -> str:
 
 
 def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
-    """Return rows of text: which program wrote each folder, and when."""
-    return [{"results": one.label, "command": one.record.command, "ended": _date(one.record.ended),
-             "programs": one.pages[0].said.provenance.get("programs", "")}
-            for one in campaign.chapters]
+    """Return rows of text: which command wrote each folder, and when; with which programs, if
+    these are not those of the page itself.
+    """
+    of = [one.pages[0].said.provenance.get("programs", "") for one in campaign.chapters]
+    others = set(of) - {"", programs()}
+    return [{"results": one.label, "command": one.record.command, "ended": _date(one.record.ended)}
+            | ({"programs": used} if others else {})
+            for one, used in zip(campaign.chapters, of, strict=True)]
 
 
 def _input_rows(campaign: Campaign) -> list[dict[str, str]]:

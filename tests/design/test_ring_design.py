@@ -12,7 +12,8 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
-from halbach_fe.design.ring_catalogue import Catalogue, largest_number
+from halbach_fe.design.ring_catalogue import Catalogue, RingOfBlocks, largest_number
+from halbach_fe.design.ring_catalogue import designed as study_with
 from halbach_fe.design.ring_design import design_rings, task_of
 from halbach_fe.design.ring_search import search
 from halbach_fe.geometry.magnet import build_magnet
@@ -94,6 +95,16 @@ def test_points_that_are_alike_count_once_and_lose_nothing():
     _, weights = REGION.points(47)
     assert len(catalogue.sample.points) < len(weights) / 3
     assert catalogue.sample.weights.sum() == pytest.approx(1)
+
+
+def test_types_of_slots_go_with_the_rings():
+    """Rings of other numbers of blocks have slots that the types of the study do not name."""
+    typed = parse_study(DOCUMENT | {"prior": {"types": {"a": list(range(1, 17))}}})
+    rings = [RingOfBlocks(0.065, 0.01, blocks).table(typed.array.of_ring(1), 0.001 * blocks)
+             for blocks in (16, 17)]
+    assert study_with(typed, rings).prior.types == {}
+    with pytest.raises(StudyError, match="every slot from 1 to 17"):  # the control
+        typed.with_(array=study_with(typed, rings).array)
 
 
 def test_a_least_field_costs_homogeneity(designed, session):
