@@ -8,7 +8,8 @@
 # make study-linear-3d       the paper's linear validation: 576 magnetizations from a map of the bore
 # make study-nonlinear-2d  the paper's non-linear validation: 32 magnetizations in a steel ring
 # make study-quadrupole    an example: solve, infer and diagnose a quadrupole in its yoke
-# make study-mri           the same of an MRI array of cubes
+# make study-cubes         the same of an MRI array of 96 cubes
+# make study-mri           an MRI magnet of 3 009 cubes, from its design to its shim tray
 # make study-emphatic      a stepped dipole of three bores and two layers, from its drawing
 # make study-mri4all       an MRI magnet of 990 cubes, from the table of its design
 # make study-mri-large     an MRI magnet of 4 032 cubes in three layers
@@ -21,7 +22,7 @@
 # Without compiled files beside the sources every process of the tests would compile all again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/run.py -o results/faser
@@ -46,7 +47,7 @@ study-nonlinear-2d: setup
 	.venv/bin/python studies/nonlinear-2d/run.py -o results/nonlinear-2d
 
 # Their campaigns were simulated by `halbach-fe simulate-measurement`; each has something hidden.
-study-quadrupole study-mri: study-%: setup
+study-quadrupole study-cubes: study-%: setup
 	.venv/bin/halbach-fe solve studies/$*/study.toml -o results/$*/field
 	.venv/bin/halbach-fe demagnetization studies/$*/study.toml -o results/$*/demagnetization
 	.venv/bin/halbach-fe infer studies/$*/study.toml --measurements studies/$*/campaign/map.csv \
@@ -92,6 +93,10 @@ results/emphatic/measured/report.html: results/emphatic/registered/study.registe
 results/mri4all/measured/report.html: results/mri4all/registered/registration.html
 	.venv/bin/halbach-fe infer results/mri4all/registered/study.registered.toml -o $(@D) \
 	    --measurements results/mri4all/check/corrected_map.csv
+
+# Everything between the wish and the shimmed magnet, on one page.
+study-mri: setup-test
+	.venv/bin/python studies/mri/run.py -o results/mri
 
 study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity

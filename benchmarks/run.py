@@ -22,6 +22,7 @@ from benchmarks import (
     inference,
     iron3d,
     moments,
+    mri,
     nonlinear,
     real,
     recovery,
@@ -40,10 +41,10 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
          "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
          "campaign_kinds": campaign_kinds.run, "real": real.emphatic, "real_mri": real.mri,
-         "faser": real.faser, "design": design.run, "speed": speed.run}
+         "faser": real.faser, "design": design.run, "mri": mri.run, "speed": speed.run}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
          "campaign_kinds", "real", "real_mri", "faser",
-         "design", "speed")
+         "design", "mri", "speed")
 """Parts that are measured only when they are named: they take long."""
 
 

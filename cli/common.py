@@ -29,7 +29,7 @@ from halbach_fe.cli.streams import say as say
 from halbach_fe.cli.streams import show
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, StudyError, must_be, printable
 from halbach_fe.core.files import InputFile
-from halbach_fe.core.numbers import LIMIT_PPM, LIMIT_UNITS
+from halbach_fe.core.numbers import HIGHEST_ORDER, LIMIT_PPM, LIMIT_UNITS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -44,10 +44,6 @@ if TYPE_CHECKING:
 
 GETDP_LIMIT_S = 3600.0
 """Time limit of each GetDP process, unless another is asked for."""
-
-MAX_ORDER = 100
-"""Highest order of a multipole. Higher orders are negligible in the bore."""
-
 
 MOST_MPI = 1024
 """Largest number of MPI processes of a run."""
@@ -374,10 +370,10 @@ def orders(text: str) -> tuple[int, ...]:
     for part in text.split(","):
         first, dots, last = part.partition("..")
         ends = [first, last if dots else first]
-        if not all(end.isdecimal() and 1 <= int(end[:9]) <= MAX_ORDER for end in ends) or (
+        if not all(end.isdecimal() and 1 <= int(end[:9]) <= HIGHEST_ORDER for end in ends) or (
                 int(ends[0]) > int(ends[1])):
             raise argparse.ArgumentTypeError(
-                f"must be orders from 1 to {MAX_ORDER}, such as 2..10 or 3,5,7, not "
+                f"must be orders from 1 to {HIGHEST_ORDER}, such as 2..10 or 3,5,7, not "
                 f"{printable(text, MAX_QUOTED)!r}")
         numbers.update(range(int(ends[0]), int(ends[1]) + 1))
     return tuple(sorted(numbers))
@@ -569,9 +565,9 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
     """Say the answer of a command, the command to go on with, and where its page is."""
     named = answer.with_paths({
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
-        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None))})
-    output = getattr(arguments, "output", None)
-    posterior = getattr(arguments, "posterior", None)
+        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
+        "POSTERIOR": getattr(arguments, "posterior", None),
+        "DIR": getattr(arguments, "output", None)})
     for sentence in named.sentences:
         say(sentence)
     if named.command:
@@ -580,10 +576,6 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
         if blocks is not None and "--measurements" in command and not {
                 "--blocks", "NEW_MAP"} & set(command.split()):
             command = command.replace(" -o ", f" --blocks {shlex.quote(str(blocks))} -o ")
-        if posterior is not None:  # which this command has read, not written
-            command = command.replace("DIR/posterior.h5", shlex.quote(str(posterior)))
-        if output is not None:
-            command = command.replace("DIR/", f"{shlex.quote(str(output))}/")
         say(f"  {command}")
     if page is not None:
         say(f"Report: {page}")

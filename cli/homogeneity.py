@@ -13,6 +13,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
+from halbach_fe.core.numbers import HIGHEST_DEGREE
 
 if TYPE_CHECKING:
     from halbach_fe.response.homogeneity import Region
@@ -24,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     add_region_arguments(parser)
-    parser.add_argument("--degrees", type=int, choices=range(1, 21), metavar="L",
-                        help="largest degree of the spherical harmonics, 1 to 20 (default: 6)")
+    parser.add_argument("--degrees", type=int, choices=range(1, HIGHEST_DEGREE + 1), metavar="L",
+                        help=f"largest degree of the spherical harmonics, 1 to {HIGHEST_DEGREE} "
+                        "(default: 6)")
 
 
 def add_region_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 
 from halbach_fe.cli import common
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--samples", type=common.positive, metavar="N",
                         help="for iron with an H(B) curve: sample the non-linear posterior by four "
                         "Markov chains of N draws each, instead of linearizing")
-    parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
-                        help="seed of the random numbers of the chains (default: %(default)s)")
+    parser.add_argument("--seed", type=common.positive, metavar="N",
+                        help="seed of the random numbers of the chains of --samples (default: 1)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,6 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise StudyError(
             f"Input --samples must go with iron that has an H(B) curve; study {magnet.name} is "
             "linear, and its posterior has a closed form. Leave it out.")
+    if arguments.seed and not arguments.samples:
+        raise StudyError(must_be(
+            "--seed", "the command line", "beside --samples, whose chains alone are random",
+            "given alone", "Leave it out."))
     if arguments.samples:
         from halbach_fe.inference.mcmc import check_sampling
 
@@ -71,8 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
 
             write_inference(result, arguments.output)  # to be kept even if the chains fail
             with common.workers(arguments) as pool:
-                sampled = sample_posterior(result, session, arguments.samples,
-                                           seed=arguments.seed, say=common.say, mapped=pool.map)
+                sampled = sample_posterior(
+                    result, session, arguments.samples, seed=arguments.seed or 1, say=common.say,
+                    mapped=pool.map)
             result = with_samples(result, sampled)
             write_sampled(sampled, arguments.output)
     if result.response.reused:

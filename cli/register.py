@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from halbach_fe.study.model import Study
 
 
+MOST_ACROSS_M = 10.0
+"""Largest standard deviation of a map's distance from the axis: that of all lengths of a study."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
@@ -44,10 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--most", type=common.positive, metavar="N",
                         help="largest number of poses that are fitted with the blocks (default: "
                         "4, or 8 on a line, of those that the search finds)")
-    parser.add_argument("--across-m", type=common.positive_number, metavar="SD",
+    parser.add_argument("--across-m", metavar="SD",
+                        type=common.within(common.positive_number, 0, MOST_ACROSS_M),
                         help="prior standard deviation of the map's distance from the axis, for a "
                         "map that does not determine it (default: the blocks' outer radius)")
-    parser.add_argument("--turn-rad", type=common.positive_number, metavar="SD",
+    parser.add_argument("--turn-rad", metavar="SD",
+                        type=common.within(common.positive_number, 0, math.pi / 2),
                         help="prior standard deviation of the map's turns from right angles, for a "
                         "map that does not determine them (default: 0.1)")
 

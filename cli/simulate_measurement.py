@@ -15,6 +15,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -38,6 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         default=COIL_SD, metavar="F",
                         help="noise of the measured moment of a block, relative to the moment "
                         "(default: %(default)g)")
+    parser.add_argument("--placed", type=common.input_file, metavar="CSV",
+                        help="assemble the blocks of this seed in the places of this table: the "
+                        "blocks.sorted.csv that halbach-fe sort made of the blocks.csv of an "
+                        "earlier simulation with the same seed")
     parser.add_argument("--hide", type=_effect, action="append", default=[],
                         metavar="NAME[=VALUE,...]",
                         help="hide an effect: the simulated magnet has it, the study does not; "
@@ -71,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     # before the simulation, which may take long; a refused study leaves no folder all the same
     common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
     elements = Elements(arguments.element_size, arguments.order)
+    placed = read_blocks(arguments.placed) if arguments.placed else None
     said = arguments.json
 
     def progress(done: int, total: int) -> None:
@@ -84,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     with common.progress_bar("magpylib") as show:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
-                                     arguments.hide_random, elements, progress)
+                                     arguments.hide_random, elements, progress, placed)
     written = write_campaign(campaign, arguments.output)
     write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,
                         arguments.output, [common.digest(path) for path in written])

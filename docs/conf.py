@@ -35,7 +35,7 @@ exclude_patterns = ["_build"]
 CONTENTS = {
     "Start": ("tutorial", "from-python", "glossary"),
     "Gallery": ("gallery", *(f"gallery/{study}" for study in (
-        "faser", "linear-3d", "nonlinear-2d", "quadrupole", "mri", "mandhala", "mri4all",
+        "faser", "linear-3d", "nonlinear-2d", "quadrupole", "cubes", "mri", "mandhala", "mri4all",
         "mri-large", "emphatic", "hybrid-quadrupole", "sensitivity", "calibration", "diagnosis"))),
     "How to": ("how-to/describe-your-magnet", "how-to/own-geometry", "how-to/own-steel",
                "how-to/own-effect", "how-to/own-map", "how-to/next-magnet", "how-to/many-cores",

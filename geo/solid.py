@@ -7,6 +7,7 @@ pockets takes seconds.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -18,7 +19,8 @@ import gmsh
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeshError
+from halbach_fe.core.errors import MeshError, OutputError
+from halbach_fe.core.files import is_full
 from halbach_fe.geo.session import gmsh_session
 from halbach_fe.geometry.prism import Prism
 
@@ -27,6 +29,9 @@ PER_M = 1e3
 
 SAGITTA_MM = 0.005
 """Largest distance in mm of a triangle from the arc that it replaces."""
+
+STEP_END = "END-ISO-10303-21;"
+"""Last line of a STEP file."""
 
 TRIANGLE = 2
 """Gmsh's element type of triangles."""
@@ -86,13 +91,23 @@ def _prism(prism: Prism) -> int:
 
 
 def _step_text() -> str:
-    """Return the model as the text of a STEP file."""
+    """Return the model as the text of a STEP file.
+
+    Raises
+    ------
+    OutputError
+        If the temporary file cannot be written. Gmsh itself does not notice a full disk.
+    """
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     with TemporaryDirectory(prefix="halbach-fe-") as folder:
         path = Path(folder, "solid.step")
-        with _silent_stdout():
+        with _silent_stdout(), contextlib.suppress(Exception):  # Gmsh raises nothing else
             gmsh.write(str(path))
-        return path.read_text(encoding="ascii")
+        text = path.read_text(encoding="ascii") if path.exists() else ""
+        if not text.rstrip().endswith(STEP_END):
+            reason = os.strerror(errno.ENOSPC if is_full(path.parent) else errno.EFBIG)
+            raise OutputError(f"Cannot write {path}: {reason}; {len(text)} bytes could be written.")
+        return text
 
 
 @contextlib.contextmanager

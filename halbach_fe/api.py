@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.core.numbers import ACROSS, DRAWS, check_number
+from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -289,7 +290,7 @@ def homogeneity(
     True
     """
     known = None if posterior is None else distributions_of(magnet, posterior)
-    check_number("degrees", "homogeneity", degrees, 1, whole=True)
+    check_number("degrees", "homogeneity", degrees, 1, HIGHEST_DEGREE, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     return HomogeneityResult(magnet, model, {
@@ -453,6 +454,8 @@ def sort(
     2
     """
     check_number("seed", "sort", seed, 0, whole=True)
+    if not isinstance(turns, bool):
+        raise StudyError(must_be("turns", "sort", "True or False", turns))
     check_objective(magnet, reference, None, None)
     blocks = sortable(magnet, blocks)  # before the solves, which may take long
     model = objective_of(magnet, reference, session)
@@ -557,9 +560,10 @@ def demagnetization(
     return demagnetization_room.demagnetization_map(magnet, session, across)
 
 
+@typed
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
@@ -578,6 +582,9 @@ def simulate_measurement(
         Number of further hidden effects that are drawn at random.
     progress : callable, optional
         Called with the amount of work that magpylib has done and its total.
+    placed : BlockTable, optional
+        The blocks of an earlier simulation with this seed in the places in which they are to be
+        assembled: the table that `sort` returns.
 
     Returns
     -------
@@ -603,6 +610,9 @@ def simulate_measurement(
     """
     check_number("seed", "simulate_measurement", seed, 0, whole=True)
     check_number("hide_random", "simulate_measurement", hide_random, 0, whole=True)
+    if isinstance(hide, str):
+        raise StudyError(must_be("hide", "simulate_measurement", "a list of texts, one for each "
+                                 "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress)
+                             hide_random=hide_random, progress=progress, placed=placed)

@@ -16,6 +16,16 @@ LIMIT_PPM = 1e-4, 1e6
 """Smallest and largest limit of the rms deviation of a field, in ppm of its mean: from below the
 noise of all instruments to as much as the field itself."""
 
+HIGHEST_ORDER = 100
+"""Highest order of a multipole. Higher orders are negligible in the bore."""
+
+HIGHEST_DEGREE = 20
+"""Highest degree of a spherical harmonic: those in the bore fall with a power of the radius, and
+points on the sphere grow with the square of the degree."""
+
+DENSITY = 1000, 20000
+"""Smallest and largest density of a magnet in kg/m^3; 7.5 is one in g/cm^3."""
+
 DRAWS = 20, 1_000_000
 """Smallest and largest number of magnets that are drawn. Fewer have no quantiles of 5 and 95 %; the
 most determine a share of 1 % to 1 % of itself, and need 1 GB for 100 multipoles."""

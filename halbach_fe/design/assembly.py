@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
@@ -204,6 +205,7 @@ class Assembly(ShownInNotebook):
     left_over: int = 0
 
 
+@typed
 def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
     """Design the holder of a magnet, and plan its assembly.
 

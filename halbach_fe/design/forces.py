@@ -30,6 +30,7 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.exact_block_field import field_of
@@ -176,8 +177,8 @@ def forces(
     Raises
     ------
     StudyError
-        If the study is a cross-section, the iron is not coaxial, or ``order`` does not name every
-        block once.
+        If the study is a cross-section, the iron is not coaxial, a number is out of its range, or
+        ``order`` does not name every block once.
 
     Examples
     --------
@@ -194,6 +195,10 @@ def forces(
         raise StudyError(must_be(
             "`iron`", f"study {magnet.name}", "coaxial tubes or discs, for the forces on blocks",
             "a prism", "Leave the prism out: the forces of the blocks on each other remain."))
+    if density_kg_per_m3 is not None:
+        check_number("density_kg_per_m3", "forces", density_kg_per_m3, *DENSITY)
+    if price_per_kg is not None:
+        check_number("price_per_kg", "forces", price_per_kg, 0)
     names = {block.name: block for block in present_blocks(magnet.blocks)}
     sequence = _sequence(list(names), order, magnet.name)
     blocks, iron = _polarized(magnet, session)

@@ -327,6 +327,8 @@ def _checked_walls(
     names, polygons = [name for name, _ in openings], [prism.polygon for _, prism in openings]
     wall, first, second = thinnest_wall(polygons, names)
     where, hint = f"{names[first]} and {names[second]}", "or leave larger gaps between the blocks"
+    if max(first, second) >= len(names) - len(frame.rods):
+        hint = "or take fewer or thinner rods, or another radius of their circle"
     for name, polygon in zip(names, polygons, strict=True):
         inside = distance_from_origin(polygon) - frame.inner if frame.inner else np.inf
         outside = frame.outer - 2 * holder.mark_m - float(np.hypot(*polygon.T).max())

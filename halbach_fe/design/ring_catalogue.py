@@ -14,6 +14,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.overlaps import overlapping_blocks
 from halbach_fe.response.homogeneity import Region
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.array import Array, Ring
@@ -227,10 +228,13 @@ def tables_of(study: Study, z_m: Floats, chosen: Sequence[Option]) -> list[Ring]
 def designed(study: Study, rings: Sequence[Ring]) -> Study:
     """Return the study with the rings of a design in place of its own.
 
-    The slots of its types are those of the old rings, so that they go.
+    If all blocks are of one type, they are so in the new rings too.
     """
-    return study.with_(array=study.array.with_(ring=tuple(rings), rings=len(rings)),
-                       prior=study.prior.with_(types={}))
+    types, array = study.prior.types, study.array
+    if len(types) == 1:
+        most = max(ring.blocks_per_ring or array.blocks_per_ring for ring in rings)
+        types = {label: tuple(range(1, most + 1)) for label in types}
+    return study.with_(array=array.with_(ring=tuple(rings), rings=len(rings)), prior__types=types)
 
 
 def blocks_of(study: Study, rings: Sequence[Ring]) -> tuple[MagnetBlock, ...]:
@@ -308,7 +312,13 @@ def _rings(study: Study, layer: DesignLayer) -> Iterator[RingOfBlocks]:
                     "`design.layer.radii_m`", f"study {study.name}",
                     "so large that four blocks fit",
                     f"{radius:g} with blocks of {1e3 * size:g} mm"))
-            yield RingOfBlocks(radius, size, blocks)
+            ring = RingOfBlocks(radius, size, blocks)
+            if blocks > most and overlapping_blocks(blocks_of(study, [ring.table(array, 0.0)])):
+                raise StudyError(must_be(
+                    "`design.layer.blocks_per_ring`", f"study {study.name}",
+                    f"so small that blocks of {1e3 * size:g} mm fit at the radius {radius:g} m",
+                    blocks, f"{most} do."))
+            yield ring
 
 
 def fields_with_images(study: Study, ring: RingOfBlocks, z: Floats, points: Floats) -> Floats:

@@ -19,6 +19,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.numbers import check_number
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
 from halbach_fe.design.radius_programs import moved_radii
 from halbach_fe.design.ring_catalogue import (
@@ -143,8 +144,8 @@ def design_rings(
     Raises
     ------
     StudyError
-        If the study has no design, rings cannot stand where they are asked to, or the region
-        reaches into them.
+        If the study has no design, rings cannot stand where they are asked to, the region reaches
+        into them, or ``seed`` is no whole number of at least 0.
 
     Examples
     --------
@@ -156,6 +157,7 @@ def design_rings(
     >>> len(found.best.rings), found.reached
     (2, True)
     """
+    check_number("seed", "design_rings", seed, 0, whole=True)
     region = region or default_region(build_magnet(study))
     catalogue = Catalogue.of(study, region, _density(study))
     design, generator = catalogue.design, np.random.default_rng(seed)

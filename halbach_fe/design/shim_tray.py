@@ -4,9 +4,9 @@ The field of the measured magnet in the region is normal with mean b and a covar
 of shims changes, so that the expected mean square of its deviations is least where that of the mean
 field with the shims is. Each place holds one magnet of the inventory at one of its angles, or none:
 a quadratic function of choices. Starting from an empty tray, the best change of one place is made
-until none helps, then the best change of two places at once, and so on. A shim whose strength is
-uncertain adds the square of its field times that uncertainty, so that weak gains are not bought
-with many magnets.
+until none helps. Then a few places are filled at random and the same is done again, which is undone
+unless it improves the whole (an iterated local search). A shim whose strength is uncertain adds the
+square of its field times that uncertainty, so that weak gains are not bought with many magnets.
 
 The shims' field is that of cuboids in vacuum. What permeable blocks answer to it is left out; it
 counts among the uncertainty that all shims' strengths share. Magnets with iron, which answers more,
@@ -48,8 +48,11 @@ from halbach_fe.study.shim_tray import ShimMagnet, ShimTray
 MOST_CHOICES = 6000
 """Largest number of places times magnets times angles, which limits memory to a gigabyte."""
 
-MOST_PAIRS = 400
-"""Largest number of changes of two places at once."""
+PATIENCE = 500
+"""Number of disturbances in a row without a gain after which the search ends."""
+
+DISTURBED = (2, 3, 4)
+"""Numbers of places that are filled at random before single places are changed again."""
 
 LEAST_GAIN = 1e-9
 """Smallest decrease of the mean square for which a place is changed, relative to that of the empty
@@ -375,16 +378,34 @@ class _Search:
         self.options = len(kinds) // places
         self.place = np.repeat(np.arange(places), self.options)
         self.chosen = np.full(places, EMPTY)
-        self.least = LEAST_GAIN * constant
+        self.square, self.least = constant, LEAST_GAIN * constant
 
     def run(self) -> Ints:
         """Return the choice for every place, (places,)."""
-        for _ in range(MOST_PAIRS):
-            while self._change_one():
-                pass
-            if not self._change_two():
-                break
+        self._descend()
+        generator, idle = np.random.default_rng(0), 0
+        while idle < PATIENCE:
+            idle += 1
+            before = self.chosen.copy(), self.gradient.copy(), self.left.copy(), self.square
+            self._disturb(generator)
+            self._descend()
+            if self.square < before[-1] - self.least:
+                idle = 0
+            else:
+                self.chosen, self.gradient, self.left, self.square = before
         return np.where(self.chosen == EMPTY, EMPTY, self.chosen % self.options)
+
+    def _disturb(self, generator: np.random.Generator) -> None:
+        """Fill a few places with random choices."""
+        count = min(self.places, int(generator.choice(DISTURBED)))
+        for place in generator.choice(self.places, count, replace=False).tolist():
+            allowed = np.flatnonzero(self._allowed() & (self.place == place))
+            self._put(place, int(generator.choice(np.append(allowed, EMPTY))))
+
+    def _descend(self) -> None:
+        """Change single places until none helps."""
+        while self._change_one():
+            pass
 
     def _change_one(self) -> bool:
         """Make the best change of one place; tell whether it helps."""
@@ -419,49 +440,12 @@ class _Search:
         same = (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == self.kinds)
         return np.asarray((self.left[self.kinds] > 0) | same)
 
-    def _change_two(self) -> bool:
-        """Make the best change of two places at once; tell whether it helps."""
-        change, empty = self._changes()
-        # each candidate is a choice, or the emptying of a full place
-        full = np.flatnonzero(self.chosen != EMPTY)
-        place = np.append(self.place, full)
-        delta = np.append(change, empty[full])
-        new = np.append(np.arange(len(change)), np.full(len(full), EMPTY))
-        best = (-self.least, 0, 0)
-        used = np.zeros((len(self.left), len(place)), int)
-        for kind in range(len(self.left)):
-            used[kind] = (new != EMPTY) & (self.kinds[np.maximum(new, 0)] == kind)
-            own = self.chosen[place]
-            used[kind] -= (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == kind)
-        for first in range(len(place)):
-            mixed = self._product(place[first], new[first], place, new)
-            total = delta[first] + delta + 2 * mixed
-            total[(place == place[first])
-                  | (used[:, first, None] + used > self.left[:, None]).any(axis=0)] = np.inf
-            second = int(np.argmin(total))
-            if total[second] < best[0]:
-                best = (float(total[second]), first, second)
-        if best[1] == best[2]:
-            return False
-        for number in best[1:]:
-            self._put(int(place[number]), int(new[number]))
-        return True
-
-    def _product(self, place: int, new: int, places: Ints, others: Ints) -> Floats:
-        """Return the products (n,) of the change of one place with changes of others."""
-        old, olds = self.chosen[place], self.chosen[places]
-        found = np.zeros(len(places))
-        for one, sign in ((new, 1.0), (old, -1.0)):
-            if one == EMPTY:
-                continue
-            row = np.append(self.products[one], 0.0)  # EMPTY is the last element
-            found += sign * (row[others] - row[olds])
-        return found
-
     def _put(self, place: int, choice: int) -> None:
         """Put a choice into a place."""
         for one, sign in ((self.chosen[place], -1), (choice, 1)):
             if one != EMPTY:
+                self.square += (2 * sign * self.gradient[one] + self.products[one, one]
+                                + sign * self.cost[one])
                 self.gradient += sign * self.products[:, one]
                 self.left[self.kinds[one]] -= sign
         self.chosen[place] = choice

@@ -694,7 +694,7 @@ def _add_moves(
             return chosen, "target"
         left = [moves for moves in candidates
                 if sum(move.kind == moves.kind for move in chosen) < budget[moves.kind]]
-        if candidates and not left:
+        if (candidates and not left) or not any(budget.values()):
             return chosen, "budget"
         shortlist = [move for moves in left
                      for move in _best_moves(move_model, placements, moves, chosen, SHORTLIST)]

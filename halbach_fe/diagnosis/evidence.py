@@ -199,12 +199,16 @@ class Marginal:
             product += whitened[part].T @ whitened[part]
         return cls(whitened, linalg.cho_factor(product, lower=True))
 
-    def evidence(self, signatures: Floats, residual: Floats) -> Evidence:
+    def evidence(
+        self, signatures: Floats, residual: Floats, absorbed: Floats | None = None
+    ) -> Evidence:
         """Return the evidence of whitened signatures (n, k) at amplitude 1 for a whitened residual
         (n,).
+
+        ``absorbed`` (m, k + 1) is `absorbed` of signatures and residual, if it is known already.
         """
         columns = np.column_stack([signatures, residual])
-        half = self.absorbed(columns)
+        half = self.absorbed(columns) if absorbed is None else absorbed
         total = -half.T @ half
         for part in _rows(len(columns)):
             total += columns[part].T @ columns[part]

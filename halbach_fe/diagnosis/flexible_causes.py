@@ -36,6 +36,11 @@ ActsOn = Literal["field", "readings", "gains", "positions"]
 SIZES = np.geomspace(0.1, 1000, 17)
 """Candidate rms sizes, in units of the noise of a reading."""
 
+NEGLIGIBLE = 1e-12
+"""Largest information of the readings about a term, in units of the inverse of its prior variance
+at the largest size, for which it is left out: a residual of a thousand standard deviations along it
+would change the log evidence by less than 1e-6."""
+
 SLENDER = 1e-3
 """Width of a line relative to its length, up to which it is one."""
 
@@ -146,8 +151,13 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
         used = np.flatnonzero(np.isin(family.axis, axes)) if axes else np.arange(len(family.axis))
         information = evidence.information[np.ix_(used, used)]
         for spectrum, smooth in zip(family.spectra[:, used], family.smooth, strict=True):
-            values, vectors = np.linalg.eigh(spectrum[:, None] * information * spectrum)
-            score = vectors.T @ (spectrum * evidence.score[used])
+            # terms that are too small to change anything cost most of the time
+            kept = np.flatnonzero(
+                (SIZES[-1] * spectrum)**2 * np.diag(information) > NEGLIGIBLE)
+            weights = spectrum[kept]
+            values, vectors = np.linalg.eigh(
+                weights[:, None] * information[np.ix_(kept, kept)] * weights)
+            score = vectors.T @ (weights * evidence.score[used[kept]])
             grown = SIZES[:, None]**2 * np.maximum(values, 0.0)
             shrunk = SIZES[:, None]**2 * score / (1 + grown)
             some = (shrunk @ score - np.log1p(grown).sum(axis=1)) / 2
@@ -156,7 +166,7 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
             if best is None or some[top] > best[0]:
                 deviations, mean = np.zeros(len(family.axis)), np.zeros(len(family.axis))
                 deviations[used] = SIZES[top] * spectrum
-                mean[used] = spectrum * (vectors @ shrunk[top])
+                mean[used[kept]] = weights * (vectors @ shrunk[top])
                 best = float(some[top]), axes, smooth, deviations, mean
     assert best is not None
     return Fitted(float(special.logsumexp(factors) - np.log(len(factors))), *best)

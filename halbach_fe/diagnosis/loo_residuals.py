@@ -14,6 +14,9 @@ from halbach_fe.diagnosis.evidence import Marginal
 DISCOVERIES = 0.01
 """False discovery rate among the groups that are reported to disagree with the model."""
 
+SINGULAR = 1e-10
+"""Smallest eigenvalue of a matrix, relative to its largest one, that is more than rounding."""
+
 
 @dataclass(frozen=True)
 class ResidualGroup:
@@ -62,9 +65,21 @@ def _solve_less_product(half: Floats, right: Floats) -> Floats:
     """
     rows, columns = half.shape
     if rows <= columns:
-        return np.asarray(np.linalg.lstsq(np.eye(rows) - half @ half.T, right, rcond=1e-10)[0])
-    inner = np.eye(columns) - half.T @ half
-    return np.asarray(right + half @ np.linalg.lstsq(inner, half.T @ right, rcond=1e-10)[0])
+        return _solve_semidefinite(np.eye(rows) - half @ half.T, right)
+    return right + half @ _solve_semidefinite(np.eye(columns) - half.T @ half, half.T @ right)
+
+
+def _solve_semidefinite(matrix: Floats, right: Floats) -> Floats:
+    """Return the solution x (n,) of a positive semidefinite system, the smallest of several."""
+    try:
+        factor = linalg.cho_factor(matrix, lower=True)
+    except linalg.LinAlgError:
+        pass
+    else:
+        size = np.diag(factor[0])
+        if size.min()**2 > SINGULAR * size.max()**2:
+            return np.asarray(linalg.cho_solve(factor, right))
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=SINGULAR)[0])
 
 
 def residual_groups(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -304,10 +305,17 @@ def _improved_place(
         None if no place explains anything.
     """
     size, scale = len(effect.parameters), amplitude_scale(effect)
-    fits = [marginal.evidence(np.hstack([fixed, part]), residual).fit(
-        range(fixed.shape[1] + size)) for part in columns]
+    # one product with the response for all places, instead of one for each
+    shared, own = fixed.shape[1], np.cumsum([0, *(part.shape[1] for part in columns)])
+    absorbed = marginal.absorbed(np.hstack([fixed, residual[:, None], *columns]))
+    parts = [absorbed[:, shared + 1 + first:shared + 1 + last]
+             for first, last in pairwise(own)]
+    fits = [marginal.evidence(np.hstack([fixed, part]), residual, np.hstack([
+        absorbed[:, :shared], half, absorbed[:, shared:shared + 1]])).fit(range(shared + size))
+            for part, half in zip(columns, parts, strict=True)]
     best = int(np.argmax([fit.log_evidence for fit in fits]))
-    alone = marginal.evidence(fixed, residual).fit(range(fixed.shape[1])).log_evidence
+    alone = marginal.evidence(fixed, residual, absorbed[:, :shared + 1]).fit(
+        range(shared)).log_evidence
     if fits[best].log_evidence - alone < DETECTION_LOG_ODDS:
         return None
     values = np.zeros(len(scale))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
@@ -277,6 +278,7 @@ WEAKEST_T = 1e-6
 """Smallest remanence in T of a magnet's strongest block; results are relative to it."""
 
 
+@typed
 def build_magnet(study: Study) -> Magnet:
     """Build the magnet that a study describes.
 

@@ -308,9 +308,13 @@ def types_of(magnet: Magnet) -> dict[str, tuple[int, ...]]:
 
 
 def with_types(magnet: Magnet, table: BlockTable) -> BlockTable:
-    """Return a table with the types that follow from the places of its blocks."""
-    if all(table.type):
-        return table
+    """Return a table with the types that follow from the places of its blocks.
+
+    Raises
+    ------
+    MeasurementError
+        If the table is not valid any more, as its arrays were changed after it was read.
+    """
     label_of = {(magnet.blocks[number].ring, magnet.blocks[number].slot): label
                 for label, members in types_of(magnet).items() for number in members}
     return replace(table, type=tuple(own or label_of.get(place, "") for own, place in zip(

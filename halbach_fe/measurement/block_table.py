@@ -182,6 +182,10 @@ def _check(table: BlockTable) -> None:
     """Raise MeasurementError for the first invalid entry of a table."""
     if not len(table):
         raise MeasurementError(must_be("content", table.source, "at least one block", "none"))
+    for name in ("type", "ring", "slot", "moment", "sigma", "volume", "temperature"):
+        wanted = (len(table), 3) if name == "moment" else (len(table),)
+        if (found := np.shape(getattr(table, name))) != wanted:
+            raise MeasurementError(must_be(name, table.source, f"of the shape {wanted}", found))
 
     def refuse(number: int, what: str, expected: str, received: object, hint: str = "") -> None:
         raise MeasurementError(must_be(f"{what} of block {table.serial[number]}", table.source,

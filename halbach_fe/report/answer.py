@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,9 @@ class Answer:
     step : str
         What to do next.
     command : str
-        The command for that, in which STUDY, MAP, BLOCKS and DIR stand for files and folders of the
-        user; empty if no command does it.
+        The command for that, in which STUDY, MAP, BLOCKS and POSTERIOR stand for files of the user,
+        ``DIR/`` for the folder of this command, and a single DIR for another one; empty if no
+        command does it.
     sound : bool
         Whether the answer may be used as it stands. Otherwise its box is a warning.
     """
@@ -42,9 +44,14 @@ class Answer:
 
     def with_paths(self, paths: Mapping[str, object]) -> Answer:
         """Return the answer with the paths that are known in place of the words of its command."""
-        words = [shlex.quote(str(paths[word])) if paths.get(word) is not None else word
-                 for word in self.command.split(" ")]
-        return replace(self, command=" ".join(words))
+        def known(word: str) -> str:
+            name, slash, rest = word.partition("/")
+            path = paths.get(name)
+            if path is None or (name == "DIR") != bool(slash):
+                return word
+            return shlex.quote(str(Path(str(path), rest)))
+
+        return replace(self, command=" ".join(map(known, self.command.split(" "))))
 
 
 def agreement(disagreement: str | None) -> str:

@@ -151,7 +151,9 @@ def drawing(sheet: Sheet, prefix: str) -> Drawing:
     outside = [number for number, layer in enumerate(layers) if layer == max(layers)]
     pitch = 2 * np.pi * radius / len(outside)
     size = min(0.8 * pitch, LARGEST * radius)
-    small = min(0.8 * 2 * np.pi * 0.9 * bore / max(layers.count(0), 1), size)
+    # texts in the bore come nearest to one another at their inner ends
+    pitch_over_radius = 0.8 * 2 * np.pi / max(layers.count(0), 1)
+    small = min(pitch_over_radius * 0.97 * bore / (1 + pitch_over_radius * LETTER * longest), size)
     drawn = []
     for number, (one, polygon, label) in enumerate(zip(
             sheet.blocks, outlines, labels, strict=True)):

@@ -25,9 +25,9 @@ from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, Picture
 from halbach_fe.study.differences import differences
 from halbach_fe.study.model import Study, magnet_description
 
-ORDER = ("design", "solve", "verify", "demagnetization", "forces", "simulate-measurement", "check",
-         "register", "prior", "infer", "multipoles", "homogeneity", "diagnose", "shim",
-         "shim-tray", "sort", "tolerance", "plan", "cad")
+ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", "plan", "sort",
+         "cad", "simulate-measurement", "check", "register", "prior", "infer", "multipoles",
+         "homogeneity", "diagnose", "shim", "shim-tray")
 """Commands in the order in which data flow; others come last."""
 
 TELLING = {"solve": "field.png", "diagnose": "diagnosis_profile.png", "shim": "shim_moves.png",

@@ -111,10 +111,10 @@ class Campaign:
         """Return the answer whose next step is the one to take.
 
         It is that of an answer which may not be used; or else of the last one about the measured
-        magnet, if there is any.
+        magnet, if there is any. Its command names the folder of that answer.
         """
-        left = [(chapter, answer) for chapter, _, answer in self.answered
-                if self.continued(chapter, answer) is None]
+        left = [(chapter, answer.with_paths({"DIR": chapter.folder}))
+                for chapter, _, answer in self.answered if self.continued(chapter, answer) is None]
         unsound = [self._with_what_was_found(chapter, answer) for chapter, answer in left
                    if not answer.sound and self.replaced(chapter) is None]
         measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]
@@ -160,8 +160,9 @@ def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> 
         path for path in map(as_path, folders) if output is None
         or path.resolve() != output.resolve()]
     if not paths:
-        raise OutputError(must_be("folders", "the report", "a list of folders of results",
-                                  repr(folders)))
+        raise OutputError(must_be(
+            "folders", "the report", "a list of folders of results other than its own",
+            repr(folders) if isinstance(folders, str) else ", ".join(map(str, folders)) or "none"))
     return Campaign(tuple(read_chapters(paths)))
 
 

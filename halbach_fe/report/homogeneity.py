@@ -59,7 +59,7 @@ def answer(found: HomogeneityResult) -> Answer:
             question, f"{text} (with a probability of 95 %, {low} to {high} ppm rms).",
             f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior DIR/posterior.h5 -o DIR", small)
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
     return Answer(
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
@@ -152,8 +152,8 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
 def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
     """Draw the deviation of |B| in three planes through the centre, in ppm.
 
-    The colours span what lies in the ellipse within each slice: beyond it, in the corners, the
-    field of a homogeneous magnet deviates many times more.
+    Colours and lines are of what lies in the ellipse within each slice: beyond it, in the corners,
+    the field of a homogeneous magnet deviates many times more.
     """
     figure = Figure(figsize=(8.4, 3.0), layout="constrained")
     deviations = [PPM * (each.size_T / mean_T - 1) for each in slices]
@@ -167,7 +167,8 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
         names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
                       extend="both")
-        lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m, deviation, round_levels,
+        lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
+                             np.where(within, deviation, np.nan), round_levels,
                              colors="black", linewidths=0.5)
         axis.clabel(lines, fmt=ppm, fontsize=7)
         axis.set_aspect("equal")

@@ -48,7 +48,7 @@ def _answer(found: FilledTray) -> Answer:
             f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(tray),
             "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
             "comes from: its harmonics tell.",
-            "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
+            "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
     text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
@@ -60,7 +60,7 @@ def _answer(found: FilledTray) -> Answer:
         return Answer(
             question, f"{text} That is hardly less.", _ranges(tray),
             "Take larger magnets or more places, or look for what the deviation comes from: its "
-            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior DIR/posterior.h5 -o DIR")
+            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     if after > 2 * found.after.rms_ppm:
         return Answer(
             question, text, "What remains is mostly what the measurement and the strength of the "

@@ -177,7 +177,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
-             f"halbach-fe {see} STUDY --posterior DIR/posterior.h5 -o DIR")))
+             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")))
 
 
 @own_style

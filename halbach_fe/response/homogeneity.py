@@ -109,6 +109,12 @@ class Region:
         if min(self.half_axes_m) <= 0:
             raise StudyError(must_be("half_axes_m", "a region", "above 0",
                                      f"{min(self.half_axes_m):g}"))
+        alike = {"sphere": 3, "cylinder": 2, "ellipsoid": 1}[self.shape]
+        if len(set(self.half_axes_m[:alike])) > 1:
+            raise StudyError(must_be(
+                "half_axes_m", f"a region of the shape {self.shape}",
+                f"equal along {'x, y and z' if alike == 3 else 'x and y'}",
+                ", ".join(f"{value:g}" for value in self.half_axes_m), "Or is it an ellipsoid?"))
 
     @classmethod
     def sphere(

@@ -14,7 +14,7 @@ Laplace equation again. Alternatively, they are the coefficients of B_r on the c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
@@ -89,6 +90,17 @@ class MultipoleReference:
     radius_m: float | None = None
     orders: tuple[int, ...] = DEFAULT_ORDERS
     z_m: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are none, and orders that no multipole has; StudyError."""
+        for name, value in (("radius_m", self.radius_m), ("z_m", self.z_m)):
+            if value is not None:
+                check_number(name, "MultipoleReference", value)
+        if isinstance(self.orders, str) or not isinstance(self.orders, Collection):
+            raise StudyError(must_be("orders", "MultipoleReference", "a tuple of whole numbers",
+                                     f"a {type(self.orders).__name__}"))
+        for order in self.orders:
+            check_number("orders", "MultipoleReference", order, 1, HIGHEST_ORDER, whole=True)
 
 
 @dataclass(frozen=True)

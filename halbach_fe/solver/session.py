@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.solver import getdp as runner
@@ -168,10 +169,11 @@ def alone(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function with an argument ``session``, in whose folder nobody else may write.
 
     A second run in the same folder raises OutputError until the function has returned. Functions
-    may call each other.
+    may call each other. Arguments of other classes than its own are refused, see `typed`.
     """
     signature = inspect.signature(function)
 
+    @typed
     @functools.wraps(function)
     def locked(*arguments: P.args, **options: P.kwargs) -> R:
         session = signature.bind(*arguments, **options).arguments["session"]

@@ -26,34 +26,38 @@ class DrawnMagnet:
     ----------
     single : TrueMagnet
         The blocks before they are mounted.
-    mounted : TrueMagnet
-        The same blocks in the magnet, with the errors of their mounting.
+    turns : tuple of Rotation
+        Error of the mounting in each place, along the magnet's axes.
     common : float
         Deviation that all magnetizations have in common, relative to the nominal.
     """
 
     single: TrueMagnet
-    mounted: TrueMagnet
+    turns: tuple[Rotation, ...]
     common: float
+
+    @property
+    def mounted(self) -> TrueMagnet:
+        """The blocks in the magnet, with the errors of their mounting."""
+        return replace(self.single, bodies=tuple(
+            body.with_magnetization(turn.apply(body.magnetization))
+            for body, turn in zip(self.single.bodies, self.turns, strict=True)))
 
 
 def draw_magnet(study: Study, nominal: TrueMagnet, generator: np.random.Generator) -> DrawnMagnet:
     """Draw the magnetizations of all blocks, and the errors of their mounting, from the prior."""
     prior = study.prior
     common = float(prior.common_mode_sd * generator.standard_normal())
-    single, mounted = [], []
+    single, turns = [], []
     for body in nominal.bodies:
         deviation = generator.standard_normal(3) * [
             prior.magnitude_sd, *2 * [np.radians(prior.direction_sd_deg)]]
         turn = np.radians(prior.mounting_sd_deg) * generator.standard_normal(3)
         if study.dimension == 2:
             deviation[2] = turn[0] = turn[1] = 0.0
-        block = _deviating(body, deviation + np.array([common, 0.0, 0.0]))
-        single.append(block)
-        mounted.append(block.with_magnetization(
-            Rotation.from_rotvec(turn).apply(block.magnetization)))
-    return DrawnMagnet(replace(nominal, bodies=tuple(single)),
-                       replace(nominal, bodies=tuple(mounted)), common)
+        single.append(_deviating(body, deviation + np.array([common, 0.0, 0.0])))
+        turns.append(Rotation.from_rotvec(turn))
+    return DrawnMagnet(replace(nominal, bodies=tuple(single)), tuple(turns), common)
 
 
 def _deviating(body: Body, deviation: Floats) -> Body:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,7 @@ from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import Progress, no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
 from halbach_fe.synthetic.optional_packages import version_of
+from halbach_fe.synthetic.placed_blocks import in_places
 from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
@@ -101,6 +102,7 @@ class SimulatedCampaign(ShownInNotebook):
 def simulate_campaign(
     study: Study, seed: int, coil_sd: float = COIL_SD, hide: Sequence[RequestedEffect] = (),
     hide_random: int = 0, elements: Elements | None = None, progress: Progress = no_progress,
+    placed: BlockTable | None = None,
 ) -> SimulatedCampaign:
     """Draw a magnet, measure it, and describe the truth.
 
@@ -120,9 +122,14 @@ def simulate_campaign(
         Resolution of NGSolve's mesh.
     progress : callable
         Function that receives the amount of work that magpylib has done and its total.
+    placed : BlockTable, optional
+        The blocks of this seed in other places, in which they are then assembled: what `sort` made
+        of the table of an earlier simulation. Its places become those of the campaign's table.
 
     Raises
     ------
+    MeasurementError
+        If ``placed`` is not a table of these blocks, or leaves places empty.
     StudyError
         If the study does not state the noise of its readings, measures at a point inside a
         material, or cannot have one of the effects, or if its magnet cannot be simulated.
@@ -145,16 +152,17 @@ def simulate_campaign(
             "Leave [instrument] out. What the mapper does wrong is told by --hide."))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
-    # separate streams of random numbers: a further draw from one does not change the others
-    blocks, coil, noise, effects, faults = (
-        np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5))
+    blocks, coil, noise, effects, faults = _streams(seed)
     nominal = magnet_of(study)
     site = site_of(study, nominal)
     hidden = choose_effects(site, hide, hide_random, effects)
     drawn = draw_magnet(study, nominal, blocks)
     table, calibration = coil_table(study, nominal, with_effects(
         drawn.single, site, hidden, single=True), coil_sd, coil)
-    magnet, instrument = with_effects(drawn.mounted, site, hidden), instrument_with(site, hidden)
+    if placed is not None:
+        drawn, table = replace(drawn, single=in_places(drawn.single, table, placed)), placed
+    mounted = drawn.mounted
+    magnet, instrument = with_effects(mounted, site, hidden), instrument_with(site, hidden)
     nominal_places = np.vstack([points, others])
     check_apart(study.external, nominal_places, study.name)
     offsets = real_places(study, nominal_places, noise) - nominal_places
@@ -166,9 +174,9 @@ def simulate_campaign(
         "common_mode": drawn.common, "coil_calibration": calibration, "coil_sd": coil_sd,
         "noise_free": {"largest_T": float(np.linalg.norm(readings, axis=1).max()),
                        "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
-        "blocks": magnetizations(drawn.mounted),
+        "blocks": magnetizations(mounted),
     }
-    if magnet.bodies != drawn.mounted.bodies:
+    if magnet.bodies != mounted.bodies:
         truth["blocks_with_effects"] = magnetizations(magnet)
     seal = {"source": "synthetic", "study": study.name, "halbach_fe": version_of("halbach-fe"),
             "truth_sha256": hashlib.sha256(truth_text(truth).encode()).hexdigest()}
@@ -178,6 +186,21 @@ def simulate_campaign(
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
     return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact)
+
+
+def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:
+    """Return the measured single blocks of `simulate_campaign`, without hidden effects or a map."""
+    blocks, coil, *_ = _streams(seed)
+    nominal = magnet_of(study)
+    return coil_table(study, nominal, draw_magnet(study, nominal, blocks).single, coil_sd, coil)[0]
+
+
+def _streams(seed: int) -> list[np.random.Generator]:
+    """Return separate streams of random numbers for blocks, coil, noise, effects and instrument.
+
+    A further draw from one does not change the others.
+    """
+    return [np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(5)]
 
 
 def measured(

@@ -161,6 +161,9 @@ def test_every_result_has_a_command():
     assert {command for command, _ in OWNERS.values()} <= set(VERBS)
 
 
+RESULT, TABLE = object.__new__(hf.InferenceResult), object.__new__(hf.BlockTable)
+"""Nothing is asked of them, as a number is wrong."""
+
 SEEDS = "seed .* a whole number of at least 0; instead received -1"
 
 
@@ -169,19 +172,55 @@ SEEDS = "seed .* a whole number of at least 0; instead received -1"
     (lambda magnet, session: hf.plan(magnet, session, points=0), "points .* at least 1"),
     (lambda magnet, session: hf.tolerance(magnet, session, draws=0), "draws .* from 20 to 1e.06"),
     (lambda magnet, session: hf.tolerance(magnet, session, limit_units=-1), "from 1e-06 to 1e.06"),
-    (lambda magnet, session: hf.shim(None, session, swaps=-1), "swaps .* at least 0"),
-    (lambda magnet, session: hf.shim(None, session, swaps=1.5), "a whole number .* received 1.5"),
-    (lambda magnet, session: hf.shim(None, session, turns=True), "turns .* a whole number"),
+    (lambda magnet, session: hf.shim(RESULT, session, swaps=-1), "swaps .* at least 0"),
+    (lambda magnet, session: hf.shim(RESULT, session, swaps=1.5), "a whole number .* received 1.5"),
+    (lambda magnet, session: hf.shim(RESULT, session, turns=True), "turns .* a whole number"),
     (lambda magnet, session: hf.demagnetization(magnet, session, across=0), "from 2 to 100"),
     (lambda magnet, session: hf.simulate_measurement(magnet.study, seed=-1), SEEDS),
-    (lambda magnet, session: hf.sort(magnet, None, session, seed=-1), SEEDS),
+    (lambda magnet, session: hf.sort(magnet, TABLE, session, seed=-1), SEEDS),
     (lambda magnet, session: hf.Region.sphere(float("nan")), "half_axes_m .* received nan"),
     (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received 0.1"),
     (lambda magnet, session: hf.Region.sphere(-0.1), "half_axes_m .* above 0"),
     (lambda magnet, session: hf.Region("cube", (0.01,) * 3), "one of sphere"),
-    (lambda magnet, session: hf.Region("cylinder", (0.01, 0.01)), "three numbers")])
+    (lambda magnet, session: hf.Region("cylinder", (0.01, 0.01)), "three numbers"),
+    (lambda magnet, session: hf.Region("sphere", (0.01, 0.02, 0.01)), "equal along x, y and z"),
+    (lambda magnet, session: hf.Region("cylinder", (0.01, 0.02, 0.03)), "an ellipsoid"),
+    (lambda magnet, session: hf.homogeneity(magnet, session, degrees=1000), "from 1 to 20"),
+    (lambda magnet, session: hf.MultipoleReference(0.02, (0, 1)), "orders .* from 1 to 100"),
+    (lambda magnet, session: hf.MultipoleReference(0.02, (1.5,)), "orders .* received 1.5"),
+    (lambda magnet, session: hf.MultipoleReference(0.02, (2, 3000)), "orders .* from 1 to 100"),
+    (lambda magnet, session: hf.MultipoleReference(0.02, "2..4"), "orders .* a tuple of"),
+    (lambda magnet, session: hf.MultipoleReference(float("nan")), "radius_m .* finite"),
+    (lambda magnet, session: hf.design_rings(magnet.study, session, seed=-1), SEEDS),
+    (lambda magnet, session: hf.sort(magnet, TABLE, session, turns="no"), "True or False"),
+    (lambda magnet, session: hf.simulate_measurement(magnet.study, hide="gain_x"), "a list")])
 def test_numbers_out_of_range(dipole, session, use, said):
     """They are refused before anything is solved, as on the command line."""
+    with pytest.raises(hf.HalbachError, match=said):
+        use(hf.build_magnet(dipole()), session)
+
+
+def test_forces_of_no_magnet(short_dipole, session):
+    magnet = hf.build_magnet(short_dipole(array__recoil_permeability=1.0))
+    for options, said in (({"density_kg_per_m3": 7.5}, "from 1000 to 20000"),
+                          ({"price_per_kg": float("nan")}, "price_per_kg .* finite")):
+        with pytest.raises(hf.HalbachError, match=said):
+            hf.forces(magnet, session, **options)
+
+
+@pytest.mark.parametrize(("use", "said"), [
+    (lambda magnet, session: hf.build_magnet("study.toml"), "a Study; .* by hf.read_study"),
+    (lambda magnet, session: hf.solve(session, magnet), "magnet of solve must be a Magnet"),
+    (lambda magnet, session: hf.solve(magnet.study, session), "hf.build_magnet makes one"),
+    (lambda magnet, session: hf.infer(magnet, None, "results"), "hf.Session.open makes one"),
+    (lambda magnet, session: hf.infer(magnet, None, session, "b.csv"), "by hf.read_blocks"),
+    (lambda magnet, session: hf.sort(magnet, "b.csv", session), "by hf.read_blocks"),
+    (lambda magnet, session: hf.cad(magnet, "b.csv"), "by hf.read_blocks"),
+    (lambda magnet, session: hf.shim(magnet, session), "result of shim must be an InferenceRes"),
+    (lambda magnet, session: hf.multipoles(magnet, session, 0.02), "a MultipoleReference; "),
+    (lambda magnet, session: hf.homogeneity(magnet, session, region="sphere"), "a Region"),
+    (lambda magnet, session: hf.simulate_measurement(magnet), "study of simulate_measurement")])
+def test_objects_of_another_kind(dipole, session, use, said):
     with pytest.raises(hf.HalbachError, match=said):
         use(hf.build_magnet(dipole()), session)
 

@@ -9,6 +9,7 @@ import argparse
 import os
 import shutil
 
+import gmsh
 import pytest
 import tomlkit
 
@@ -74,6 +75,8 @@ def test_a_stock_of_blocks_in_the_magnet(campaign, tmp_path, capsys, kind):
     (["simulate-measurement", "{study}", "--order", "99"], "from 1 to 10, not 99"),
     (["simulate-measurement", "{study}", "--element-size", "1e-9"], "from 1e-05 to 10"),
     (["forces", "{study}", "--density-kg-per-m3", "7.5"], "7.5 g/cm^3 are 7500 kg/m^3"),
+    (["register", "{study}", "--turn-rad", "5"], "from 0 to 1.5708, not 5"),
+    (["register", "{study}", "--across-m", "50"], "from 0 to 10, not 50"),
     (["import-map", "{measured}", "--at", "x=0,x=1"], "must give x once"),
     (["import-map", "{measured}", "--at", "x=nan"], "must be a finite number, not 'nan'")])
 def test_command_lines(campaign, tmp_path, capsys, arguments, said):
@@ -91,6 +94,7 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
     (["homogeneity", "{study}", "--sphere-m", "0.3"], 3, "contains blocks"),
     (["homogeneity", "{study}", "--sphere-m", "20"], 3, "in millimetres"),
     (["homogeneity", "{study}", "--sphere-m", "1e-300"], 3, "at least 1e-06 m"),
+    (["infer", "{study}", "--measurements", "{measured}", "--seed", "2"], 3, "beside --samples"),
     (["forces", "{study}", "--order", "{measured}"], 4, "with the column block"),
     (["multipoles", "{study}", "--posterior", "{measured}"], 4, "a posterior.h5 that halbach-fe"),
     (["multipoles", "{study}", "--posterior", "nope.h5"], 4, "received No such file or directory"),
@@ -381,3 +385,62 @@ def test_an_endless_file(monkeypatch):
     with pytest.raises(OSError, match="A pipe or device of more than"):
         InputFile("/dev/zero").read_bytes()
     assert InputFile("/dev/null").read_bytes() == b""
+
+
+def test_rods_that_leave_no_wall(campaign, tmp_path, capsys):
+    """It is not the pockets that are too near to each other."""
+    study, _, _ = campaign
+    study.write_text(tomlkit.dumps(changed(BASE, holder={
+        "clearance_m": 0.0, "rods": {"count": 100, "diameter_m": 0.02}})))
+    code, sentence = refused(["cad", study, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert "between rod 1 and rod 2" in sentence
+    assert "take fewer or thinner rods" in sentence
+
+
+def test_a_folder_is_refused_before_the_check(tmp_path, capsys, monkeypatch):
+    """Which may take a minute."""
+    file = tmp_path / "map.csv"
+    file.write_text("x_m,y_m,z_m,Bx_T,By_T,Bz_T\n0,0,0,1,0,0\n")
+    monkeypatch.setattr("halbach_fe.measurement.map_check.check_map", None)
+    code, sentence = refused(["check", file, "-o", file], capsys)
+    assert code == 8
+    assert "Cannot make folder" in sentence
+
+
+def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
+    """The search would choose rings that cannot be built."""
+    study = tmp_path / "study.toml"
+    layer = {"radii_m": [0.06, 0.065], "sizes_m": [0.02], "blocks_per_ring": [8, 20]}
+    study.write_text(tomlkit.dumps(changed(
+        BASE, array__block={"shape": "cuboid", "width_m": 0.02},
+        design={"rings": 2, "spacing_m": 0.03, "layer": [layer]})))
+    code, sentence = refused(["design", study, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert "`design.layer.blocks_per_ring`" in sentence
+    assert "at the radius 0.065 m; instead received 20. 17 do." in sentence
+
+
+def test_a_report_on_its_own_folder(tmp_path, capsys):
+    """Which wildcards may name; alone it is nothing to report on."""
+    code, sentence = refused(["report", tmp_path, "-o", tmp_path], capsys)
+    assert code == 8
+    assert f"other than its own; instead received {tmp_path}." in sentence
+
+
+@pytest.mark.parametrize("kept", [0, 3000])
+def test_no_space_for_a_solid(campaign, tmp_path, capsys, monkeypatch, kept):
+    """Gmsh blames nothing, or the file; the radii of the study are right."""
+    write = gmsh.write
+
+    def cut(name):
+        write(name)
+        os.truncate(name, kept)
+
+    assert main(["cad", str(campaign[0]), "-o", str(tmp_path / "whole")]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr("gmsh.write", cut)
+    code, sentence = refused(["cad", campaign[0], "-o", tmp_path / "out"], capsys)
+    assert code == 8
+    assert f"File too large; {kept} bytes could be written" in sentence
+    assert not (tmp_path / "out" / "blocks.step").exists()

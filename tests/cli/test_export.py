@@ -20,7 +20,7 @@ observation = { quantity = "flux_density", positions = { kind = "points", points
 """
 
 
-@pytest.mark.parametrize("study", ["mri", "quadrupole"])
+@pytest.mark.parametrize("study", ["cubes", "quadrupole"])
 @pytest.mark.parametrize("name", ["blocks.csv", "blocks.h5"])
 def test_blocks_of_a_study(tmp_path, capsys, study, name):
     """The shipped studies, exported and read back, have the same field in vacuum."""
@@ -41,7 +41,7 @@ def test_blocks_of_a_study(tmp_path, capsys, study, name):
 
 
 def test_refusals(tmp_path, capsys):
-    study, map_ = ROOT / "studies" / "mri" / "study.toml", tmp_path / "map.csv"
+    study, map_ = ROOT / "studies" / "cubes" / "study.toml", tmp_path / "map.csv"
     code, sentence = refused(["export", study, "--format", "blocks", "-o", tmp_path / "b.xls"],
                              capsys)
     assert (code, ".csv, .h5" in sentence) == (8, True)

@@ -12,8 +12,8 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
-from halbach_fe.design.ring_catalogue import Catalogue, RingOfBlocks, largest_number
-from halbach_fe.design.ring_catalogue import designed as study_with
+from halbach_fe.design import ring_catalogue
+from halbach_fe.design.ring_catalogue import Catalogue, largest_number
 from halbach_fe.design.ring_design import design_rings, task_of
 from halbach_fe.design.ring_search import search
 from halbach_fe.geometry.magnet import build_magnet
@@ -22,6 +22,7 @@ from halbach_fe.report.result_files import write_report
 from halbach_fe.report.ring_design import STUDY_FILE, answer
 from halbach_fe.response.homogeneity import PPM, Region
 from halbach_fe.solver.session import Session
+from halbach_fe.study.array import Ring
 from halbach_fe.study.reader import parse_study, read_study
 
 REGION = Region.sphere(0.025)
@@ -95,16 +96,6 @@ def test_points_that_are_alike_count_once_and_lose_nothing():
     _, weights = REGION.points(47)
     assert len(catalogue.sample.points) < len(weights) / 3
     assert catalogue.sample.weights.sum() == pytest.approx(1)
-
-
-def test_types_of_slots_go_with_the_rings():
-    """Rings of other numbers of blocks have slots that the types of the study do not name."""
-    typed = parse_study(DOCUMENT | {"prior": {"types": {"a": list(range(1, 17))}}})
-    rings = [RingOfBlocks(0.065, 0.01, blocks).table(typed.array.of_ring(1), 0.001 * blocks)
-             for blocks in (16, 17)]
-    assert study_with(typed, rings).prior.types == {}
-    with pytest.raises(StudyError, match="every slot from 1 to 17"):  # the control
-        typed.with_(array=study_with(typed, rings).array)
 
 
 def test_a_least_field_costs_homogeneity(designed, session):
@@ -230,3 +221,14 @@ def test_pages(designed, tmp_path):
     page = write_report(designed, tmp_path)
     assert "peak to peak" in page.read_text(encoding="utf-8")
     assert "<table" in html_of(designed)
+
+
+def test_one_type_of_blocks_remains_one():
+    """A study whose slots are all of one type has one type in any rings, so that `sort` works."""
+    one = parse_study(DOCUMENT | {"prior": {"types": {"cube": list(range(1, 17))}}})
+    rings = [Ring(blocks_per_ring=count) for count in (12, 20)]
+    assert ring_catalogue.designed(one, rings).prior.types == {"cube": tuple(range(1, 21))}
+    assert ring_catalogue.designed(study(), rings).prior.types == {}
+    two = parse_study(DOCUMENT | {"prior": {"types": {"a": [1], "b": list(range(2, 17))}}})
+    with pytest.raises(StudyError, match=r"prior\.types must name every slot from 1 to 20"):
+        ring_catalogue.designed(two, rings)

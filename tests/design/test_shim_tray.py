@@ -146,10 +146,8 @@ def test_the_search_finds_the_best_of_all(counts):
             return np.sum((target + effect[rows].sum(axis=0))**2) + 0.01 * np.sum(effect[rows]**2)
 
         best = min(size(each) for each in product([EMPTY, 0, 1, 2], repeat=4))
-        # changes of two places at a time end in a minimum that may not be the least
         excess.append((size(found) - best) / (target @ target))
-    assert max(excess) < 0.2
-    assert np.mean(excess) < 0.02
+    assert max(excess) < 1e-9  # rounding
 
 
 def test_a_tray_that_cannot_help_stays_empty(measured, tmp_path):

@@ -550,3 +550,16 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     summary = json.loads((tmp_path / "prior.json").read_text())
     assert summary["not_normal"] == ["4"]
     assert summary["types"][3]["anderson_darling_p"][0] < 0.05
+
+
+def test_a_table_that_was_changed_after_it_was_read(short_dipole):
+    """Its arrays can be written to; negative standard deviations would be taken as positive."""
+    study = short_dipole(array__recoil_permeability=1.0)
+    magnet = build_magnet(study)
+    slots = [block.slot for block in magnet.blocks]
+    table = table_of(study, slots, np.array([block.magnetization for block in magnet.blocks]),
+                     rings=[block.ring for block in magnet.blocks])
+    prior_from_blocks(magnet, table)
+    table.sigma[3] *= -1
+    with pytest.raises(MeasurementError, match=r"sigma_A_m2 of block .* must be positive"):
+        prior_from_blocks(magnet, table)

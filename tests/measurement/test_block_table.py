@@ -123,3 +123,11 @@ def test_nothing_half_written(tmp_path):
     with pytest.raises(OutputError, match="Cannot write"):
         write_blocks(table(), tmp_path / "file" / "blocks.csv")
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("changes", [
+    {"moment": table().moment[:2]}, {"moment": table().moment[:, :2]}, {"sigma": 1e-3},
+    {"ring": np.array([1, 1])}, {"type": ("1", "2")}])
+def test_arrays_of_another_shape(changes):
+    with pytest.raises(MeasurementError, match=f"{next(iter(changes))} .* of the shape"):
+        table(**changes)

@@ -16,7 +16,7 @@ def campaign_of(name):
     return ROOT / "studies" / name / "campaign"
 
 
-@pytest.mark.parametrize("name", ["quadrupole", "mri"])
+@pytest.mark.parametrize("name", ["quadrupole", "cubes"])
 def test_maps_name_the_truth(name):
     truth = (campaign_of(name) / "truth" / "truth.json").read_bytes()
     for part in ("map.csv", "held-out.csv"):

@@ -211,6 +211,27 @@ def test_paths_in_a_command_are_quoted():
     assert found.command == "halbach-fe infer 'my study.toml' --measurements MAP -o DIR"
 
 
+def test_the_command_has_the_files_of_the_user(tmp_path):
+    """Quoted for a shell; a folder for other results is not that of these."""
+    command = "halbach-fe homogeneity STUDY --posterior POSTERIOR --blocks DIR/b.csv -o DIR"
+    answer = Answer("?", "", "", "", command)
+    assert answer.with_paths({"DIR": None}).command == command
+    found = answer.with_paths({"STUDY": tmp_path / "my study.toml", "DIR": "a b", "POSTERIOR": "p"})
+    assert shlex.split(found.command)[2:] == [
+        str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
+
+
+def test_commands_name_the_posterior_that_was_read(given):
+    """It lies in the folder of the update, not in that of the command which read it."""
+    still = hf.shim(given.updated, given.session, swaps=0, turns=0)
+    assert still.stop == "budget"  # other blocks would fit
+    for found in (homogeneity.answer(hf.homogeneity(given.magnet, given.session,
+                                                    posterior=given.updated)),
+                  shimming.answer(still, given.updated)):
+        assert "DIR/posterior.h5" not in found.command
+        assert "--posterior POSTERIOR" in found.command
+
+
 def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_path):
     wrong = given.campaign.readings.copy(deep=True)
     wrong["B_T"][::2] *= 1.02  # which no magnet makes at every second point

@@ -326,6 +326,15 @@ def test_other_settings_are_said_but_no_doubt(home):
                                  "mesh.block_size_m is 0.02 instead of 0.01."]
 
 
+def test_the_next_command_names_the_folder_of_its_answer(home):
+    """Neither that of the page, nor a word."""
+    unused_finding(home)
+    results(home / "diagnosis", "diagnose", answer=Answer(
+        "What?", "That.", "Yes.", "Update.", "halbach-fe verify DIR/new.toml -o DIR", False))
+    assert found_in(home, "field", "diagnosis").answer.command == (
+        f"halbach-fe verify {home / 'diagnosis' / 'new.toml'} -o DIR")
+
+
 def test_a_better_answer_replaces_one_that_is_not_sound(home):
     """Which the diagnosis of it led to; alone it makes the whole page doubtful."""
     study = home / "study.toml"
@@ -361,9 +370,9 @@ def test_commands_name_the_folder_that_holds_their_file(home):
     results(home / "shimmed", "shim", reads=[home / "study.toml", home / "map.csv"],
             files=["study.shimmed.toml"], answer=Answer(
                 "Which?", "Some.", "Yes.", "Measure.",
-                "halbach-fe infer DIR/study.shimmed.toml --blocks DIR/none.csv -o DIR"))
+                "halbach-fe infer DIR/study.shimmed.toml -o DIR"))
     assert found_in(home, "field", "shimmed").answer.command == (
-        "halbach-fe infer shimmed/study.shimmed.toml --blocks DIR/none.csv -o DIR")
+        "halbach-fe infer shimmed/study.shimmed.toml -o DIR")
 
 
 def test_the_order_is_that_of_the_data(tmp_path):

@@ -12,7 +12,7 @@ from tests.conftest import ROOT, circle
 
 def test_points_and_blocks_are_in_view():
     """Off one plane there is a side view; its limits hold all that is drawn, from the axis on."""
-    study = read_study(ROOT / "studies" / "mri" / "study.toml")
+    study = read_study(ROOT / "studies" / "cubes" / "study.toml")
     points = np.vstack([circle(0.08, 8, z) for z in (-0.05, 0.05)])
     _, side = geometry_figure(build_magnet(study), points).axes
     (low, high), (left, right) = side.get_ylim(), side.get_xlim()

@@ -21,7 +21,7 @@ from halbach_fe.report.magnet_view_3d import (
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
 
-STUDIES = ("quadrupole", "mri", "faser")
+STUDIES = ("quadrupole", "cubes", "faser")
 
 
 def study_of(name):

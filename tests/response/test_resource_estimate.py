@@ -77,7 +77,8 @@ def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
     assert (found.radius, found.half_length) == pytest.approx((real.radius, real.half_length))
 
 
-@pytest.mark.parametrize(("source", "finer"), [("quadrupole", 1), ("mri", 2), ("nonlinear-2d", 1)])
+@pytest.mark.parametrize(("source", "finer"), [
+    ("quadrupole", 1), ("cubes", 2), ("nonlinear-2d", 1)])
 def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
     magnet = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
     kind = "cross_section" if magnet.dimension == 2 else "extruded"

@@ -35,7 +35,7 @@ def volumes(path, dimension):
     return found
 
 
-@pytest.mark.parametrize(("name", "larger"), [("faser", 1), ("quadrupole", 1), ("mri", 2)])
+@pytest.mark.parametrize(("name", "larger"), [("faser", 1), ("quadrupole", 1), ("cubes", 2)])
 def test_shipped_studies_mesh_to_their_volumes(tmp_path, name, larger):
     """Chords cut some per cent off sectors; cuboids and trapezoids are met exactly.
 

@@ -39,7 +39,7 @@ KEYS = [line.partition(" #")[0] for line in RINGS.splitlines()]
 LAYOUTS = {
     "faser": PLAIN,
     "quadrupole": (ROOT / "studies" / "quadrupole" / "study.toml").read_text(),
-    "cubes": (ROOT / "studies" / "mri" / "study.toml").read_text(),
+    "cubes": (ROOT / "studies" / "cubes" / "study.toml").read_text(),
     "iron": (ROOT / "studies" / "faser" / "iron.toml").read_text(),
     "tables last": BARE + f'[array]\n{RINGS}[array.block]\nshape = "sector"',
     "exceptions": BARE + f'[array]\n{RINGS}[array.block]\nshape = "sector"\n'

@@ -1,0 +1,149 @@
+"""Solids of blocks and holders, read back by Gmsh, and the plan: which block goes where."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import gmsh
+import numpy as np
+import pytest
+import tomlkit
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.design.assembly import cad
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import read_blocks, write_blocks
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.simulate import simulate_delivery
+
+SIDE, GAP, CLEARANCE, FLOOR = 0.012, 0.010, 2e-4, 0.003
+INNER, OUTER, SLOTS = 0.03, 0.075, 8
+
+DOCUMENT = {
+    "name": "held", "dimension": 3,
+    "array": {
+        "blocks_per_ring": SLOTS, "rings": 2, "inner_radius_m": 0.04, "outer_radius_m": 0.04 + SIDE,
+        "ring_length_m": SIDE, "ring_gap_m": GAP, "remanence_T": 1.3, "recoil_permeability": 1.0,
+        "block": {"shape": "cuboid", "width_m": SIDE, "orientation": "magnetization"}},
+    "mesh": {"block_size_m": 0.006},
+    "observation": {"quantity": "flux_density",
+                    "positions": {"kind": "points", "points_m": [[0, 0, 0]]}},
+    "prior": {"magnitude_sd": 0.01, "types": {"cube": list(range(1, SLOTS + 1))}},
+    # without marks the volume of a plate has a closed form
+    "holder": {"clearance_m": CLEARANCE, "floor_m": FLOOR, "inner_radius_m": INNER,
+               "outer_radius_m": OUTER, "mark_m": 0.0, "engraving_m": 0.0}}
+
+
+def study(**holder):
+    return parse_study(DOCUMENT | {"holder": DOCUMENT["holder"] | holder})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of `halbach-fe cad`, and the measured blocks, half of them exchanged."""
+    folder = tmp_path_factory.mktemp("cad")
+    (folder / "study.toml").write_text(tomlkit.dumps(DOCUMENT))
+    table = simulate_delivery(study(), 2)
+    write_blocks(replace(table, serial=table.serial[::-1]), folder / "blocks.csv")
+    assert main(["cad", str(folder / "study.toml"), "--blocks", str(folder / "blocks.csv"),
+                 "-o", str(folder / "cad")]) == 0
+    return folder / "cad", read_blocks(folder / "blocks.csv")
+
+
+def solids(path):
+    """Volumes (n,) in mm^3 and centres of mass (n, 3) in mm of the solids of a STEP file."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.occ.importShapes(str(path))
+        gmsh.model.occ.synchronize()
+        tags = [tag for _, tag in gmsh.model.getEntities(3)]
+        return (np.array([gmsh.model.occ.getMass(3, tag) for tag in tags]),
+                np.array([gmsh.model.occ.getCenterOfMass(3, tag) for tag in tags]))
+    finally:
+        gmsh.finalize()
+
+
+def stl_volume(path):
+    """Volume in mm^3 of a closed surface, by the divergence theorem."""
+    data = path.read_bytes()
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    a, b, c = np.frombuffer(data, kind, offset=84)["corners"].astype(float).swapaxes(0, 1)
+    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+
+
+def sorted_rows(places):
+    return places[np.lexsort(places.round(3).T)]
+
+
+def test_blocks_have_their_volume_and_place(made):
+    folder, _ = made
+    volume, centre = solids(folder / "blocks.step")
+    blocks = build_magnet(study()).blocks
+    assert volume == pytest.approx(np.full(2 * SLOTS, (1e3 * SIDE)**3), rel=1e-9)
+    places = 1e3 * np.array([block.middle for block in blocks])
+    assert sorted_rows(centre) == pytest.approx(sorted_rows(places), abs=1e-6)
+    assert stl_volume(folder / "blocks.stl") == pytest.approx(volume.sum(), rel=1e-5)  # 4 bytes
+
+
+def plate_volume(clearance):
+    """Volume in mm^3 of a ring with pockets that leave a floor."""
+    ring = np.pi * (OUTER**2 - INNER**2) * (FLOOR + SIDE)
+    return 1e9 * (ring - SLOTS * (SIDE + 2 * clearance)**2 * SIDE)
+
+
+def test_plates_have_pockets_with_their_clearance(made):
+    folder, _ = made
+    volume, centre = solids(folder / "holder_01.step")
+    assert volume == pytest.approx([plate_volume(CLEARANCE)], rel=1e-6)
+    assert centre[0, :2] == pytest.approx([0, 0], abs=1e-6)
+    # control: pockets 0.01 mm narrower on each side
+    assert plate_volume(CLEARANCE - 1e-5) != pytest.approx(volume[0], rel=1e-5)
+    assert stl_volume(folder / "holder_01.stl") == pytest.approx(volume[0], rel=2e-3)  # chords
+    assert not (folder / "holder_02.step").exists()  # both rings have equal plates
+
+
+def test_the_whole_magnet(made):
+    folder, _ = made
+    volume, _ = solids(folder / "magnet.step")
+    assert sorted(volume) == pytest.approx(
+        [(1e3 * SIDE)**3] * 2 * SLOTS + [plate_volume(CLEARANCE)] * 2, rel=1e-6)
+
+
+def test_the_plan_says_which_block_goes_where(made):
+    folder, table = made
+    with (folder / "assembly.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    serial = dict(zip(table.places, table.serial, strict=True))
+    assert len(rows) == 2 * SLOTS
+    for row in rows:
+        ring, slot = int(row["ring"]), int(row["slot"])
+        assert row["serial"] == serial[ring, slot]
+        angle = 360.0 / SLOTS * (slot - 1)  # a dipole turns twice as fast as the place
+        assert np.exp(1j * np.radians(float(row["magnetization_angle_deg"]))) == pytest.approx(
+            np.exp(2j * np.radians(angle)), abs=1e-6)
+        north = {0: "outwards", 2: "counter-clockwise", 4: "inwards", 6: " clockwise"}
+        assert north.get((slot - 1) % 8, "") in row["way_round"]
+    assert rows[0]["serial"] != "B0001"  # the table says another one
+    page = (folder / "assembly.html").read_text()
+    assert all(one in page for one in ("holder_01.step", "ring 1"))
+
+
+@pytest.mark.parametrize(("holder", "said"), [
+    ({"clearance_m": 9e-3}, "wall of 0 mm between block"),
+    ({"least_wall_m": 9e-3}, "thinner than least_wall_m = 9 mm.*Reduce least_wall_m"),
+    ({"thickness_m": 0.03}, "plates that overlap by .*Reduce floor_m or thickness_m"),
+    ({"outer_radius_m": 0.05}, "edge of the plate"),
+])
+def test_holders_that_cannot_be_made(holder, said):
+    with pytest.raises(StudyError, match=said):
+        cad(build_magnet(study(**holder)))
+
+
+def test_blocks_without_places():
+    table = simulate_delivery(study(), 2)
+    loose = replace(table, ring=0 * table.ring, slot=0 * table.slot)
+    with pytest.raises(MeasurementError, match=r"give its blocks\.sorted\.csv"):
+        cad(build_magnet(study()), loose)
