@@ -13,6 +13,7 @@ import json
 import math
 import multiprocessing
 import os
+import shlex
 import sys
 import threading
 import time
@@ -570,7 +571,12 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
     for sentence in named.sentences:
         say(sentence)
     if named.command:
-        say(f"  {named.command}")
+        command = named.command
+        blocks = getattr(arguments, "blocks", None)
+        if blocks is not None and "--measurements" in command and not {
+                "--blocks", "NEW_MAP"} & set(command.split()):
+            command = command.replace(" -o ", f" --blocks {shlex.quote(str(blocks))} -o ")
+        say(f"  {command}")
     if page is not None:
         say(f"Report: {page}")
 

@@ -286,7 +286,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     lines = scan_lines(points)
     chosen = usable & _some_lines(lines, usable)
     time = _time(data, len(points))
-    say("comparing the orientations of the probe")
+    say("step 1 of 4: comparing the orientations of the probe")
     places, readings = points[chosen], field[chosen]
     spacing = point_spacing(places)
     directions = _directions(points, lines)
@@ -294,7 +294,7 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     train_rows = chosen & ~held_out
     seen = points[train_rows], field[train_rows], time[train_rows], directions[train_rows]
     matrix, alike = _orientation(*seen, spacing)
-    say("fitting the field and the instrument")
+    say("step 2 of 4: fitting the field and the instrument")
     gap, sensors, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing)
     # around all rows, of which those that are not fitted are read too
     charges = Charges.around(_read_at(points[usable], sensors), gap)
@@ -304,12 +304,12 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     model = model.weighted(train, train_rows)
     # the prior width of the field, now that the instrument no longer counts as noise
     fit = model.fit(train, train_rows)
-    say("asking each change of the instrument to predict scan lines")
+    say("step 3 of 4: asking each change of the instrument to predict scan lines")
     model, train = _confirmed(model, train_rows, _held_out(lines, train_rows), fit, train)
     for _ in range(WEIGHTINGS):
         model = model.weighted(train, train_rows)
         train = fit_probe(model, train_rows, fit, train)
-    say("fitting all scan lines")
+    say("step 4 of 4: fitting all scan lines")
     whole = fit_probe(model, chosen, fit, train)
     far_off = spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
                      usable)

@@ -30,6 +30,9 @@ from halbach_fe.study.model import Study
 
 PAGE = "report.html"
 
+DIAGNOSED = "study.diagnosed.toml"
+"""The study that halbach-fe diagnose writes, with what was missing."""
+
 MOST_ROWS = 40
 """Largest number of rows of a folded table. All of them are on its page."""
 
@@ -112,10 +115,22 @@ class Campaign:
         """
         left = [(chapter, answer.with_paths({"DIR": chapter.folder}))
                 for chapter, _, answer in self.answered if self.continued(chapter, answer) is None]
-        unsound = [answer for chapter, answer in left
+        unsound = [self._with_what_was_found(chapter, answer) for chapter, answer in left
                    if not answer.sound and self.replaced(chapter) is None]
         measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]
         return next(iter([*unsound, *measured, *(answer for _, answer in reversed(left))]), None)
+
+    def _with_what_was_found(self, chapter: Chapter, answer: Answer) -> Answer:
+        """Return the next step of an answer that may not be used.
+
+        It is its own, or to repeat the command if the study has been diagnosed already.
+        """
+        found = next((one for one in self.chapters if one.verb == "diagnose"
+                      and DIAGNOSED in one.record.files and not chapter.has_study_of(one)), None)
+        if found is None:
+            return answer
+        return replace(answer, step=f"Repeat {chapter.label} with {found.label}/{DIAGNOSED}, which "
+                       "has what its study lacks.", command="")
 
     def plain(self) -> dict[str, object]:
         """Return the answers and what does not fit as plain data."""
@@ -260,10 +275,14 @@ def _date(ended: str) -> str:
 
 
 def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
-    """Return rows of text: which program wrote each folder, and when."""
-    return [{"results": one.label, "command": one.record.command, "ended": _date(one.record.ended),
-             "programs": one.pages[0].said.provenance.get("programs", "")}
-            for one in campaign.chapters]
+    """Return rows of text: which command wrote each folder, and when; with which programs, if
+    these are not those of the page itself.
+    """
+    of = [one.pages[0].said.provenance.get("programs", "") for one in campaign.chapters]
+    others = set(of) - {"", programs()}
+    return [{"results": one.label, "command": one.record.command, "ended": _date(one.record.ended)}
+            | ({"programs": used} if others else {})
+            for one, used in zip(campaign.chapters, of, strict=True)]
 
 
 def _input_rows(campaign: Campaign) -> list[dict[str, str]]:

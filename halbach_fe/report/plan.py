@@ -254,8 +254,8 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     before = by_slot(plan.prior_sd)
     for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
                                     ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
-        axis.bar(places + shift, by_slot(sd) / before, 0.4, color=colour, label=name)
-    axis.set(xlabel="slot", ylabel="sd after the plan / before", ylim=(0, None))
+        axis.bar(places + shift, 100 * by_slot(sd) / before, 0.4, color=colour, label=name)
+    axis.set(xlabel="slot", ylabel="uncertainty that remains in %", ylim=(0, None))
     axis.set_xticks(places[::max(1, len(places) // 16)])
-    axis.legend()
+    figure.legend(loc="outside upper center", ncols=2)
     return figure

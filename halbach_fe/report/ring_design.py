@@ -130,7 +130,7 @@ def side_figure(found: Designed) -> Figure:
             1e3 * ring.ring_length_m, 1e3 * (ring.outer_radius_m - ring.inner_radius_m),
             facecolor=PRIOR, edgecolor="white"))
         axis.annotate(str(ring.blocks_per_ring), (1e3 * ring.z_m, 1e3 * ring.outer_radius_m),
-                      ha="center", va="bottom", fontsize=7, color=PUBLISHED)
+                      ha="center", va="bottom", fontsize=9)
     centre, half = found.region.centre_m, found.region.half_axes_m
     t = np.linspace(0, np.pi, 91)
     if found.region.shape == "cylinder":
@@ -138,12 +138,12 @@ def side_figure(found: Designed) -> Figure:
     else:
         z, r = np.cos(t), np.sin(t)
     axis.fill(1e3 * (centre[2] + half[2] * z), 1e3 * half[0] * r, color=POSTERIOR, alpha=0.2,
-              label=found.region.text)
+              label=f"region: {found.region.text}")
     axis.set(xlabel="z in mm", ylabel="radius in mm")
-    axis.set_ylim(bottom=0)
-    axis.set_aspect("equal")
     axis.autoscale_view()
-    axis.legend(frameon=False, loc="lower left")
+    axis.set_ylim(0, 1.08 * axis.get_ylim()[1])  # with room for the numbers
+    axis.set_aspect("equal")
+    figure.legend(loc="outside upper center", frameon=False)
     return figure
 
 

@@ -271,7 +271,7 @@ def _gain_figure(shim: Shim) -> Figure:
     axis = figure.subplots()
     sizes = [known.rms for known in (shim.before, *(step.after for step in shim.steps))]
     axis.plot(sizes, "-o", color=POSTERIOR)
-    axis.set(xlabel="moves", ylim=(0, None), ylabel="rms of |c$_n$| in units of 1e-4"
+    axis.set(xlabel="moves", ylim=(0, 1.08 * max(sizes)), ylabel="rms of |c$_n$| in units of 1e-4"
              if shim.fields is None else "rms deviation of |B| in ppm")
     axis.set_xticks(range(len(sizes)))
     axis.grid(alpha=0.3)

@@ -354,6 +354,27 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
 
 
+def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
+    """A command is not told to diagnose what has been diagnosed; the control has no diagnosis."""
+    results(home / "shimmed", "shim", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.shimmed.toml"], answer=Answer(
+                "Which?", "Some.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False))
+    assert found_in(home, "field", "shimmed").answer.step == "Diagnose."
+    unused_finding(home)
+    last = found_in(home, "field", "shimmed", "diagnosis").answer
+    assert last.step.startswith("Repeat shimmed with diagnosis/study.diagnosed.toml")
+    assert not last.sound
+
+
+def test_commands_name_the_folder_that_holds_their_file(home):
+    results(home / "shimmed", "shim", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.shimmed.toml"], answer=Answer(
+                "Which?", "Some.", "Yes.", "Measure.",
+                "halbach-fe infer DIR/study.shimmed.toml -o DIR"))
+    assert found_in(home, "field", "shimmed").answer.command == (
+        "halbach-fe infer shimmed/study.shimmed.toml -o DIR")
+
+
 def test_the_order_is_that_of_the_data(tmp_path):
     """And every command has its place in it."""
     for number, verb in enumerate(reversed(ORDER)):
