@@ -106,6 +106,14 @@ ENOUGH = 0.2
 """Smallest share of readings beyond those that determine the field. With fewer, a field obeys any
 map."""
 
+VIOLATED = 0.02
+"""A map whose floor is above this share of the largest field does not obey Maxwell's equations."""
+
+ALTERNATES = -0.3
+"""Correlation of neighbouring residuals below which they change sign from point to point: the field
+varies more than the spacing shows. Of a field with a curl or of shuffled lines it is positive or
+near 0."""
+
 WINDOWS = 6
 """Number of parts along the longest axis for which the residual is given."""
 
@@ -207,8 +215,15 @@ class MapCheck:
 
     @property
     def suffices(self) -> bool:
-        """Whether the map has enough readings to tell."""
-        return self.redundancy >= ENOUGH
+        """Whether the map has enough readings to tell, and near enough to each other."""
+        return self.redundancy >= ENOUGH and not self.is_too_coarse
+
+    @property
+    def is_too_coarse(self) -> bool:
+        """Whether a large residual changes sign from point to point, as of a field that varies more
+        than the spacing shows.
+        """
+        return self.structure < ALTERNATES and self.floor_rms_T > VIOLATED * self.size_T
 
     @property
     def floor_rms_T(self) -> float:  # noqa: N802 - a unit

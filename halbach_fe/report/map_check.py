@@ -13,16 +13,13 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import MapCheck
+from halbach_fe.measurement.map_check import VIOLATED, MapCheck
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
 from halbach_fe.report.point_maps import draw, panels
 from halbach_fe.report.words import decimals, flux_density
 from halbach_fe.study.types import COMPONENTS
-
-VIOLATED = 0.02
-"""A map whose floor is above this share of the largest field does not obey Maxwell's equations."""
 
 REMAINS = 0.3
 """Correlation of neighbouring residuals from which they are no noise."""
@@ -37,6 +34,12 @@ ROWS_NAMED = 10
 def answer(check: MapCheck) -> Answer:
     """Say whether the map obeys Maxwell's equations, and what to do next."""
     question = "Does the map obey Maxwell's equations?"
+    if check.is_too_coarse:
+        return Answer(
+            question, verdict(check), "No: whether the map obeys cannot be told. An update of the "
+            "magnet may use it nevertheless, as a magnet's model knows how fast its field varies.",
+            "Measure with a smaller spacing, or farther from the blocks, and check that map.",
+            "halbach-fe check MAP -o DIR", sound=False)
     if not check.suffices:
         return Answer(
             question, verdict(check), "Nothing on this page tests the map: too many numbers were "
@@ -98,6 +101,10 @@ BROKEN = {"zero": "all components are zero",
 
 def verdict(check: MapCheck) -> str:
     """Return the answer in a sentence."""
+    if check.is_too_coarse:
+        return (f"The map cannot tell: with a spacing of {1e3 * check.spacing_m:.3g} mm the field "
+                "changes more from point to point than its neighbours show: what a field without "
+                "sources leaves of it changes sign from each reading to the next.")
     if not check.suffices:
         return (f"The map cannot tell: {1 - check.redundancy:.0%} of its readings are needed to "
                 "describe any field in its region. Measure in a volume, with a smaller spacing.")

@@ -21,7 +21,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields
 from halbach_fe.measurement.map_check import check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel
-from halbach_fe.report.map_check import oriented, sentences, undetermined, verdict
+from halbach_fe.report.map_check import answer, oriented, sentences, undetermined, verdict
 from tests.support.short_dipole import FRINGE, truth
 
 NOISE_T = 2e-5
@@ -208,6 +208,23 @@ def test_a_small_map_cannot_tell(generator):
     for wrong in (partly, 0 * GRID, np.ones_like(GRID)):
         with pytest.raises(MeasurementError, match="all three components"):
             check_map(field_map(GRID, wrong))
+
+
+def test_a_map_that_is_too_coarse_cannot_tell(generator):
+    """A multipole of order 9 at 16 angles: the field obeys, but its neighbours do not show it.
+
+    That a map with a curl is refused whatever it is, `test_what_no_magnet_makes_is_not_fitted`
+    tests.
+    """
+    angle = 2 * np.pi * np.arange(16) / 16
+    points = np.array([[0.03 * np.cos(one), 0.03 * np.sin(one), z]
+                       for z in np.linspace(-0.03, 0.03, 4) for one in angle])
+    field = 0.1 + 0.008 * ((points[:, 0] + 1j * points[:, 1]) / 0.03)**8
+    field = np.column_stack([field.imag, field.real, np.zeros(64)])
+    check = check_map(field_map(points, field + 1e-5 * generator.standard_normal(field.shape)))
+    assert not check.suffices
+    assert "cannot tell: with a spacing of 11.7 mm" in verdict(check)
+    assert not answer(check).sound
 
 
 def test_command(generator, tmp_path, capsys):
