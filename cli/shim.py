@@ -25,6 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_objective_arguments(parser)
     parser.add_argument("--swaps", type=common.count, default=8, metavar="N",
                         help="largest number of swaps of two blocks (default: %(default)s)")
+    parser.add_argument("--cycles", type=common.count, default=0, metavar="N",
+                        help="largest number of cyclic exchanges of three blocks "
+                        "(default: %(default)s)")
     parser.add_argument("--turns", type=common.count, default=8, metavar="N",
                         help="largest number of blocks turned in their slots "
                         "(default: %(default)s)")
@@ -73,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         result = infer(magnet, data, session, blocks)
         moves = shim(result, session, common.reference(arguments), arguments.swaps,
                      arguments.turns, arguments.replace, arguments.limit_units, stock,
-                     arguments.seed, arguments.limit_ppm)
+                     arguments.seed, arguments.limit_ppm, arguments.cycles)
     if result.disagreement:
         common.say(f"warning: Model and measurement disagree. {result.disagreement}")
     write_shim(moves, result, arguments.study.read_text(encoding="utf-8-sig"), arguments.output)

@@ -341,6 +341,7 @@ def shim(
     result: InferenceResult, session: Session, reference: MultipoleReference | None = None,
     swaps: int = 8, turns: int = 8, replacements: int = 0, limit_units: float | None = None,
     stock: BlockTable | None = None, seed: int = 1, limit_ppm: float | None = None,
+    cycles: int = 0,
 ) -> Shim:
     """Choose blocks to swap, turn or replace so that unwanted multipoles become small.
 
@@ -367,6 +368,8 @@ def shim(
     limit_ppm : float, optional
         Largest rms deviation of |B| that is allowed, in ppm, if the study asks for homogeneity. The
         search ends when it is met.
+    cycles : int
+        Largest number of cyclic exchanges of three blocks.
 
     Returns
     -------
@@ -391,7 +394,8 @@ def shim(
     True
     """
     for name, value in (("swaps", swaps), ("turns", turns), ("replacements", replacements),
-                        ("seed", seed)):
+                        ("seed", seed),
+                        ("cycles", cycles)):
         check_number(name, "shim", value, 0, whole=True)
     if stock is not None and not replacements:
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
@@ -399,7 +403,8 @@ def shim(
     check_objective(result.magnet, reference, limit_units, limit_ppm)
     model = objective_of(result.magnet, reference, session.within("objective"),
                          result.posterior.mean)
-    budget: dict[Kind, int] = {"swap": swaps, "turn": turns, "replace": replacements}
+    budget: dict[Kind, int] = {"swap": swaps, "cycle": cycles, "turn": turns,
+                               "replace": replacements}
     return choose_moves(result, model, np.random.default_rng(seed), budget,
                         limit_units or limit_ppm, stock)
 

@@ -1,4 +1,4 @@
-"""Shimming: which blocks to swap, turn or replace so that the field becomes better.
+"""Shimming: which blocks to exchange, turn or replace so that the field becomes better.
 
 What is to become small are the values of an `halbach_fe.design.objective`: unwanted multipoles in
 units of 1e-4, or deviations of |B| in ppm. They are linear in the magnetizations, and a moved block
@@ -46,7 +46,7 @@ from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, rotation_roots
 from halbach_fe.study.model import Study
 
-Kind = Literal["swap", "turn", "replace"]
+Kind = Literal["swap", "cycle", "turn", "replace"]
 
 GAIN_SDS = 1.0
 """Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
@@ -60,6 +60,9 @@ DRAWS = 4000
 
 SHORTLIST = 24
 """Number of moves of each kind, the best by an approximate gain, whose exact gain is computed."""
+
+FIRST_OF_CYCLES = 200
+"""Number of placements, the best by themselves, from which exchanges of three blocks are formed."""
 
 AT_ONCE = 100_000
 """Number of moves that are evaluated at a time, which limits the memory."""
@@ -98,7 +101,9 @@ class Placement:
 
 @dataclass(frozen=True)
 class Move:
-    """A swap (two placements), a turn or a replacement (one placement each)."""
+    """A swap (two placements), a cyclic exchange of three blocks (three placements), a turn or a
+    replacement (one placement each).
+    """
 
     kind: Kind
     placements: tuple[Placement, ...]
@@ -349,11 +354,15 @@ class _CandidateMoves:
     ----------
     kind : str
     parts : ndarray of int, shape (n, 1) or, for swaps, (n, 2)
-        Numbers of the placements of each move in `_Placements`.
+        Numbers of the placements of each move in `_Placements`. Cycles are too many to be listed,
+        see `_cycles`.
+    count : int
+        Number of possible moves; of cycles without their turns.
     """
 
     kind: Kind
     parts: Ints
+    count: int
 
 
 @dataclass(frozen=True)
@@ -436,7 +445,7 @@ def shim(
         shimmed = move_model.magnetizations([step.move for step in steps])
         fields = model.homogeneity.of(result.posterior), model.homogeneity.of(shimmed)
     return Shim(result, model, mounts, spares.names, before, steps, stop,
-                {moves.kind: len(moves.parts) for moves in candidates}, limit, within, fields)
+                {moves.kind: moves.count for moves in candidates}, limit, within, fields)
 
 
 def check_shimming(study: Study) -> None:
@@ -644,6 +653,7 @@ def _refuse_too_many(move_model: _MoveModel, turn: Ints, to: Ints, block: Ints) 
 
 def _candidate_moves(placements: _Placements, slots: int) -> list[_CandidateMoves]:
     """Return all moves of each kind; a swap is a pair of placements that exchange two blocks."""
+    every: dict[Kind, Ints]
     number = np.arange(len(placements.to))
     inside = placements.block < slots
     turns = number[inside & (placements.block == placements.to)]
@@ -661,8 +671,13 @@ def _candidate_moves(placements: _Placements, slots: int) -> list[_CandidateMove
     first = np.repeat(up, count)
     offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     second = down[np.repeat(start, count) + offset]
-    return [_CandidateMoves("swap", np.column_stack([first, second])),
-            _CandidateMoves("turn", turns[:, None]), _CandidateMoves("replace", spare[:, None])]
+    every = {"swap": np.column_stack([first, second]), "turn": turns[:, None],
+             "replace": spare[:, None]}
+    fits = np.zeros((slots, slots))
+    fits[placements.to[moved], placements.block[moved]] = 1
+    cycles = round(float(np.einsum("ij,ji->", fits @ fits, fits)) / 3)
+    return [_CandidateMoves("cycle", np.zeros((0, 3), int), cycles), *(
+        _CandidateMoves(kind, parts, len(parts)) for kind, parts in every.items())]
 
 
 def _search(
@@ -738,13 +753,14 @@ def _best_moves(
     used = [placement for move in chosen for placement in move.placements]
     free = ~(np.isin(placements.to, [placement.to for placement in used])
              | np.isin(placements.block, [placement.block for placement in used]))
-    parts = candidates.parts[free[candidates.parts].all(axis=1)]
-    if not len(parts):
-        return []
     mean, _ = move_model.products(chosen)
     # Moves hardly change the main multipole or mean field: use that by which
     # `_Placements.change` is scaled.
     now = move_model.model.units(np.concatenate([[abs(move_model.start[0][0])], mean[1:]]))
+    parts = (_cycles(placements, now, free, len(move_model.mean)) if candidates.kind == "cycle"
+             else candidates.parts[free[candidates.parts].all(axis=1)])
+    if not len(parts):
+        return []
     score = np.empty(len(parts))
     for first in range(0, len(parts), AT_ONCE):
         batch = parts[first:first + AT_ONCE]
@@ -753,6 +769,29 @@ def _best_moves(
             np.einsum("ij,ij->i", after, after) + placements.noise[batch].sum(axis=1))
     best = np.argpartition(score, count)[:count] if count < len(score) else np.arange(len(score))
     return [placements.move(candidates.kind, parts[i]) for i in best[np.argsort(score[best])]]
+
+
+def _cycles(
+    placements: _Placements, now: Floats, free: NDArray[np.bool_], slots: int
+) -> Ints:
+    """Return cyclic exchanges of three blocks (n, 3) as numbers of placements.
+
+    All possible ones are too many. They begin with the `FIRST_OF_CYCLES` best placements by
+    themselves, i into j; each goes on with every j into m, and every m into i.
+    """
+    moved = np.flatnonzero(free & (placements.block < slots)
+                           & (placements.block != placements.to))
+    after = now + placements.change[moved]
+    score = np.einsum("ij,ij->i", after, after) + placements.noise[moved]
+    found = [np.zeros((0, 3), int)]
+    for first in moved[np.argsort(score, kind="stable")[:FIRST_OF_CYCLES]]:
+        i, j = placements.block[first], placements.to[first]
+        second = moved[(placements.block[moved] == j) & (placements.to[moved] != i)]
+        third = moved[(placements.to[moved] == i) & (placements.block[moved] != j)]
+        here, there = np.nonzero(
+            placements.to[second][:, None] == placements.block[third][None, :])
+        found.append(np.column_stack([np.full(len(here), first), second[here], third[there]]))
+    return np.vstack(found)
 
 
 def _steps_by_gain(

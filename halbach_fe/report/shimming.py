@@ -143,7 +143,7 @@ def _place_text(shim: Shim, number: int) -> str:
 
 def answer(shim: Shim, result: InferenceResult) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
-    question = "Which blocks should be swapped, turned or replaced?"
+    question = "Which blocks should be exchanged, turned or replaced?"
     before, after = (_size(shim, known.rms) for known in (shim.before, shim.after))
     if shim.fields is None:
         what, unit = "the unwanted multipoles are", "units of 1e-4 rms"
@@ -202,7 +202,7 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
         figures |= {
             "shim_moves.png": (
                 _moves_figure(shim), "Moves with their numbers: lines connect blocks that are "
-                "swapped, circles mark blocks that are turned in place, squares mark blocks that "
+                "exchanged, circles mark blocks that are turned in place, squares mark blocks that "
                 "are replaced"),
             "shim_gain.png": (
                 _gain_figure(shim), f"Root mean square of {_values_text(shim)} after each move, "
@@ -253,10 +253,10 @@ def _moves_figure(shim: Shim) -> Figure:
 
 
 def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
-    """Draw a move at the slots (1 or 2, 2) where its blocks go."""
+    """Draw a move at the slots (1 to 3, 2) where its blocks go."""
     kind = step.move.kind
-    if kind == "swap":
-        axis.plot(*ends.T, "-o", color=POSTERIOR, lw=1.2, ms=5)
+    if kind in ("swap", "cycle"):
+        axis.plot(*np.vstack([ends, ends[:1]]).T, "-o", color=POSTERIOR, lw=1.2, ms=5)
     else:
         axis.plot(*ends.T, "o" if kind == "turn" else "s", mfc="none", ms=11, mew=1.8,
                   color=SECOND if kind == "turn" else PUBLISHED)
