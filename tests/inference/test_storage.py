@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.api import homogeneity, multipoles
-from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import mcmc
 from halbach_fe.inference.infer import infer
