@@ -11,6 +11,10 @@ from halbach_fe.solver.session import Progress
 QUIET_S = 10.0
 """Time in s between two lines about the progress of one step."""
 
+FORETOLD = 0.01
+"""Part of a step that must be done before its pace foretells the time left: the first part often
+prepares what all others use."""
+
 MINUTE_S, HOUR_S = 60.0, 3600.0
 
 
@@ -61,7 +65,8 @@ class Pace:
             self._step_begun = now
         elif done < total and now - self._said >= QUIET_S:
             left = (now - self._step_begun) * (total - done) / done
-            self.say(f"{self._step}: {done} of {total}, about {duration(left)} left")
+            foretold = f", about {duration(left)} left" if done >= FORETOLD * total else ""
+            self.say(f"{self._step}: {done} of {total}{foretold}")
             self._said = now
 
 

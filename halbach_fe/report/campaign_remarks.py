@@ -12,6 +12,7 @@ from pathlib import PurePath
 from typing import Any
 
 from halbach_fe.report.campaign_folders import Chapter
+from halbach_fe.report.words import counted
 from halbach_fe.study.differences import differences
 from halbach_fe.study.model import Study, magnet_description
 
@@ -154,8 +155,10 @@ def _plain(study: Study) -> dict[str, Any]:
 
 def _short(value: Any) -> str:
     """Return a value of a key as a short text."""
-    if value is None:
+    if value is None or value == []:
         return "not given"
+    if isinstance(value, list) and isinstance(value[0], dict):
+        return counted(len(value), "table")
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list) and all(isinstance(one, float) for one in value):

@@ -36,6 +36,10 @@ def test_progress_is_told_with_the_time_left():
     assert said[0] == "effects: 10 of 100, about 2 min left"
     assert said[-1] == "effects: 90 of 100, about 10 s left"
     assert len(said) == 9
+    pace.begin("more effects")
+    clock.now += 20.0  # the first prepares what all others use: nothing is foretold from it
+    pace.advance(1, 10_000)
+    assert said[-1] == "more effects: 1 of 10000"
     assert not pace.is_over
 
 

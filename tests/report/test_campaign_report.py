@@ -174,11 +174,13 @@ def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
     """Whatever a diagnosis has changed; without its folder nobody knows."""
     first = results(tmp_path / "field", "solve")
     found = results(tmp_path / "diagnosis", "diagnose", files=["study.diagnosed.toml"])
-    after = results(tmp_path / "better", "infer", another(array__inner_radius_m=0.12),
-                    [found / "study.diagnosed.toml"])
+    after = results(tmp_path / "better", "infer", another(
+        array__inner_radius_m=0.12, array__exceptions=[{"shift_m": [0.002, 0, 0]}]),
+        [found / "study.diagnosed.toml"])
     page = parts_of(hf.campaign_report([first, after, found], tmp_path / "all.html"))
     assert ("better is of diagnosis/study.diagnosed.toml, which halbach-fe diagnose wrote: "
-            "array.inner_radius_m is 0.12 instead of 0.104.") in page.text
+            "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions is 1 table instead of "
+            "not given.") in page.text
     assert re.findall(r"folder (\w+),", page.text) == [
         "field", "diagnosis", "better"]
     with pytest.raises(hf.HalbachError, match="of one magnet"):
