@@ -302,7 +302,8 @@ def homogeneity(
 def plan(magnet: Magnet, session: Session, points: int | None = None) -> MeasurementPlan:
     """Choose the positions whose readings carry most information about the magnetizations.
 
-    If the study has a table ``homogeneity``, they tell most about the deviation of |B| in that region.
+    If the study has a table ``homogeneity``, they tell most about the deviation of |B| in that
+    region.
 
     Parameters
     ----------
