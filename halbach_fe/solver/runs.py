@@ -10,7 +10,7 @@ import re
 import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -105,9 +105,11 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
                 (folder / name).unlink()
             return result
 
+    futures: list[Future[Floats]] = []
     with ThreadPoolExecutor(max(1, session.jobs)) as pool:
-        futures = [pool.submit(run, task) for task in tasks]
         try:
+            for task in tasks:  # Ctrl-C may come here, while the first runs go on already
+                futures.append(pool.submit(run, task))
             wait(futures, return_when=FIRST_EXCEPTION)
             for future in futures:
                 if future.done():
