@@ -14,14 +14,14 @@ from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
-from halbach_fe.diagnosis.map_errors import Data, blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import check_maps
+from halbach_fe.measurement.campaign import Data, check_maps
 from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
 from halbach_fe.study.model import Study
 

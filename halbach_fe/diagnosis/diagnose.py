@@ -39,7 +39,8 @@ from halbach_fe.diagnosis.equal_positions import possible_positions
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.map_errors import Data, blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.pace import Pace
@@ -74,7 +75,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import check_maps
+from halbach_fe.measurement.campaign import Data, check_maps
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
@@ -139,6 +140,10 @@ def diagnose(
     gross_errors, corrected, starts = correct_map_errors(study, data, blocks, effects)
     for error in gross_errors:
         say(f"gross error: {error.text}")
+    poses: tuple[FoundPose, ...] = ()
+    if not starts:  # which are places that explain the map
+        pace.begin("looking where the map lies")
+        poses, corrected = find_poses(corrected, data, _subsession(session, "pose"), say)
     campaign = Campaign.of(corrected, data, validation_map)
     blocks = blocks_of(blocks, study, corrected)
     signatures: Signatures = {}
@@ -239,7 +244,7 @@ def diagnose(
         groups_after=_groups(update, search.marginal, search.training),
         loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
-        gross_errors=gross_errors, outliers=outliers, position_noise=position_noise,
+        gross_errors=gross_errors, poses=poses, outliers=outliers, position_noise=position_noise,
         solver_error=solver_error, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)

@@ -33,7 +33,6 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.hypothesis import Hypothesis
-from halbach_fe.diagnosis.map_errors import Data
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, keys_of
@@ -42,6 +41,7 @@ from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP
+from halbach_fe.measurement.campaign import Data
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulation_choice import solve_nominal

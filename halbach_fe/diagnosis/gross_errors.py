@@ -213,16 +213,28 @@ def find_gross_errors(
         equivalent.
     """
     found: list[GrossError] = []
-    rows = np.unique(np.linspace(0, data.sizes["point"] - 1, MAX_POINTS).round().astype(int))
-    thinned = data.isel(point=rows)
     while len(found) < MAX_ERRORS:
-        error = _Search(
-            study, points_of(thinned), np.asarray(thinned["B_T"].values, float), blocks).find()
+        error = _search(study, data, blocks).find()
         if error is None:
             break
         found.append(error)
         study = error.apply(study)
     return tuple(found)
+
+
+def misfit_of(study: Study, data: xr.Dataset) -> float:
+    """Return the rms difference of a map from the nominal magnet, relative to the map's rms.
+
+    Infinite if the study places points of the map inside material.
+    """
+    return _search(study, data).misfit(MapConvention()).relative
+
+
+def _search(study: Study, data: xr.Dataset, blocks: BlockTable | None = None) -> _Search:
+    """Return the search with some points of a map."""
+    rows = np.unique(np.linspace(0, data.sizes["point"] - 1, MAX_POINTS).round().astype(int))
+    thinned = data.isel(point=rows)
+    return _Search(study, points_of(thinned), np.asarray(thinned["B_T"].values, float), blocks)
 
 
 class _Search:

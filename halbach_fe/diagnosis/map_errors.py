@@ -6,7 +6,7 @@ possible if all maps are of that magnet.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -20,10 +20,8 @@ from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.campaign import Data
 from halbach_fe.study.model import Study
-
-Data = xr.Dataset | Mapping[str, xr.Dataset]
-"""The only map, or the maps that a study lists, by name."""
 
 
 def correct_map_errors(

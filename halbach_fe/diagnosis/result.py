@@ -15,6 +15,7 @@ from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
+from halbach_fe.diagnosis.map_pose import FoundPose
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
 from halbach_fe.diagnosis.position_noise import PositionNoise
@@ -256,6 +257,8 @@ class Diagnosis(ShownInNotebook):
         Number of rounds of solving and searching.
     gross_errors : tuple of GrossError
         Errors of the map's units, axes or magnet.
+    poses : tuple of FoundPose
+        Where the maps lie, if they do not lie where the study says.
     outliers : tuple of Outlier
         Single readings that are excluded.
     position_noise : tuple of PositionNoise
@@ -302,6 +305,7 @@ class Diagnosis(ShownInNotebook):
     loo_residuals_after: Floats
     rounds: int
     gross_errors: tuple[GrossError, ...] = ()
+    poses: tuple[FoundPose, ...] = ()
     outliers: tuple[Outlier, ...] = ()
     position_noise: tuple[PositionNoise, ...] = ()
     solver_error: SolverErrorExplanation | None = None
@@ -314,5 +318,6 @@ class Diagnosis(ShownInNotebook):
 
     @property
     def found_anything(self) -> bool:
-        """Whether the diagnosis found gross errors, outliers, effects or position noise."""
-        return bool(self.gross_errors or self.outliers or self.identified or self.position_noise)
+        """Whether the diagnosis found gross errors, poses, outliers, effects or position noise."""
+        return bool(self.gross_errors or self.poses or self.outliers or self.identified
+                    or self.position_noise)

@@ -20,6 +20,7 @@ from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
+from halbach_fe.diagnosis.map_pose import FoundPose
 from halbach_fe.diagnosis.model_selection import Candidate
 from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.diagnosis.result import (
@@ -178,6 +179,9 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     for error in diagnosis.gross_errors:
         study = error.apply(study)
         yield study, f"gross error: {error.text}"
+    for pose in diagnosis.poses:
+        study = pose.apply(study)
+        yield study, f"registered: {pose.text}"
     study = diagnosis.corrected_study
     yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
     for effect in diagnosis.identified:
@@ -301,6 +305,16 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
             f"Gross error: {error.text}.", EMPTY_CELL if error.map is None else f"map {error.map}",
             instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
+    for pose in diagnosis.poses:
+        others = "" if not pose.others else (
+            " By symmetry it could lie elsewhere too, with a probability of "
+            f"{', '.join(f'{100 * one:.0f}' for one in pose.others)} %.")
+        found.append(OtherFinding(
+            "pose", "place and axes of the map", "registration",
+            f"misfit {_percent(pose.misfit_before)} → {_percent(pose.misfit_after)}",
+            f"{'Map ' + pose.map if pose.map else 'The map'} is not where the study says: "
+            f"{pose.text}.{others}",
+            EMPTY_CELL if pose.map is None else f"map {pose.map}"))
     if diagnosis.outliers:
         text = "; ".join(
             _rows_in_words([one.row for one in diagnosis.outliers if one.map == name])
@@ -373,11 +387,13 @@ def diagnosis_summary(
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
         "verdict": "numerical" if diagnosis.solver_error else
-        "unknown" if diagnosis.unknown and not (diagnosis.identified or diagnosis.gross_errors)
+        "unknown" if diagnosis.unknown and not (
+            diagnosis.identified or diagnosis.gross_errors or diagnosis.poses)
         else "suspected" if diagnosis.suspected and not diagnosis.found_anything else
         "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
         "named" if diagnosis.found_anything else "nothing",
         "gross": [_gross(error) for error in diagnosis.gross_errors],
+        "poses": [_pose(pose) for pose in diagnosis.poses],
         "positions": [asdict(position) for position in diagnosis.positions],
         "outliers": [asdict(outlier) for outlier in diagnosis.outliers],
         "effects": [_entry(effect) for effect in diagnosis.identified],
@@ -409,6 +425,27 @@ def _gross(found: GrossError) -> dict[str, object]:
     return {**entry(found.convention), "map": found.map, "misfit_before": found.misfit_before,
             "misfit_after": found.misfit_after,
             "alternatives": [entry(convention) for convention in found.alternatives]}
+
+
+def _pose(found: FoundPose) -> dict[str, object]:
+    """Return the JSON entry of the place of a map."""
+    best = found.best
+    return {"map": found.map, "text": found.text, "middle_m": best.middle_m.tolist(),
+            "translation_sd_m": best.translation_sd_m.tolist(),
+            "rotation_rad": list(best.instrument.rotation_rad),
+            "rotation_sd_rad": best.rotation_sd_rad.tolist(),
+            "other_probabilities": list(found.others),
+            "misfit_before": _finite(found.misfit_before), "misfit_after": found.misfit_after}
+
+
+def _finite(value: float) -> float | None:
+    """Return a number for JSON, which has no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _percent(misfit: float) -> str:
+    """Return a misfit in words; it is infinite for points that were stated inside blocks."""
+    return f"{100 * misfit:.2g} %" if np.isfinite(misfit) else "(inside blocks)"
 
 
 def _vibration_entry(found: Sequence[PositionNoise]) -> object:

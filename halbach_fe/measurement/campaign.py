@@ -22,6 +22,9 @@ from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
 
+Data = xr.Dataset | Mapping[str, xr.Dataset]
+"""The only map, or the maps that a study lists, by name."""
+
 ONLY_MAP, VALIDATION_MAP = "map", "held-out map"
 """Names of the map of a study that lists none, and of another map that is only predicted."""
 
@@ -124,7 +127,7 @@ def different_maps(study: Study, files: Mapping[str, Path]) -> dict[str, xr.Data
 
 
 def maps_of(
-    study: Study, data: xr.Dataset | Mapping[str, xr.Dataset],
+    study: Study, data: Data,
     validation_map: xr.Dataset | None = None
 ) -> list[Map]:
     """Return the maps of a study, each with the part of the study that holds for it.

@@ -1,0 +1,139 @@
+"""Find from nothing where maps lie whose stated place explains nothing.
+
+A stage has coordinates of its own. A map in these may be half a metre away from where the study
+says, and turned by a right angle and a few degrees. No effect of the catalogue, and no gross error
+of units or axes, reaches so far, and so such maps are registered before anything else is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.diagnosis.gross_errors import misfit_of
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.campaign_registration import register_maps, registered_study
+from halbach_fe.inference.pose_result import Registration
+from halbach_fe.inference.registration import axes_of_map, odds, register
+from halbach_fe.measurement.campaign import Data, maps_of
+from halbach_fe.solver.session import Session
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
+
+MIN_MISFIT_OF_A_POSE = 0.3
+"""Smallest misfit of a map in its stated place, relative to the map's rms, from which its pose is
+searched. Displacements by a tenth of the bore, which are gross errors, leave less in the bore."""
+
+MIN_REDUCTION = 3.0
+"""Factor by which the registered pose must reduce the misfit to be believed."""
+
+GOOD = 0.05
+"""Misfit that is good enough even if it was not larger in the stated place: of a map that lies
+right beside another one that does not."""
+
+POSSIBLE = 0.05
+"""Odds from which another pose is named beside the best one."""
+
+
+@dataclass(frozen=True)
+class FoundPose:
+    """Where a map lies, found from nothing.
+
+    Attributes
+    ----------
+    best : Registration
+        The most probable pose.
+    instrument : Instrument
+        The instrument of the study with that pose and its probe.
+    others : tuple of float
+        Probabilities of the other poses that the map hardly tells from the best one.
+    misfit_before, misfit_after : float
+        Rms difference from the nominal magnet in the stated and in the best pose, relative to the
+        map's rms; infinite for points that the study states inside of material.
+    map : str or None
+        Name of the map among those that the study lists; None if it lists none.
+    """
+
+    best: Registration
+    instrument: Instrument
+    others: tuple[float, ...]
+    misfit_before: float
+    misfit_after: float
+    map: str | None = None
+
+    @property
+    def text(self) -> str:
+        """Where the map lies, in words."""
+        place = ", ".join(
+            f"{1e3 * value:.2f} ± {1e3 * sd:.2g}" for value, sd in zip(
+                self.best.middle_m, self.best.translation_sd_m, strict=True))
+        axes = ", ".join(f"{name} along {axis}" for name, axis in axes_of_map(
+            self.best.instrument).items())
+        return (f"the middle of {f'map {self.map}' if self.map else 'the map'} lies at ({place}) "
+                f"mm in the magnet, with its axis {axes} of the magnet").replace("-", "−")
+
+    def apply(self, study: Study) -> Study:
+        """Return the study with the map in this pose."""
+        if self.map is None:
+            return study.with_(instrument=self.instrument)
+        return study.with_tables({self.map: {"instrument": self.instrument}})
+
+
+def find_poses(
+    study: Study, data: Data, session: Session, say: Callable[[str], None]
+) -> tuple[tuple[FoundPose, ...], Study]:
+    """Register the maps if one of them is far from the magnet's field where the study states it.
+
+    Several maps of one study are registered together, since a stage may be common to them.
+
+    Parameters
+    ----------
+    study : Study
+        Corrected for gross errors.
+    data : Dataset or dict of str to Dataset
+        The map, or the maps that the study lists.
+    session : Session
+    say : callable
+        Called with a description of each step before it starts.
+
+    Returns
+    -------
+    poses : tuple of FoundPose
+        Empty if the maps lie about where the study says, if no pose explains them, or if the study
+        is a cross-section.
+    study : Study
+        The study with the instruments of these poses.
+    """
+    if study.dimension == 2:
+        return (), study
+    several = isinstance(data, dict)
+    maps = maps_of(study, data)
+    before = {one.name: misfit_of(one.study, one.data) for one in maps}
+    if not any(each > MIN_MISFIT_OF_A_POSE for each in before.values()):
+        return (), study
+    say("the field is not that of the place that the study states: searching the pose")
+    magnet = build_magnet(study.with_(maps=()))
+    try:
+        if several:
+            found = register_maps(magnet, maps, session, say=say)
+            registered = registered_study(study, maps, found)
+        else:
+            found = {maps[0].name: register(magnet, maps[0].data, session, say=say)}
+            registered = found[maps[0].name][0].study
+    except MeasurementError as error:
+        say(f"no pose explains the map: {error}")
+        return (), study
+    poses = []
+    for one in maps_of(registered, data):
+        best, after = found[one.name][0], misfit_of(one.study, one.data)
+        if after > min(MIN_MISFIT_OF_A_POSE, max(before[one.name] / MIN_REDUCTION, GOOD)):
+            say("no pose explains the map")
+            return (), study
+        poses.append(FoundPose(
+            best, one.study.instrument,
+            tuple(float(one) for one in odds(found[one.name])[1:] if one > POSSIBLE),
+            before[one.name], after, one.name if several else None))
+    for pose in poses:
+        study = pose.apply(study)
+    return tuple(poses), study
