@@ -10,11 +10,13 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
 from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_pose import MIN_MISFIT_OF_A_POSE, misfits_of
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import apply_effects
@@ -72,9 +74,20 @@ def estimate_diagnosis(
 
     Gross errors of the maps are found, as in the diagnosis, because the magnet is solved at the
     corrected positions.
+
+    Raises
+    ------
+    MeasurementError
+        If a map does not lie where the study says: a diagnosis would register it first.
     """
     data = check_maps(study, data)
     _, corrected, starts = correct_map_errors(study, data, blocks, catalogue())
+    if study.dimension == 3 and not starts and (
+            max(misfits_of(corrected, data).values()) > MIN_MISFIT_OF_A_POSE):
+        raise MeasurementError(must_be(
+            "map", f"study {study.name}", "where the study says, for an estimate", "elsewhere",
+            "A diagnosis would find its pose; run `halbach-fe register` and estimate the "
+            "registered study."))
     blocks = blocks_of(blocks, study, corrected)
     study = apply_effects(corrected, starts[0]) if starts else corrected
     magnet = build_magnet(study)

@@ -80,6 +80,11 @@ class FoundPose:
         return study.with_tables({self.map: {"instrument": self.instrument}})
 
 
+def misfits_of(study: Study, data: Data) -> dict[str, float]:
+    """Return the `misfit_of` of each map in its stated place, by name."""
+    return {one.name: misfit_of(one.study, one.data) for one in maps_of(study, data)}
+
+
 def find_poses(
     study: Study, data: Data, session: Session, say: Callable[[str], None]
 ) -> tuple[tuple[FoundPose, ...], Study]:
@@ -105,13 +110,10 @@ def find_poses(
     study : Study
         The study with the instruments of these poses.
     """
-    if study.dimension == 2:
+    before = misfits_of(study, data)
+    if study.dimension == 2 or max(before.values()) < MIN_MISFIT_OF_A_POSE:
         return (), study
-    several = isinstance(data, dict)
-    maps = maps_of(study, data)
-    before = {one.name: misfit_of(one.study, one.data) for one in maps}
-    if not any(each > MIN_MISFIT_OF_A_POSE for each in before.values()):
-        return (), study
+    several, maps = isinstance(data, dict), maps_of(study, data)
     say("the field is not that of the place that the study states: searching the pose")
     magnet = build_magnet(study.with_(maps=()))
     try:

@@ -509,12 +509,27 @@ def test_memory_limit(study, measured, tmp_path, extra_MiB):
     assert extra_MiB > 100 or done.returncode, "the control: there is no run in so little"
 
 
+@pytest.fixture
+def start():
+    """Start a process, which ends with the test, so that a failure does not make others fail."""
+    started = []
+
+    def popen(*arguments, **keys):
+        started.append(subprocess.Popen(*arguments, **keys))
+        return started[-1]
+
+    yield popen
+    for process in started:
+        with process:
+            process.kill()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_interruption_ends_getdp_too(study, tmp_path, number):
+def test_interruption_ends_getdp_too(study, tmp_path, start, number):
     out = tmp_path / "out"
     marker = tmp_path / "pid"
     fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
-    process = subprocess.Popen(
+    process = start(
         [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(out), "--getdp",
          str(fake)], stderr=subprocess.PIPE, text=True,
         # a shell's background jobs ignore Ctrl-C, those of nohup SIGHUP: so would their children
@@ -532,11 +547,11 @@ def test_interruption_ends_getdp_too(study, tmp_path, number):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_end_of_halbach_fe_ends_wrapped_getdp(study, tmp_path, number):
+def test_the_end_of_halbach_fe_ends_wrapped_getdp(study, tmp_path, start, number):
     """A wrapper's child is GetDP, and a cluster's modules wrap it."""
     marker = tmp_path / "pid"
     fake = fake_getdp(tmp_path, f"sleep 60 & echo $! > {marker}; wait")
-    process = subprocess.Popen(
+    process = start(
         [sys.executable, "-m", "halbach_fe", "solve", str(study), "-o", str(tmp_path / "out"),
          "--getdp", str(fake)], stderr=subprocess.DEVNULL)
     while not (marker.exists() and marker.read_text().strip()):

@@ -10,9 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.map_pose import find_poses
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
@@ -30,12 +32,14 @@ def study():
     return parse_study(tomllib.loads(TEXT))
 
 
-def test_a_map_on_a_stage_is_registered_first(generator, tmp_path):
+def test_a_map_on_a_stage_is_registered_first(study, generator, tmp_path):
     """The truth is magpylib's; the pose is right, and with it nothing else is missing."""
     data = measured(truth(generator, 0.004), generator, TURN,
                     MIDDLE_M - TURN.apply(GRID.mean(axis=0)))
     write_map(field_map(GRID + STAGE_M, data["B_T"].values), tmp_path / "map.csv")
     (tmp_path / "study.toml").write_text(TEXT)
+    with pytest.raises(MeasurementError, match="halbach-fe register"):
+        estimate_diagnosis(study, read_map(tmp_path / "map.csv"))
     names = ",".join(each.name for each in catalogue() if each.name.startswith(("gain", "mapper")))
     assert main(["diagnose", str(tmp_path / "study.toml"), "--measurements",
                  str(tmp_path / "map.csv"), "--effects", names, "-o", str(tmp_path / "out")]) == 0
