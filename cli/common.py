@@ -479,7 +479,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)
         if arguments.scheduler is not None:
-            cluster = stack.enter_context(connected(arguments.scheduler))
+            cluster = stack.enter_context(connected(arguments.scheduler, say))
             opened = replace(opened, run=cluster.run, jobs=arguments.jobs or cluster.cores)
         yield opened
 
@@ -497,7 +497,7 @@ def workers(arguments: argparse.Namespace) -> Iterator[Executor]:
     if arguments.scheduler is not None:
         from halbach_fe.solver.dask_cluster import connected
 
-        with connected(arguments.scheduler) as cluster:
+        with connected(arguments.scheduler, say) as cluster:
             yield cluster.executor
         return
     pool = ProcessPoolExecutor(jobs(arguments), multiprocessing.get_context("spawn"),

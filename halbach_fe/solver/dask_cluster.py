@@ -137,13 +137,17 @@ class Cluster:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Cluster]:
+def connected(
+    address: str, say: Callable[[str], None] = lambda text: None
+) -> Iterator[Cluster]:
     """Connect to a Dask scheduler, and disconnect at the end of the context.
 
     Parameters
     ----------
     address : str
         Address of the scheduler, such as ``tcp://host:8786``.
+    say : callable, optional
+        Called with a sentence if no worker is there yet: work would wait in silence.
 
     Raises
     ------
@@ -173,6 +177,9 @@ def connected(address: str) -> Iterator[Cluster]:
             f"tcp://host:8786; instead received {address or 'an empty text'} ({error}). "
             "Start the scheduler, or correct its address.") from None
     try:
+        if not client.nthreads():
+            say(f"The scheduler {address} has no workers: waiting for the first one "
+                f"(dask worker {address}).")
         yield Cluster(client, address)
     except Exception as error:
         if type(error).__module__.startswith("distributed"):

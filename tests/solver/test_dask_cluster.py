@@ -103,6 +103,18 @@ def test_results_equal_the_local_ones(grid, tmp_path, capsys):
         tmp_path / "there" / "prediction.csv").read_bytes()
 
 
+def test_a_scheduler_without_workers_says_so(grid):
+    """The control: with a worker nothing is said."""
+    said = []
+    with connected(grid.address, said.append) as cluster:
+        grid.worker()
+        wait_for_workers(cluster, 1)
+    with connected(grid.address, said.append):
+        pass
+    (sentence,) = said
+    assert f"{grid.address} has no workers: waiting" in sentence
+
+
 def slow_getdp(getdp, folder):
     """GetDP that waits a while before it solves."""
     path = folder / "slow-getdp"
