@@ -17,6 +17,7 @@ import numpy as np
 import tomlkit
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
@@ -34,6 +35,9 @@ IRON = "#56B4E9"
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
+
+DPI = 130
+"""Resolution of figures in dots per inch."""
 
 own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
@@ -58,8 +62,10 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
 
 def png_of(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
+    figure.dpi = DPI
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
+    # savefig would draw everything twice, the first time to lay it out
+    FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 
