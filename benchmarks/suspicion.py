@@ -44,7 +44,7 @@ from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.support.unlisted import STUDY
 
-CASES = 300
+CASES = 3000
 NAMES = (
     "arm_sag", "gain_x", "gain_y", "gain_z", "mapper_roll", "mapper_tilt_x", "mapper_tilt_y",
     "misalignment_xy", "misalignment_xz", "misalignment_yx", "misalignment_yz", "misalignment_zx",
