@@ -75,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         homogeneity_summary,
         write_homogeneity,
     )
+    from halbach_fe.report.stray_field import stray_rows
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
     from halbach_fe.study.reader import read_study
 
@@ -93,5 +94,6 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_table(homogeneity_rows(found.by_name),
                            f"The field in {found.model.region.text}")
         common.print_table(harmonic_rows(found), "Spherical harmonics in ppm of the mean field")
+        common.print_table(stray_rows(found.stray_field), "Outside of the magnet")
         common.say_answer(arguments, answer(found), arguments.output / "homogeneity.html")
     return 0

@@ -55,6 +55,7 @@ from halbach_fe.response.multipoles import (
     Multipoles,
     multipole_models,
 )
+from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import Progress, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
@@ -108,6 +109,8 @@ class HomogeneityResult(ShownInNotebook):
     disagreement : str or None
         Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
         if that is not known.
+    stray_field : StrayField or None
+        How far outside the field of the last of these distributions is strong.
 
     Examples
     --------
@@ -123,6 +126,7 @@ class HomogeneityResult(ShownInNotebook):
     by_name: Mapping[str, Homogeneity]
     distributions: Mapping[str, Gaussian]
     disagreement: str | None = None
+    stray_field: StrayField | None = None
 
 
 @alone
@@ -295,7 +299,8 @@ def homogeneity(
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
-        distributions, disagreement_of(posterior))
+        distributions, disagreement_of(posterior),
+        stray_field(magnet, session, list(distributions.values())[-1]))
 
 
 @alone

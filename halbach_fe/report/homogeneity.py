@@ -19,6 +19,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 
@@ -146,6 +147,7 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
         "study": found.magnet.name, "region": asdict(found.model.region),
         "solver_error_ppm": found.model.solver_error_ppm,
         "harmonics_convention": CONVENTION,
+        "stray_field": None if found.stray_field is None else found.stray_field.summary(),
         **{name: plain_homogeneity(known) for name, known in found.by_name.items()}}
 
 
@@ -222,9 +224,10 @@ def write_homogeneity(
                          for each in known.harmonics]
                    for key in ("degree", "order", "letter", "ppm", "sd_ppm")}}, {
                 "study": found.magnet.name, "convention": CONVENTION}, temporary)
+    figures |= stray_pictures(found.stray_field)
     write_page(folder / "homogeneity.html", "homogeneity.html.j2", save(figures, folder),
                study=found.magnet.study, provenance=provenance, answer=answer(found),
                region=found.model.region.text, rows=homogeneity_rows(found.by_name),
-               sizes=SIZES,
+               sizes=SIZES, stray=stray_section(found.stray_field),
                harmonics=harmonic_rows(found), convention=CONVENTION,
                solver_error=f"{found.model.solver_error_ppm:.2g}")
