@@ -102,6 +102,13 @@ results/emphatic/measured.html: results/emphatic/measured/report.html
 results/mri4all/measured.html: results/mri4all/diagnosed/diagnosis.html
 	.venv/bin/halbach-fe report $(addprefix results/mri4all/,check registered measured diagnosed) -o $@
 
+# In the sphere of the map: the nominal magnet, the updated one, and the readings themselves.
+study-mri4all: results/mri4all/homogeneity/homogeneity.html
+results/mri4all/homogeneity/homogeneity.html: results/mri4all/measured/report.html
+	.venv/bin/halbach-fe homogeneity results/mri4all/registered/study.registered.toml -o $(@D) \
+	    --posterior results/mri4all/measured/posterior.h5 --sphere-m 0.05 \
+	    --measurements results/mri4all/check/corrected_map.csv
+
 # Everything between the wish and the shimmed magnet, on one page.
 study-mri: setup-test
 	.venv/bin/python studies/mri/run.py -o results/mri
