@@ -16,7 +16,7 @@ from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
-from halbach_fe.report.page import POSTERIOR, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
 from halbach_fe.report.prediction import (
     PublishedErrors,
     has_profile,
@@ -203,7 +203,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         there = ~np.isnan(percent[0])
         bars = axis.bar(slots[there], percent[0, there], color=POSTERIOR)
         if len(slots) <= NUMBERED_SLOTS:
-            axis.bar_label(bars, fmt="%.0f", fontsize=7)
+            axis.bar_label(bars, fmt="%.0f", fontsize=SMALL)
         axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))
         return figure
     image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
@@ -212,7 +212,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         for (ring, slot), value in np.ndenumerate(percent):
             if np.isnan(value):
                 continue
-            axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
+            axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=SMALL,
                       color="white" if value < 50 else "black")
     axis.set(ylabel="ring", yticks=range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="contraction in %")

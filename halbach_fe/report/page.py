@@ -24,7 +24,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page_record import Picture, write_record
+from halbach_fe.report.page_record import DPI, SMALLEST_PT, Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -35,9 +35,13 @@ IRON = "#56B4E9"
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
 
+SMALL = SMALLEST_PT
+"""Size of the small texts of figures in points; a figure has no smaller ones."""
+
 own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
+
 
 def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
@@ -59,7 +63,7 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
 def png_of(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
+    figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
 
 

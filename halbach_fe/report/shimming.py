@@ -27,6 +27,7 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PUBLISHED,
     SECOND,
+    SMALL,
     draw_cross_section,
     own_style,
     save,
@@ -261,7 +262,7 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
         axis.plot(*ends.T, "o" if kind == "turn" else "s", mfc="none", ms=11, mew=1.8,
                   color=SECOND if kind == "turn" else PUBLISHED)
     for end in ends:
-        axis.annotate(label, end, xytext=(6, 6), textcoords="offset points", fontsize="small",
+        axis.annotate(label, end, xytext=(6, 6), textcoords="offset points", fontsize=SMALL,
                       fontweight="bold")
 
 
