@@ -174,9 +174,11 @@ def print_diagnosis(diagnosis: Diagnosis, arguments: argparse.Namespace) -> None
     """Print the missing effects, the scores before and after, and the answer."""
     from halbach_fe.report.diagnosis import change_table, found_table, residual_table
     from halbach_fe.report.diagnosis_answer import answer
+    from halbach_fe.report.words import BAYES_FACTOR_IN_WORDS
 
     if diagnosis.found_anything:
         common.print_table(found_table(diagnosis), "Missing from the study")
+        common.say(BAYES_FACTOR_IN_WORDS)
     common.print_table(change_table(diagnosis), "The model before and after")
     common.print_table(residual_table(diagnosis), "Rms difference of model and readings")
     common.say_answer(arguments, answer(diagnosis), arguments.output / "diagnosis.html")

@@ -220,13 +220,13 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     left.set_xticks(range(0, 101, 20))
     left.set_xlabel("probability in %, if at most one effect is missing")
     if bars:
-        right.barh(range(len(bars)), [value for _, value, _ in bars],
+        right.barh(range(len(bars)), [value / np.log(10) for _, value, _ in bars],
                    color=[colour for *_, colour in bars])
         right.set_yticks(range(len(bars)), [name for name, *_ in bars])
         right.set_xscale("log")  # factors range from a few to 1e5
-        right.set_xlim(left=1)
-        right.axvline(DETECTION_LOG_ODDS, color=MEASURED, lw=0.8, ls="--")
-        right.set_xlabel("log Bayes factor")
+        right.set_xlim(left=0.3)
+        right.axvline(DETECTION_LOG_ODDS / np.log(10), color=MEASURED, lw=0.8, ls="--")
+        right.set_xlabel("power of ten of the Bayes factor")
     else:
         right.text(0.5, 0.5, "no effect was identified", ha="center", transform=right.transAxes)
         right.set_axis_off()

@@ -53,7 +53,7 @@ def score_table(result: InferenceResult,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading": NOTHING if score.chi2_posterior is None
-            else f"{score.chi2_posterior:.3g}",
+            else decimals(score.chi2_posterior),
         }
         if published is not None:
             inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
