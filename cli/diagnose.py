@@ -157,7 +157,7 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
     if as_json:
         common.print_json(estimate.as_dict())
         return 0
-    from halbach_fe.diagnosis.pace import duration
+    from halbach_fe.core.pace import duration
     from halbach_fe.response.resource_estimate import TIME_FACTOR
 
     common.print_estimate(estimate.update, as_json=False)

@@ -458,8 +458,7 @@ class InferenceResult(ShownInNotebook):
                 "rare, and the largest change of a block is "
                 f"{float(change.max(initial=0.0)):.1f} prior standard deviations. An effect is "
                 "missing from the model (geometry, position or unit of the readings, iron, ...), "
-                "so its error bars are too small. `halbach-fe check` tests the map by itself, "
-                "`register` finds where it lies, and `diagnose` finds what is missing.")
+                "so its error bars are too small.")
 
     def relative_error(self, prediction: Prediction) -> Floats:
         """Return ``|measured - predicted| / |measured|`` (readings,); NaN for readings of 0."""

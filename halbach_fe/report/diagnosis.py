@@ -35,7 +35,7 @@ from halbach_fe.report.diagnosis_answer import (
     titles_of_rivals,
 )
 from halbach_fe.report.diagnosis_figures import states
-from halbach_fe.report.magnet_view_3d import view_of_inference
+from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.page import own_style, save, write_page
 from halbach_fe.report.unknown_cause import more_readings, unknown_advice
 from halbach_fe.report.words import (
@@ -147,6 +147,7 @@ def write_diagnosis_report(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, answer=answer(diagnosis), assumptions=assumptions,
         shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(diagnosis.after),
+        view_colours=colours_in_words(diagnosis.after),
         rows=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
                 "Bayes factor": bayes_factor(finding.log_bayes_factor), "kind": finding.kind}
                for finding in other_findings(diagnosis)]

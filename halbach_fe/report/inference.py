@@ -14,7 +14,7 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
-from halbach_fe.report.magnet_view_3d import view_of_inference
+from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
 from halbach_fe.report.prediction import (
@@ -139,7 +139,7 @@ def write_inference_report(
             result.study.noise.position_sd_m or () if result.study.noise else ())],
         solver_error=_solver_error(result), superposition=ppm(
             PPM * float(result.response.superposition_error)),
-        view=view_of_inference(result))
+        view=view_of_inference(result), view_colours=colours_in_words(result))
 
 
 def _solver_error(result: InferenceResult) -> str:

@@ -129,10 +129,15 @@ def _without_empty_cells(value: Any) -> Any:
     return "" if value is None else value
 
 
-def stacked_axes(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    """Return a figure, and its axes in rows that share the x axis; ``ratios`` are heights."""
+def stacked_axes(
+    rows: int, ratios: Sequence[float] | None = None, shared: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure, and its axes in rows; ``ratios`` are heights.
+
+    ``shared`` tells whether they share the x axis.
+    """
     figure = Figure(figsize=(8, 2.4 + 1.7 * rows), layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=True, squeeze=False,
+    axes = figure.subplots(rows, 1, sharex=shared, squeeze=False,
                            gridspec_kw={"height_ratios": ratios or [1] * rows})
     for axis in axes[:, 0]:
         axis.grid(alpha=0.3)
