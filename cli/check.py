@@ -40,7 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     data = read_map(arguments.map)
     if arguments.output is not None:  # before the check, which may take a minute
         common.own_folder(arguments, "halbach-fe check")
-    check = check_map(data, say=(lambda _: None) if arguments.json else common.say)
+    with common.progress_bar("checking") as show:
+        check = check_map(data, (lambda _: None) if arguments.json else common.say, show)
     if arguments.output is not None:
         write_map_check(data, check, arguments.output, {
             "map": common.digest(arguments.map)})

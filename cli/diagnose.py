@@ -157,7 +157,7 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
     if as_json:
         common.print_json(estimate.as_dict())
         return 0
-    from halbach_fe.diagnosis.pace import duration
+    from halbach_fe.core.pace import duration
     from halbach_fe.response.resource_estimate import TIME_FACTOR
 
     common.print_estimate(estimate.update, as_json=False)
@@ -174,9 +174,11 @@ def print_diagnosis(diagnosis: Diagnosis, arguments: argparse.Namespace) -> None
     """Print the missing effects, the scores before and after, and the answer."""
     from halbach_fe.report.diagnosis import change_table, found_table, residual_table
     from halbach_fe.report.diagnosis_answer import answer
+    from halbach_fe.report.words import BAYES_FACTOR_IN_WORDS
 
     if diagnosis.found_anything:
         common.print_table(found_table(diagnosis), "Missing from the study")
+        common.say(BAYES_FACTOR_IN_WORDS)
     common.print_table(change_table(diagnosis), "The model before and after")
     common.print_table(residual_table(diagnosis), "Rms difference of model and readings")
     common.say_answer(arguments, answer(diagnosis), arguments.output / "diagnosis.html")

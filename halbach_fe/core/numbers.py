@@ -23,6 +23,9 @@ HIGHEST_DEGREE = 20
 """Highest degree of a spherical harmonic: those in the bore fall with a power of the radius, and
 points on the sphere grow with the square of the degree."""
 
+TINY = 1e-6
+"""Size below which a number that is shown to people is zero."""
+
 DENSITY = 1000, 20000
 """Smallest and largest density of a magnet in kg/m^3; 7.5 is one in g/cm^3."""
 
@@ -40,6 +43,19 @@ on long text."""
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d{1,4})?", re.ASCII)
 """Decimal numbers as programs print them, including Fortran's exponent letter D."""
+
+
+def decimals(value: float, digits: int = 3) -> str:
+    """Return a number for people: so many significant digits, no exponent, thousands apart.
+
+    It is "0" below `TINY`.
+    """
+    if abs(value) < TINY:
+        return "0"
+    text = f"{value:.{digits}g}"
+    if "e" not in text:
+        return text
+    return f"{float(text):,.0f}".replace(",", "\u202f") if abs(value) > 1 else f"{value:.7f}"
 
 
 def parse_number(cell: str) -> float:

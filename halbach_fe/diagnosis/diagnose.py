@@ -32,6 +32,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
@@ -43,7 +44,6 @@ from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
-from halbach_fe.diagnosis.pace import Pace
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,
     estimate_position_noise,

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
+from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
 from halbach_fe.diagnosis.hypothesis import Hypothesis
@@ -31,7 +32,7 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.mesh import with_rough_mesh
-from halbach_fe.solver.session import Progress, Session
+from halbach_fe.solver.session import Session
 from halbach_fe.study.model import FIELD_KEYS, Study
 
 MAX_PLACE_STEPS, PLACE_TOLERANCE = 20, 0.1

@@ -5,6 +5,7 @@ changes.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.core.numbers import decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
@@ -278,8 +280,10 @@ class OtherFinding:
         Size of the finding.
     sentence : str
         The finding in a sentence.
-    place, factor : str
-        Place and log Bayes factor, if there are any.
+    place : str
+        Its place, if there is one.
+    log_bayes_factor : float
+        NaN if there is none.
     instead : str
         Standard names of findings that the map does not distinguish from this one.
     """
@@ -290,7 +294,7 @@ class OtherFinding:
     amount: str
     sentence: str
     place: str = EMPTY_CELL
-    factor: str = EMPTY_CELL
+    log_bayes_factor: float = math.nan
     instead: str = EMPTY_CELL
 
 
@@ -333,15 +337,16 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             f"up to {1e3 * cause.largest_error_T:.2g} mT, {cause.largest_over_noise:.2g} times the "
             "noise",
             "The solver's own error explains the misfit: chi² per reading is "
-            f"{cause.chi2_noise:.3g} for the noise alone and {cause.chi2_errors:.3g} with that "
-            "error. Refine `mesh` or move `open_boundary` outwards, and diagnose the map again."))
+            f"{decimals(cause.chi2_noise)} for the noise alone and "
+            f"{decimals(cause.chi2_errors)} with that error. Refine `mesh` or move "
+            "`open_boundary` outwards, and diagnose the map again."))
     for noise in diagnosis.position_noise:
         size, where = f"{1e3 * noise.sd_m:.2g} mm", f"map {noise.map}" if noise.map else ""
         found.append(OtherFinding(
             "vibration", "random errors of the probe's positions", "noise",
             f"{size} along each axis",
             f"The probe's positions{f' in {where}' if where else ''} have random errors of {size} "
-            "along each axis.", where or EMPTY_CELL, f"{noise.log_bayes_factor:.1f}"))
+            "along each axis.", where or EMPTY_CELL, noise.log_bayes_factor))
     return found
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
@@ -159,7 +160,7 @@ class Overlap:
     def disagreement(self) -> str:
         """A sentence if the two maps do not agree, else an empty string."""
         where = (f"Where they overlap, map {self.name} is {1e3 * self.rms_T:.3g} mT rms off what "
-                 f"map {self.by} predicts (chi² per reading is {self.chi2:.3g}, where 1 is "
+                 f"map {self.by} predicts (chi² per reading is {decimals(self.chi2)}, where 1 is "
                  "expected")
         if self.chi2 > self.limit:
             return (f"{where} and more than {self.limit:.2g} is rare): they are not of the same "
@@ -450,8 +451,8 @@ class InferenceResult(ShownInNotebook):
             if chi2 > max(TOO_FAR, 1 + 5 * np.sqrt(2 / count)):
                 return (f"Held-out readings{words} are {np.sqrt(chi2):.3g} times farther from "
                         "their predictions than these and the noise allow (chi² per reading is "
-                        f"{chi2:.3g}): sigma_T is too small, an effect is missing from the model, "
-                        "or these readings are not of this magnet.")
+                        f"{decimals(chi2)}): sigma_T is too small, an effect is missing from the "
+                        "model, or these readings are not of this magnet.")
         return ""
 
     @property
@@ -462,13 +463,12 @@ class InferenceResult(ShownInNotebook):
             return ""
         free = self.prior.sd > 0  # a missing block has no parameters to change
         change = np.abs(self.posterior.mean - self.prior.mean)[free] / self.prior.sd[free]
-        return (f"Prior, model and readings cannot all be right: chi² per reading is {chi2:.3g}, "
-                f"where 1 is expected and more than {self.conflict_limit:.2g} is rare, and the "
-                f"largest change of a block is {float(change.max(initial=0.0)):.1f} prior standard "
-                "deviations. An effect is missing from the model (geometry, position or unit of "
-                "the readings, iron, ...), so its error bars are too small. `halbach-fe check` "
-                "tests the map by itself, `register` finds where it lies, and `diagnose` finds "
-                "what is missing.")
+        return ("Prior, model and readings cannot all be right: chi² per reading is "
+                f"{decimals(chi2)}, where 1 is expected and more than {self.conflict_limit:.2g} is "
+                "rare, and the largest change of a block is "
+                f"{float(change.max(initial=0.0)):.1f} prior standard deviations. An effect is "
+                "missing from the model (geometry, position or unit of the readings, iron, ...), "
+                "so its error bars are too small.")
 
     def relative_error(self, prediction: Prediction) -> Floats:
         """Return ``|measured - predicted| / |measured|`` (readings,); NaN for readings of 0."""

@@ -25,6 +25,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
@@ -83,6 +84,9 @@ for it to be kept. Without any drift it changed by -2 % to +1.3 % in four maps o
 GROUPS = (slice(None), GAINS, OFFSETS, TURNS, SENSORS, MIXING)
 """Parameters that must help to predict: all together, those that change during the scan, places of
 the sensors, and their directions and gains."""
+
+CONFIRMATIONS = 1 + len(GROUPS)
+"""Number of fits that compare what the parameters predict."""
 
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
@@ -245,7 +249,10 @@ class MapCheck:
             "floor_rms_T": self.floor_rms_T, "suffices": self.suffices}
 
 
-def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> MapCheck:
+def check_map(
+    data: xr.Dataset, say: Callable[[str], None] = lambda _: None,
+    progress: Progress | None = None,
+) -> MapCheck:
     """Check whether a field map obeys Maxwell's equations, without a model of the magnet.
 
     Parameters
@@ -253,7 +260,10 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     data : Dataset
         The map, see `halbach_fe.read_map`.
     say : callable, optional
-        Called with a description of each step before it starts.
+        Called with a description of each step before it starts, and now and then with the time
+        left of a step that takes long.
+    progress : callable, optional
+        Called with the numbers of finished and of all parts of a step.
 
     Returns
     -------
@@ -301,16 +311,17 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     lines = scan_lines(points)
     chosen = usable & _some_lines(lines, usable)
     time = _time(data, len(points))
-    say("step 1 of 4: comparing the orientations of the probe")
+    pace = Pace(say, progress)
+    _begin(pace, 1, "comparing the orientations of the probe")
     places, readings = points[chosen], field[chosen]
     spacing = point_spacing(places)
     directions = _directions(points, lines)
     held_out = _held_out(lines, chosen)  # nothing that follows sees them, until the floor
     train_rows = chosen & ~held_out
     seen = points[train_rows], field[train_rows], time[train_rows], directions[train_rows]
-    matrix, alike = _orientation(*seen, spacing)
-    say("step 2 of 4: fitting the field and the instrument")
-    gap, sensors, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing)
+    matrix, alike = _orientation(*seen, spacing, pace)
+    _begin(pace, 2, "fitting the field and the instrument")
+    gap, sensors, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing, pace)
     # around all rows, of which those that are not fitted are read too
     charges = Charges.around(_read_at(points[usable], sensors), gap)
     turned = field @ matrix.T
@@ -319,12 +330,13 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
     model = model.weighted(train, train_rows)
     # the prior width of the field, now that the instrument no longer counts as noise
     fit = model.fit(train, train_rows)
-    say("step 3 of 4: asking each change of the instrument to predict scan lines")
-    model, train = _confirmed(model, train_rows, _held_out(lines, train_rows), fit, train)
-    for _ in range(WEIGHTINGS):
+    _begin(pace, 3, "asking each change of the instrument to predict scan lines")
+    model, train = _confirmed(model, train_rows, _held_out(lines, train_rows), fit, train, pace)
+    for number in range(WEIGHTINGS):
         model = model.weighted(train, train_rows)
         train = fit_probe(model, train_rows, fit, train)
-    say("step 4 of 4: fitting all scan lines")
+        pace.advance(CONFIRMATIONS + number + 1, CONFIRMATIONS + WEIGHTINGS)
+    _begin(pace, 4, "fitting all scan lines")
     whole = fit_probe(model, chosen, fit, train)
     far_off = spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
                      usable)
@@ -356,6 +368,12 @@ def check_map(data: xr.Dataset, say: Callable[[str], None] = lambda _: None) -> 
         structure=_structure(points[chosen], residual[chosen]),
         redundancy=1 - whole.used / (3 * int(chosen.sum())), excluded=~usable,
         residual_T=residual @ matrix, corrected_T=model.ideal(train))
+
+
+def _begin(pace: Pace, step: int, what: str) -> None:
+    """Say which step begins."""
+    pace.say(f"step {step} of 4: {what}")
+    pace.begin(f"step {step} of 4")
 
 
 def _rms(residual: Floats) -> Floats:
@@ -415,7 +433,7 @@ def _named(matrix: Floats) -> tuple[str, str, str]:
 
 
 def _orientation(
-    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float
+    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float, pace: Pace
 ) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
     """Return the matrix of the orientation, and others that fit as well.
 
@@ -437,13 +455,14 @@ def _orientation(
         fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
         against[number] = float(3 * len(some) * np.log(fitted.sigma)
                                 + fitted.instrument @ fitted.instrument / 2)
+        pace.advance(len(against), len(left))
     alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
     best = 0 if 0 in alike else min(alike, key=lambda number: against[number])
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
 
 
 def _gap(
-    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float
+    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float, pace: Pace
 ) -> tuple[float, Floats, HarmonicFit]:
     """Return the distance in m of the charges, where the sensors are, and the fit of the field.
 
@@ -458,9 +477,10 @@ def _gap(
     (perfect,) = fit_fields(start.charges, points[some], [field[some]])
     instrument = fit_probe(start, np.ones(len(some), bool), perfect)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
-    for probe in (instrument, start.start(perfect)):
+    probes = instrument, start.start(perfect)
+    for number, probe in enumerate(probes):
         read_at = _read_at(points, probe.sensors_m)
-        for gap in GAPS:
+        for place, gap in enumerate(GAPS):
             near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
             if near or gap == GAPS[-1]:
                 model = ProbeModel(Charges.around(read_at, gap * spacing), points, field, time,
@@ -468,6 +488,7 @@ def _gap(
                 fit = model.fit(probe, every)
                 evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
                 found.append((evidence, gap, probe, fit))
+            pace.advance(number * len(GAPS) + place + 1, len(probes) * len(GAPS))
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe.sensors_m, fit
 
@@ -484,7 +505,7 @@ def _read_at(points: Floats, sensors: Floats) -> Floats:
 
 def _confirmed(
     model: ProbeModel, rows: NDArray[np.bool_], left_out: NDArray[np.bool_], fit: HarmonicFit,
-    start: ProbeFit,
+    start: ProbeFit, pace: Pace,
 ) -> tuple[ProbeModel, ProbeFit]:
     """Return the model without the parameters that do not help to predict some of the rows.
 
@@ -499,7 +520,8 @@ def _confirmed(
         return float(np.linalg.norm(_rms(off))), fitted
 
     error, start = predicted(model)
-    for group in GROUPS:
+    for number, group in enumerate(GROUPS, 1):
+        pace.advance(number, CONFIRMATIONS + WEIGHTINGS)
         trial = model.without(group)
         other, fitted = predicted(trial)
         if other <= error * PREDICTS:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.core.numbers import decimals
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
@@ -54,7 +55,7 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
     return [{
         "map": each.name, "as predicted by map": each.by,
         "readings": f"{each.readings}{' held out' if each.held_out else ''}",
-        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "chi²/reading": f"{each.chi2:.3g}",
+        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "chi²/reading": decimals(each.chi2),
         "verdict": "they disagree" if each.disagreement else "they agree"}
         for each in result.overlaps]
 

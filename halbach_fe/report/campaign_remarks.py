@@ -49,15 +49,17 @@ def _out_of_date(chapters: Sequence[Chapter]) -> list[str]:
     present = {digest for one in chapters for digest in one.record.files.values()}
     found = []
     for one in chapters:
+        names: dict[str, list[str]] = {}
         for path, digest in one.record.inputs.items():
             name = PurePath(path).name
             holders = [other for other in chapters if other is not one
                        and name in {PurePath(file).name for file in other.digests.values()}]
             if holders and digest not in present:
-                found.append(
-                    f"{one.label} is out of date: it was computed with another {name} than "
-                    f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}. Run "
-                    f"{one.record.command} again, or leave out what does not belong to it.")
+                hold = f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}"
+                names.setdefault(hold, []).append(name)
+        found += [f"{one.label} is out of date: it was computed with another {_in_a_row(files)} "
+                  f"than {hold}. Run {one.record.command} again, or leave out what does not belong "
+                  "to it." for hold, files in names.items()]
     return found
 
 
@@ -170,5 +172,10 @@ def _short(value: Any) -> str:
 
 def _listed(chapters: Sequence[Chapter]) -> str:
     """Return the names of folders in words."""
-    *others, last = (one.label for one in chapters)
+    return _in_a_row([one.label for one in chapters])
+
+
+def _in_a_row(names: Sequence[str]) -> str:
+    """Return names in words: one, two and three."""
+    *others, last = names
     return f"{', '.join(others)} and {last}" if others else last

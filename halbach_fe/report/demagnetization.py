@@ -83,14 +83,16 @@ def answer(found: DemagnetizationMap) -> Answer:
         "Do the blocks keep their magnetization?",
         f"At {temperature:g} °C {start}. The smallest margin is "
         f"{1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
-        "As far as coercivity and coefficients of the study are right: data sheets state them "
+        "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (--across makes "
         f"cells smaller); shares of the volume hardly depend on that.{nonlinear}",
         *(("Choose a grade of a higher coercivity for these blocks (the table says which), or a "
            "lower temperature. What is lost is found in a measurement.",
            "halbach-fe diagnose STUDY --measurements MAP -o DIR") if lost > 0 else
           ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
-           "halbach-fe forces STUDY -o DIR")))
+           "halbach-fe forces STUDY -o DIR") if found.study.dimension == 3 else
+          ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
+           "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")))
 
 
 @own_style

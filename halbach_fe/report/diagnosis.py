@@ -35,10 +35,16 @@ from halbach_fe.report.diagnosis_answer import (
     titles_of_rivals,
 )
 from halbach_fe.report.diagnosis_figures import states
-from halbach_fe.report.magnet_view_3d import view_of_inference
+from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.page import own_style, save, write_page
 from halbach_fe.report.unknown_cause import more_readings, unknown_advice
-from halbach_fe.report.words import flux_density, fraction
+from halbach_fe.report.words import (
+    BAYES_FACTOR_IN_WORDS,
+    bayes_factor,
+    decimals,
+    flux_density,
+    fraction,
+)
 
 FIGURES = {
     "groups": (figures.groups, "Chi² per reading of groups of readings, each group predicted from "
@@ -46,9 +52,10 @@ FIGURES = {
     "residuals": (figures.residuals, "Standardized leave-one-out residuals of the training "
                   "readings"),
     "probabilities": (figures.probabilities, "Left: posterior probability of each effect of the "
-                      "catalogue, if at most one effect is missing and nothing else. Right: log "
-                      "Bayes factors of the identified effects and of their alternatives; the "
-                      "dashed line is the threshold"),
+                      "catalogue, if at most one effect is missing and nothing else. Right: how "
+                      "many times as probable the readings are with each identified effect, or an "
+                      "alternative of it, as without (Bayes factor); the dashed line is the "
+                      "threshold"),
     "profile": (figures.profile, "The readings with the largest residuals before the diagnosis, "
                 "the predictions of the updated models, and their residuals; the band holds 95 % "
                 "of the residuals by the uncertainty of prediction and noise"),
@@ -62,13 +69,14 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Return the rows of a table of all findings, as text."""
     titles = catalogue_titles(diagnosis)
     found = [{"effect": finding.title, "place": finding.place, "amplitude": finding.amount,
-              "log Bayes factor": finding.factor, "it could be": finding.instead}
+              "Bayes factor": bayes_factor(finding.log_bayes_factor),
+              "it could be": finding.instead}
              for finding in other_findings(diagnosis)]
     return found + [
         {"effect": title_of(effect.hypothesis.effect.name, titles),
          "place": place_in_words(effect.place),
          "amplitude": "; ".join(amounts(effect)),
-         "log Bayes factor": f"{effect.selection.log_bayes_factor:.3g}",
+         "Bayes factor": bayes_factor(effect.selection.log_bayes_factor),
          "it could be": ", ".join(titles_of_rivals(effect, titles)) or EMPTY_CELL}
         for effect in diagnosis.identified]
 
@@ -81,7 +89,7 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
         region = "" if fit.region == ALL_READINGS else f", {fit.region}"
         rows.append({"readings": f"{fit.part}{region}", "count": str(fit.readings)} | {
             name: " → ".join(text(getattr(fits[number], key)) for fits in found)
-            for name, key, text in (("chi²/reading", "chi2_per_reading", _figure),
+            for name, key, text in (("chi²/reading", "chi2_per_reading", decimals),
                                     ("95 % band holds", "coverage95", fraction))})
     return rows
 
@@ -139,8 +147,9 @@ def write_diagnosis_report(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, answer=answer(diagnosis), assumptions=assumptions,
         shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(diagnosis.after),
+        view_colours=colours_in_words(diagnosis.after),
         rows=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
-                "log Bayes factor": finding.factor, "kind": finding.kind}
+                "Bayes factor": bayes_factor(finding.log_bayes_factor), "kind": finding.kind}
                for finding in other_findings(diagnosis)]
         + [_entry(effect, titles) for effect in diagnosis.identified],
         changes=change_table(diagnosis), residuals=residual_table(diagnosis),
@@ -157,9 +166,9 @@ def write_diagnosis_report(
         further=[_further_measurements(effect, own, titles) for effect in diagnosis.identified
                  if (own := [pair for pair in separations
                              if pair.identified == effect.hypothesis])],
-        ground={"found": DETECTION_LOG_ODDS, "certain": math.exp(DETECTION_LOG_ODDS),
-                "alike": INDISTINGUISHABLE_LOG_EVIDENCE,
-                "odds": round(1 / EFFECT_PRIOR_ODDS), "enough": SEPARATING_GAIN,
+        ground={"certain": math.exp(DETECTION_LOG_ODDS),
+                "alike": math.exp(INDISTINGUISHABLE_LOG_EVIDENCE),
+                "odds": round(1 / EFFECT_PRIOR_ODDS), "enough": math.exp(SEPARATING_GAIN),
                 "discoveries": DISCOVERIES},
         advice=unknown_advice(diagnosis.unknown) if diagnosis.unknown else
         " ".join(map(more_readings, diagnosis.suspected)) if diagnosis.suspected else
@@ -167,7 +176,7 @@ def write_diagnosis_report(
         "(`instrument_sd`)." if diagnosis.before.terms is not None else
         "None of the candidate measurements would distinguish the effects from their alternatives."
         if any(rivals(effect) for effect in diagnosis.identified) else "",
-        study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
+        in_words=BAYES_FACTOR_IN_WORDS, study_file=STUDY_FILE, summary_file=SUMMARY_FILE)
 
 
 def _disagreement_summary(found: Sequence[ResidualGroup]) -> str:
@@ -177,17 +186,18 @@ def _disagreement_summary(found: Sequence[ResidualGroup]) -> str:
         return f"none of {len(found)}"
     worst = max(wrong, key=lambda group: group.chi2_per_reading)
     return (f"{len(wrong)} of {len(found)}, most of all {worst.name} "
-            f"({worst.chi2_per_reading:.2g})")
+            f"({decimals(worst.chi2_per_reading, 2)})")
 
 
 def _equivalence_sentence(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
     """Name the effects that the readings cannot distinguish from an identified effect."""
-    found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {factor:.1f}"
+    found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {bayes_factor(factor)}"
              for title, (candidate, factor) in zip(
                  titles_of_rivals(identified, titles), rivals(identified), strict=True)]
     name = title_of(identified.hypothesis.effect.name, titles)
-    return (f"Instead of {name} (log Bayes factor {identified.selection.log_bayes_factor:.1f}), "
-            f"the cause may equally well be: {'; '.join(found)}.")
+    own = bayes_factor(identified.selection.log_bayes_factor)
+    return (f"Instead of {name} (Bayes factor {own}), the cause may equally well be: "
+            f"{'; '.join(found)}.")
 
 
 def _entry(identified: IdentifiedEffect, titles: dict[str, str]) -> dict[str, str]:
@@ -196,7 +206,7 @@ def _entry(identified: IdentifiedEffect, titles: dict[str, str]) -> dict[str, st
     return {"finding": title_of(effect.name, titles),
             "place": place_in_words(identified.place) or EMPTY_CELL,
             "amplitude": "; ".join(text.replace(" ", "\u00a0") for text in amounts(identified)),
-            "log Bayes factor": f"{identified.selection.log_bayes_factor:.1f}",
+            "Bayes factor": bayes_factor(identified.selection.log_bayes_factor),
             "kind": effect.kind}
 
 
@@ -216,9 +226,4 @@ def _further_measurements(
 
 def _gain(value: float) -> str:
     """Format a gain in the log Bayes factor."""
-    return f"{max(value, 0.0):.1f}" if value < 1000 else "over 1000"
-
-
-def _figure(value: float) -> str:
-    """Format a number with three digits."""
-    return f"{value:.3g}"
+    return bayes_factor(max(value, 0.0))

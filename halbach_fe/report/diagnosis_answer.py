@@ -26,6 +26,7 @@ from halbach_fe.report.unknown_cause import (
     unknown_advice,
     unknown_sentences,
 )
+from halbach_fe.report.words import decimals
 
 UNUSUAL_AMPLITUDE = 20.0
 """Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
@@ -95,15 +96,15 @@ def _found(diagnosis: Diagnosis) -> list[str]:
                  else f"Nothing is missing that {these} can show:")
         agree = "the maps agree" if several else "the map agrees"
         sentences.append(f"{start} {agree} with the study within noise (chi² per reading "
-                         f"{after.prior_conflict:.3g}).")
+                         f"{decimals(after.prior_conflict)}).")
     if unknown is not None:
         sentences += unknown_sentences(unknown, bool(diagnosis.identified))
     elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
         disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
         sentences.append(
             f"{disagree} with the study (chi² per reading "
-            f"{after.prior_conflict:.3g}, where {after.conflict_limit:.3g} would be rare), and "
-            "no effect of the catalogue explains the difference, nor does a smooth field or "
+            f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
+            "and no effect of the catalogue explains the difference, nor does a smooth field or "
             "sensor error. Check the noise of the study.")
     for suspicion in diagnosis.suspected:
         sentences.append(suspicion_in_words(suspicion, titles))
@@ -119,14 +120,15 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.solver_error:
         return sentences
     if diagnosis.identified:
-        held = ["".join(f", and {fit.chi2_per_reading:.3g} for held-out readings"
+        held = ["".join(f", and {decimals(fit.chi2_per_reading)} for held-out readings"
                         for fit in [each for each in fits if each.part != TRAINING][:1])
                 for fits in (region_scores(before, diagnosis.loo_residuals_before),
                               region_scores(after, diagnosis.loo_residuals_after))]
         added = "this effect" if len(diagnosis.identified) == 1 else "these effects"
         sentences.append(
             f"With {added} in the model, chi² per training reading is "
-            f"{after.prior_conflict:.3g}{held[1]} (before: {before.prior_conflict:.3g}{held[0]}).")
+            f"{decimals(after.prior_conflict)}{held[1]} (before: "
+            f"{decimals(before.prior_conflict)}{held[0]}).")
         if _fails(diagnosis) and diagnosis.unknown is None:
             sentences.append("That is still too large: another cause is missing.")
     sentences += [

@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, SMALL
 from halbach_fe.report.prediction import axis_of_readings
 
 MAX_BARS = 8
@@ -95,7 +95,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
                               state.marker, ms=6, color=state.colour, clip_on=False,
                               mfc=state.colour if group.disagrees else "white")
             axis.plot([], [], state.marker, color=state.colour, label=state.when)
-        axis.set_yticks(range(len(names)), names, fontsize="small")
+        axis.set_yticks(range(len(names)), names, fontsize=SMALL)
         axis.set_ylim(len(names) - 0.4, -0.6)
         axis.set_title(GROUP_TITLES.get(kind, kind), fontsize="medium", loc="left")
         axis.grid(alpha=0.3, axis="x")
@@ -106,7 +106,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
             axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_xlim(*limits)
-    axes[0].legend(fontsize="small")
+    axes[0].legend(fontsize=SMALL)
     for axis in (axes[0], axes[-1]):
         axis.set_xlabel("chi² per reading (1 expected)")
     return figure
@@ -215,18 +215,18 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
-        left.text(100 * value + 1, height, said, va="center", fontsize="small")
+        left.text(100 * value + 1, height, said, va="center", fontsize=SMALL)
     left.set_xlim(0, 130)
     left.set_xticks(range(0, 101, 20))
     left.set_xlabel("probability in %, if at most one effect is missing")
     if bars:
-        right.barh(range(len(bars)), [value for _, value, _ in bars],
+        right.barh(range(len(bars)), [value / np.log(10) for _, value, _ in bars],
                    color=[colour for *_, colour in bars])
         right.set_yticks(range(len(bars)), [name for name, *_ in bars])
         right.set_xscale("log")  # factors range from a few to 1e5
-        right.set_xlim(left=1)
-        right.axvline(DETECTION_LOG_ODDS, color=MEASURED, lw=0.8, ls="--")
-        right.set_xlabel("log Bayes factor")
+        right.set_xlim(left=0.3)
+        right.axvline(DETECTION_LOG_ODDS / np.log(10), color=MEASURED, lw=0.8, ls="--")
+        right.set_xlabel("power of ten of the Bayes factor")
     else:
         right.text(0.5, 0.5, "no effect was identified", ha="center", transform=right.transAxes)
         right.set_axis_off()
@@ -261,7 +261,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     top.set_title(f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     top.set_ylabel(f"{label} in mT")
-    top.legend(fontsize="small")
+    top.legend(fontsize=SMALL)
     bottom.set_ylabel("measured − predicted\nin mT")
     bottom.set_xlabel(name)
     for axis in (top, bottom):

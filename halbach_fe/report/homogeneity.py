@@ -19,8 +19,12 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
+<<<<<<< HEAD
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
 from halbach_fe.report.stray_field import stray_pictures, stray_section
+=======
+from halbach_fe.report.page import POSTERIOR, PUBLISHED, SMALL, own_style, save, write_page
+>>>>>>> h24
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 
@@ -200,7 +204,7 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
         lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
                              np.where(within, deviation, np.nan), round_levels,
                              colors="black", linewidths=0.5)
-        axis.clabel(lines, fmt=ppm, fontsize=7)
+        axis.clabel(lines, fmt=ppm, fontsize=SMALL)
         axis.set_aspect("equal")
         axis.set_xlabel(f"{names[0]} in mm")
         axis.set_ylabel(f"{names[1]} in mm")

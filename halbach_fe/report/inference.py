@@ -14,10 +14,14 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
+<<<<<<< HEAD
 from halbach_fe.report.magnet_view_3d import view_of_inference
 from halbach_fe.report.magnetic_axis import axis_rows, definition
+=======
+from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
+>>>>>>> h24
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
-from halbach_fe.report.page import POSTERIOR, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
 from halbach_fe.report.prediction import (
     PublishedErrors,
     has_profile,
@@ -55,7 +59,7 @@ def score_table(result: InferenceResult,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading": NOTHING if score.chi2_posterior is None
-            else f"{score.chi2_posterior:.3g}",
+            else decimals(score.chi2_posterior),
         }
         if published is not None:
             inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
@@ -141,9 +145,13 @@ def write_inference_report(
             result.study.noise.position_sd_m or () if result.study.noise else ())],
         solver_error=_solver_error(result), superposition=ppm(
             PPM * float(result.response.superposition_error)),
+<<<<<<< HEAD
         axis=axis_rows(result.magnetic_axis), axis_definition=(
             "" if result.magnetic_axis is None else definition(result.magnetic_axis)),
         stray=stray_section(result.stray_field), view=view_of_inference(result))
+=======
+        view=view_of_inference(result), view_colours=colours_in_words(result))
+>>>>>>> h24
 
 
 def _solver_error(result: InferenceResult) -> str:
@@ -207,7 +215,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         there = ~np.isnan(percent[0])
         bars = axis.bar(slots[there], percent[0, there], color=POSTERIOR)
         if len(slots) <= NUMBERED_SLOTS:
-            axis.bar_label(bars, fmt="%.0f", fontsize=7)
+            axis.bar_label(bars, fmt="%.0f", fontsize=SMALL)
         axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))
         return figure
     image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
@@ -216,7 +224,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         for (ring, slot), value in np.ndenumerate(percent):
             if np.isnan(value):
                 continue
-            axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=7,
+            axis.text(slot + 1, ring + 1, f"{value:.0f}", ha="center", va="center", fontsize=SMALL,
                       color="white" if value < 50 else "black")
     axis.set(ylabel="ring", yticks=range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="contraction in %")

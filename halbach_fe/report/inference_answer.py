@@ -17,7 +17,8 @@ def answer(result: InferenceResult) -> Answer:
     if result.disagreement:
         return Answer(question, said,
                       f"No. Model and measurement disagree. {result.disagreement}",
-                      "Look for what the study lacks.",
+                      "Look for what the study lacks. (Before that, halbach-fe check tests the map "
+                      "by itself, and register finds where it lies.)",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
     tested = "" if result.held_out.any() else (
         " No reading was held out, so that this is no test of the predictions: hold some out by "

@@ -186,9 +186,16 @@ def view_of_inference(result: InferenceResult) -> Markup:
         f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
         for percent, error, magnetized in zip(change, sd, there, strict=True)]))
     scores = result.standardized(result.prediction_posterior)
-    return magnet_view(
-        result.magnet, values, _worst_residuals(result.observation.positions, scores),
-        _residual_vectors(result))
+    points = (_worst_residuals(result.observation.positions, scores)
+              if any(result.observation.components) else None)
+    return magnet_view(result.magnet, values, points, _residual_vectors(result))
+
+
+def colours_in_words(result: InferenceResult) -> str:
+    """Say what the colours of `view_of_inference` show."""
+    blocks = "blocks by their change along the easy axis"
+    return f"{blocks}, and measured points by the largest residual at each, over the standard " \
+        "deviation of prediction and noise" if any(result.observation.components) else blocks
 
 
 def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:

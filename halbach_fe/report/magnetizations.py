@@ -11,7 +11,16 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    SECOND,
+    SMALL,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import decimals, fraction
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
@@ -126,7 +135,7 @@ def _magnetizations_figure(
                   mew=2, label="truth", zorder=3)
         axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
         axis.grid(alpha=0.3)
-    axes[0].legend(ncols=4, fontsize="small")
+    axes[0].legend(ncols=4, fontsize=SMALL)
     axes[-1].set_xlabel("slot")
     axes[-1].set_xticks(places)
     return figure

@@ -12,7 +12,16 @@ from matplotlib.figure import Figure
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SECOND, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    SECOND,
+    SMALL,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
@@ -71,7 +80,7 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("units of 1e-4")
-    axes[1].legend(fontsize="small")
+    axes[1].legend(fontsize=SMALL)
     return figure
 
 

@@ -25,7 +25,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page_record import Picture, write_record
+from halbach_fe.report.page_record import DPI, SMALLEST_PT, Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -36,12 +36,18 @@ IRON = "#56B4E9"
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
 
+<<<<<<< HEAD
 DPI = 130
 """Resolution of figures in dots per inch."""
+=======
+SMALL = SMALLEST_PT
+"""Size of the small texts of figures in points; a figure has no smaller ones."""
+>>>>>>> h24
 
 own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
+
 
 def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
@@ -64,8 +70,12 @@ def png_of(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     figure.dpi = DPI
     buffer = io.BytesIO()
+<<<<<<< HEAD
     # savefig would draw everything twice, the first time to lay it out
     FigureCanvasAgg(figure).print_png(buffer)
+=======
+    figure.savefig(buffer, format="png", dpi=DPI)
+>>>>>>> h24
     return buffer.getvalue()
 
 
@@ -131,10 +141,15 @@ def _without_empty_cells(value: Any) -> Any:
     return "" if value is None else value
 
 
-def stacked_axes(rows: int, ratios: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    """Return a figure, and its axes in rows that share the x axis; ``ratios`` are heights."""
+def stacked_axes(
+    rows: int, ratios: Sequence[float] | None = None, shared: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure, and its axes in rows; ``ratios`` are heights.
+
+    ``shared`` tells whether they share the x axis.
+    """
     figure = Figure(figsize=(8, 2.4 + 1.7 * rows), layout="constrained")
-    axes = figure.subplots(rows, 1, sharex=True, squeeze=False,
+    axes = figure.subplots(rows, 1, sharex=shared, squeeze=False,
                            gridspec_kw={"height_ratios": ratios or [1] * rows})
     for axis in axes[:, 0]:
         axis.grid(alpha=0.3)

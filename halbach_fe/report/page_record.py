@@ -6,6 +6,7 @@ read HTML.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -18,6 +19,15 @@ from halbach_fe.report.answer import Answer
 from halbach_fe.study.model import Study
 
 PAGE_RECORD = "page.json"
+
+DPI = 130
+"""Pixels per inch of the figures."""
+
+SMALLEST_PT = 9
+"""Size of the smallest texts of a figure, in points of 1/72 inch."""
+
+LEGIBLE_PX, POINTS_PER_INCH = 9, 72
+"""Size in px at which a text can still be read on a screen."""
 
 LONGEST_TEXT = 10_000
 """Largest number of characters of a text. The longest answers have some thousand."""
@@ -38,6 +48,13 @@ class Picture(NamedTuple):
     png: str
     caption: str
     file: str = ""
+
+    @property
+    def legible_px(self) -> int:
+        """Width in px of a page below which its smallest texts could not be read."""
+        header = base64.b64decode(self.png[:32])  # signature, length and name of the first chunk
+        width = int.from_bytes(header[16:20], "big")
+        return round(width * LEGIBLE_PX / (SMALLEST_PT * DPI / POINTS_PER_INCH))
 
 
 def _cleaned(text: str) -> str:

@@ -91,10 +91,10 @@ def panels(points: Floats) -> list[Panel]:
 
     if np.ptp(from_middle) <= 10 * SAME * from_middle.max():
         return [unrolled(f"on the sphere of {2e3 * from_middle.mean():.4g} mm diameter", every)]
-    steps = np.round(radii / (SAME * size)).astype(int)
-    if len(different := np.unique(steps)) <= FEW_RADII:
-        return [unrolled(f"at the radius of {1e3 * radii[steps == one].mean():.4g} mm",
-                         np.flatnonzero(steps == one)) for one in different[::-1] if one]
+    different, number = _different(radii, SAME * size)
+    if len(different) <= FEW_RADII and np.abs(radii - different[number]).max() <= SAME * size:
+        return [unrolled(f"at the radius of {1e3 * radius:.4g} mm", np.flatnonzero(number == one))
+                for one, radius in reversed(list(enumerate(different))) if radius > SAME * size]
     spacing = point_spacing(points)
     found = []
     for axis in (1, 2):  # from the side, and from the end
@@ -105,9 +105,22 @@ def panels(points: Floats) -> list[Panel]:
     return found or [unrolled("all points", every)]
 
 
+def _different(values: Floats, apart: float) -> tuple[Floats, Ints]:
+    """Return the different ones (m,) of values (n,), increasing, and the number (n,) of each value.
+
+    Values that differ from their neighbours by no more than ``apart``, such as by rounding, are the
+    same; their mean stands for them.
+    """
+    order = np.argsort(values, kind="stable")
+    number = np.empty(len(values), np.intp)
+    number[order] = np.append(0, np.cumsum(np.diff(values[order]) > apart))
+    return np.asarray(np.bincount(number, values) / np.bincount(number)), number
+
+
 def _angle(points: Floats) -> Floats:
     """Return the angles (n,) of points (n, 3) about z, from 0 to 360 degrees."""
-    return np.asarray(np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360, np.float64)
+    angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    return np.asarray(np.where(angle > 360 - SAME, 0.0, angle), np.float64)  # -1e-17 is 0
 
 
 def _slice(points: Floats, chosen: Ints, across: int) -> Panel:
@@ -121,8 +134,8 @@ def _slice(points: Floats, chosen: Ints, across: int) -> Panel:
 
 def draw(axis: Axes, panel: Panel, values: Floats, **colours: Any) -> ScalarMappable:
     """Draw values (n,) at the points of a panel: as cells if they fill a grid, else as squares."""
-    columns, column = np.unique(panel.first.round(3), return_inverse=True)
-    rows, row = np.unique(panel.second.round(2), return_inverse=True)
+    columns, column = _different(panel.first, SAME * float(np.ptp(panel.first)))
+    rows, row = _different(panel.second, SAME * float(np.ptp(panel.second)))
     if len(columns) * len(rows) == len(values) and min(len(columns), len(rows)) > 1:
         grid = np.full((len(rows), len(columns)), np.nan)
         grid[row, column] = values

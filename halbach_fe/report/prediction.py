@@ -22,7 +22,7 @@ from halbach_fe.inference.result import (
     Prediction,
 )
 from halbach_fe.measurement.scan_lines import point_spacing
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, stacked_axes
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SMALL, stacked_axes
 from halbach_fe.report.point_maps import curve, residual_figure, unit_for
 
 MARKERS: dict[str, dict[str, Any]] = {
@@ -223,7 +223,7 @@ def relative_error_figure(result: InferenceResult, published: PublishedErrors | 
                               label=f"{name}, {part}", **MARKERS[part])
     axis.set_xlabel(line.axis)
     axis.set_ylabel(f"|measured − predicted| / |measured| of {line.what}")
-    axis.legend(ncols=2, fontsize="small")
+    axis.legend(ncols=2, fontsize=SMALL)
     return figure
 
 
@@ -241,7 +241,7 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.2, lw=0)
         axis.set_ylabel(f"standardized\nresidual, {name}")
         _scale(axis, scores)
-    axes[0].legend(ncols=3, fontsize="small", loc="upper right",
+    axes[0].legend(ncols=3, fontsize=SMALL, loc="upper right",
                    markerscale=5 if len(result.readings) > CROWD else 1)
     axes[1].set_xlabel(label)
     return figure

@@ -17,7 +17,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, PUBLISHED, own_style, save, write_page
-from halbach_fe.report.words import counted, fraction
+from halbach_fe.report.words import counted, fraction, p_value
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -29,16 +29,25 @@ SIMULATIONS = 1000
 
 
 def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
-    """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values."""
+    """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values.
+
+    Columns of p-values are left out if no type has enough blocks for the test.
+    """
+    tested = _tested(prior)
     return [
         {"type": samples.label, "n": str(len(samples.deviations)),
          **{f"{name} in {unit}": f"{mean:+.2f}{sd}" for name, unit, mean, sd in zip(
              DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
              ["" if np.isnan(sd) else f" ± {sd:.2f}" for sd in _sd_of_type(samples)],
              strict=False)},
-         **{f"p {name}": NOTHING if np.isnan(p) else f"{p:.2g}"
-            for name, p in zip(DIRECTIONS, samples.p, strict=False)}}
+         **{f"p {name}": NOTHING if np.isnan(p) else p_value(p)
+            for name, p in zip(DIRECTIONS, samples.p, strict=False) if tested}}
         for samples in prior.types]
+
+
+def _tested(prior: MeasuredPrior) -> bool:
+    """Whether any type has enough blocks to test their distribution."""
+    return any(not np.isnan(samples.p).all() for samples in prior.types)
 
 
 def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
@@ -74,7 +83,7 @@ def answer(prior: MeasuredPrior) -> Answer:
                 if prior.placed else "Which block is in which slot is not known: all blocks of a "
                 "type have its mean and spread."))
     odd = [samples.label for samples in prior.types if not samples.normal]
-    tested = any(not np.isnan(samples.p).all() for samples in prior.types)
+    tested = _tested(prior)
     trust = ("Yes: it is what the table says. No type has enough blocks to test whether their "
              "deviations are distributed normally"
              + (", which does not matter where each block is known." if prior.placed else ".")
@@ -116,7 +125,7 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
             _deviations_figure(prior), "Deviation of each block from the study's magnetization: "
             "along it, and across it")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
-               summary=summary, rows=type_table(prior), answer=answer(prior))
+               summary=summary, rows=type_table(prior), tested=_tested(prior), answer=answer(prior))
 
 
 def _mean_of_type(samples: TypeSamples) -> Floats:

@@ -18,7 +18,7 @@ from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
-from halbach_fe.report.words import counted, flux_density, with_error
+from halbach_fe.report.words import counted, decimals, flux_density, with_error
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -66,9 +66,9 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
         said = ("This magnet does not explain the map. The least bad answer: "
                 f"{said[0].lower()}{said[1:]}")
         trust.insert(0, (
-            f"Even in the best pose and with updated blocks chi² is {best.chi2:.3g} per reading, "
-            "where about 1 is expected: the map is of another magnet, its noise is larger than the "
-            "study says, or the study lacks something."))
+            f"Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
+            "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
+            "than the study says, or the study lacks something."))
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *(
@@ -140,7 +140,7 @@ def pose_table(
                 f"{1e3 * value:.2f}" for value in turn_from_axes(each.instrument)),
             "sd in mrad": ", ".join(f"{1e3 * value:.2f}" for value in each.rotation_sd_rad),
             "nominal" if before == NOMINAL else "before": _rms_in_words(each.nominal_rms_T),
-            "updated": _rms_in_words(each.rms_T), "chi²/reading": f"{each.chi2:.3g}"})
+            "updated": _rms_in_words(each.rms_T), "chi²/reading": decimals(each.chi2)})
     return rows
 
 

@@ -17,7 +17,7 @@ from halbach_fe.design.ring_design import Designed, RingDesign
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import slices_figure
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SMALL, own_style, save, write_page
 from halbach_fe.report.words import ppm
 from halbach_fe.study.edit_file import write_edited
 
@@ -130,7 +130,7 @@ def side_figure(found: Designed) -> Figure:
             1e3 * ring.ring_length_m, 1e3 * (ring.outer_radius_m - ring.inner_radius_m),
             facecolor=PRIOR, edgecolor="white"))
         axis.annotate(str(ring.blocks_per_ring), (1e3 * ring.z_m, 1e3 * ring.outer_radius_m),
-                      ha="center", va="bottom", fontsize=9)
+                      ha="center", va="bottom", fontsize=SMALL)
     centre, half = found.region.centre_m, found.region.half_axes_m
     t = np.linspace(0, np.pi, 91)
     if found.region.shape == "cylinder":

@@ -17,7 +17,7 @@ from scipy import stats
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.summary import EMPTY_CELL
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SMALL, own_style, save, write_page
 from halbach_fe.report.words import fraction
 from halbach_fe.study.model import Study
 
@@ -163,11 +163,12 @@ def _confusion(confusion: Confusion) -> Figure:
     axis = figure.subplots()
     axis.imshow(np.where(counts, counts, np.nan), cmap="Blues", vmin=0, vmax=counts.max())
     for row, column in np.argwhere(counts):
-        axis.text(column, row, f"{counts[row, column]:.0f}", ha="center", va="center", fontsize=7,
+        axis.text(column, row, f"{counts[row, column]:.0f}", ha="center", va="center",
+                  fontsize=SMALL,
                   color="white" if counts[row, column] > counts.max() / 2 else "black")
     axis.set(xlabel="identified", ylabel="hidden")
-    axis.set_xticks(range(len(columns)), map(title_of_hidden, columns), rotation=90, fontsize=7)
-    axis.set_yticks(range(len(hidden)), map(title_of_hidden, hidden), fontsize=7)
+    axis.set_xticks(range(len(columns)), map(title_of_hidden, columns), rotation=90, fontsize=SMALL)
+    axis.set_yticks(range(len(hidden)), map(title_of_hidden, hidden), fontsize=SMALL)
     return figure
 
 
@@ -186,7 +187,7 @@ def _reliability(kinds: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
         axis.plot(stated, [row["happened"] for row in rows], "o", color=POSTERIOR)
         for row in rows:
             axis.annotate(f"{row['statements']:.0f}", (row["stated"], row["happened"]),
-                          textcoords="offset points", xytext=(6, -10), fontsize=8)
+                          textcoords="offset points", xytext=(6, -10), fontsize=SMALL)
         axis.set(title=kind, xlabel="probability stated", ylabel="frequency", xlim=(-0.03, 1.06),
                  ylim=(-0.06, 1.06))
     return figure

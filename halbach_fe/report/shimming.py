@@ -27,12 +27,13 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PUBLISHED,
     SECOND,
+    SMALL,
     draw_cross_section,
     own_style,
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, place_of, ppm, probability
+from halbach_fe.report.words import counted, place_of, ppm, probability, with_error
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
@@ -223,7 +224,7 @@ def _convention(shim: Shim) -> str:
         return (f"{SIZES} Ranges contain the uncertainty of the blocks after the update; after the "
                 "moves also that of mounting and of replaced blocks.")
     before, after = (main_in_words(shim.model, known) for known in (shim.before, shim.after))
-    first, last = (f"{1e3 * known.roll:.3g} ± {1e3 * known.roll_sd:.2g} mrad"
+    first, last = (f"{with_error(1e3 * known.roll, 1e3 * known.roll_sd)} mrad"
                    for known in (shim.before, shim.after))
     return (f"{reference_text(shim.model)} ± is the standard deviation, including the error of the "
             f"solver. Main multipole: {before} before, {after} after. It is rotated about the z "
@@ -261,7 +262,7 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
         axis.plot(*ends.T, "o" if kind == "turn" else "s", mfc="none", ms=11, mew=1.8,
                   color=SECOND if kind == "turn" else PUBLISHED)
     for end in ends:
-        axis.annotate(label, end, xytext=(6, 6), textcoords="offset points", fontsize="small",
+        axis.annotate(label, end, xytext=(6, 6), textcoords="offset points", fontsize=SMALL,
                       fontweight="bold")
 
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.pace import Progress as Progress
 from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import Plate
 from halbach_fe.geo.solid import PER_M, solid
 from halbach_fe.geo.step_file import Group, Occurrence, Solid, step_text
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.prism import Prism, circle
-
-Progress = Callable[[int, int], None]
-"""Takes the number of solids made and their total number."""
 
 UNIT = "Unit: mm. z is the axis of the magnet; angles count from x, counter-clockwise from +z"
 

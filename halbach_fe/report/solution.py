@@ -137,15 +137,20 @@ def field_table(solution: Solution) -> list[dict[str, str]]:
 
 
 def field_figure(solution: Solution) -> Figure:
-    """Draw the components along a line or a circle, with the error bars below, or as maps."""
+    """Draw the components along a line or a circle, with the error bars below, or as maps.
+
+    Error bars of Fourier coefficients are drawn by their order.
+    """
     if (along := curve(solution.points)) is None:
         return maps_figure(solution.points, {
             f"B{name}": 1e3 * column
             for name, column in zip(COMPONENTS, solution.flux_density.T, strict=True)}, "mT")
     place, label = along
-    bars = curve(solution.observation.positions)
+    fourier = not any(solution.observation.components)
+    bars = ((np.array([float(name[1:]) for name in solution.observation.labels]), "harmonic")
+            if fourier else curve(solution.observation.positions))
     below = bars if solution.errors.any() else None  # blocks in vacuum have none
-    figure, (top, *others) = stacked_axes(2 if below else 1, [2, 1] if below else [1])
+    figure, (top, *others) = stacked_axes(2 if below else 1, [2, 1] if below else [1], not fourier)
     order = np.argsort(place, kind="stable")
     for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], COLOURS,
                                          solution.flux_density.T, strict=False):
@@ -155,6 +160,7 @@ def field_figure(solution: Solution) -> Figure:
     top.legend(ncols=3)
     if below:
         others[0].semilogy(below[0], 1e6 * solution.errors, ".", ms=3, color=MEASURED)
-        others[0].set_ylabel("error bar in µT")
-    (others or [top])[-1].set_xlabel(label)
+        others[0].set(ylabel="error bar in µT", xlabel=below[1])
+    if not below or fourier:
+        top.set_xlabel(label)
     return figure

@@ -112,8 +112,8 @@ def answer(found: SortedBlocks) -> Answer:
     if not found.has_choice and not found.turned:
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
-            f"{text(best)} {unit}.", "Blocks go only into slots of their own type, and here every "
-            "slot has its own.", "Let slots take the same blocks by prior.types of the study"
+            f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, and here "
+            "every slot has its own.", "Let slots take the same blocks by prior.types of the study"
             f"{types_in_words(found.alike)}, or measure spare blocks, and sort again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
     spread, prior = _uncertainty(found), found.study.prior
@@ -160,7 +160,7 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
                                   found.turn_deg[rows].T, strict=True))}, {
                 "content": "blocks that are turned in their slots: rotation vectors along own axes"
             }, temporary)
-    figures = {"sort_orders.png": (
+    figures = {} if not np.ptp(found.random) else {"sort_orders.png": (
         _random_orders_figure(found), f"Histogram of the root mean square of {_axis_text(found)} "
         f"for {len(found.random)} random orders of the blocks; the lines are the order of the "
         "table and the sorted blocks")}

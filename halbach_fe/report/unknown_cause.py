@@ -7,6 +7,7 @@ import numpy as np
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Suspicion, UnknownCause, UnknownPart
 from halbach_fe.diagnosis.summary import place_in_words
+from halbach_fe.report.words import bayes_factor
 
 COORDINATES = {
     "z": "z", "angle": "the azimuth", "radius": "the radius", "time": "the time",
@@ -51,8 +52,8 @@ def unknown_sentences(unknown: UnknownCause, beside_effects: bool) -> list[str]:
              "them" if unknown.ambiguous else "Something outside the catalogue "
              + ("remains" if beside_effects else "is missing"))
     sentences = [f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
-                 f"{1e3 * unknown.largest_T:.2g} mT (log Bayes factor "
-                 f"{unknown.log_bayes_factor:.0f})."]
+                 f"{1e3 * unknown.largest_T:.2g} mT (Bayes factor "
+                 f"{bayes_factor(unknown.log_bayes_factor)})."]
     if unknown.parts:
         sentences.append("It looks like " + "; and ".join(map(part_in_words, unknown.parts)) + ".")
     if unknown.source_m is not None:

@@ -22,6 +22,7 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
+    SMALL,
     THIRD,
     axis_of_points,
     geometry_figure,
@@ -179,7 +180,7 @@ def _convergence_figure(found: Verification) -> Figure:
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3, which="both")
-    figure.legend(loc="outside upper center", ncols=2, fontsize="small")
+    figure.legend(loc="outside upper center", ncols=2, fontsize=SMALL)
     return figure
 
 
@@ -194,5 +195,5 @@ def _change_figure(found: Verification) -> Figure:
                       label=difference.what.replace("_", " "))
     axis.set(xlabel=label, ylabel="|change of B| in µT")
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    figure.legend(loc="outside upper center", ncols=2, fontsize="small")
+    figure.legend(loc="outside upper center", ncols=2, fontsize=SMALL)
     return figure

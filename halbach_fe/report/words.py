@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.diagnosis.summary import EMPTY_CELL, block_in_words
 from halbach_fe.geometry.blocks import MagnetBlock
 
@@ -14,6 +15,15 @@ ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
 
 
+CERTAIN = 100
+"""Power of ten beyond which a Bayes factor is not told in detail."""
+
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+BAYES_FACTOR_IN_WORDS = ("The Bayes factor of an effect says how many times as probable the "
+                         "readings are with it as without it.")
+
+
 def flux_density(value: float, digits: int = 3) -> str:
     """Format a flux density in T as mT, or as T or µT if it is large or small."""
     if np.isnan(value):
@@ -21,14 +31,6 @@ def flux_density(value: float, digits: int = 3) -> str:
     size, unit = ((value, "T") if abs(value) >= LARGE_T else (1e3 * value, "mT")
                   if abs(value) >= SMALL_T or not value else (1e6 * value, "µT"))
     return f"{decimals(size, digits)}\u00a0{unit}"
-
-
-def decimals(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, without an exponent; 0 if it is tiny."""
-    if abs(value) < 1e-6:
-        return "0"
-    text = f"{value:.{digits}g}"
-    return text if "e" not in text else f"{value:.0f}" if abs(value) > 1 else f"{value:.7f}"
 
 
 def with_error(value: float, sd: float) -> str:
@@ -49,6 +51,21 @@ def probability(share: float) -> str:
     """Return a probability in per cent, without claiming certainty."""
     return ("less than 0.1\u00a0%" if share < 1e-3 else "more than 99.9\u00a0%"
             if share > 0.999 else f"{100 * share:.3g}\u00a0%")
+
+
+def bayes_factor(log_bayes_factor: float) -> str:
+    """Return how many times as probable the readings are with an effect as without it.
+
+    Large factors are powers of ten, and no larger one than `CERTAIN` is claimed.
+    """
+    if np.isnan(log_bayes_factor):
+        return EMPTY_CELL
+    power = log_bayes_factor / np.log(10)
+    if power >= CERTAIN:
+        return f"over 10{str(CERTAIN).translate(RAISED)} : 1"
+    if power >= 4:
+        return f"10{str(int(power)).translate(RAISED)} : 1"
+    return f"{decimals(float(np.exp(log_bayes_factor)), 2)} : 1"
 
 
 def p_value(value: float) -> str:

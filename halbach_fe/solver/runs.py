@@ -20,10 +20,11 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, NotConvergedError, OutputError
 from halbach_fe.core.files import is_full, make_folder
+from halbach_fe.core.pace import Progress
 from halbach_fe.core.temporary_files import remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import Job
-from halbach_fe.solver.session import Progress, RunSize, Session
+from halbach_fe.solver.session import RunSize, Session
 
 NEWTON_HISTORY = "newton.csv"
 """File in the run folder with the relative residual of every Newton step."""

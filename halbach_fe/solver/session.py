@@ -12,6 +12,7 @@ from typing import ParamSpec, TypeVar
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.numbers import check_number
+from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Run, find_getdp
@@ -23,10 +24,6 @@ runs, with the real materials and with vacuum in their place."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-Progress = Callable[[int, int], None]
-"""A function that is called with the number of finished solves and the number of all solves."""
-
 
 @dataclass(frozen=True)
 class RunSize:

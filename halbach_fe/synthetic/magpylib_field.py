@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
+from halbach_fe.core.pace import Progress as Progress
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.plane_field import plane_field
@@ -45,9 +46,6 @@ AT_ONCE = 10_000
 
 SEARCHED = 1_000_000
 """Largest number of bodies times points that are searched for equal positions: 24 MB."""
-
-Progress = Callable[[int, int], None]
-"""Function that is called with the amount of work done and its total."""
 
 Piece = tuple[Shape, Fractions, Fractions]
 """A shape, and the fractions of its thickness and half width that limit a part of it.

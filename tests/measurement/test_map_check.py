@@ -97,7 +97,14 @@ def test_scan_lines():
 
 
 def test_a_perfect_instrument(generator):
-    check = check_map(field_map(GRID, read_by(generator)))
+    said, shown = [], []
+    check = check_map(field_map(GRID, read_by(generator)), said.append,
+                      lambda *counts: shown.append(counts))
+    assert list(dict.fromkeys(line.partition(":")[0] for line in said)) == [
+        f"step {number} of 4" for number in range(1, 5)]
+    steps = {total: done for done, total in shown}
+    assert steps == {total: total for total in steps}  # every step comes to its end
+    assert len(steps) >= 2  # a clean map has one orientation, and the last step is one fit
     assert check.orientation == ("x", "y", "z")
     assert not check.is_reoriented
     assert check.suffices

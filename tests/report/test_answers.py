@@ -31,7 +31,7 @@ from halbach_fe.report import (
     verification,
 )
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.words import decimals, flux_density, ppm, with_error
+from halbach_fe.report.words import bayes_factor, decimals, flux_density, ppm, with_error
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -203,6 +203,21 @@ def test_page_and_terminal_say_the_same(tmp_path, capsys):
     assert f"infer {study} --measurements MAP --blocks {blocks}" in said
     assert "12 measured blocks" in shown["said"]
     assert json.loads((tmp_path / "prior.json").read_text())["blocks"] == 12
+
+
+@pytest.mark.parametrize(("nats", "said"), [
+    (np.log(2.5), "2.5 : 1"), (np.log(140), "140 : 1"), (83.0, "10³⁶ : 1"),
+    (5e5, "over 10¹⁰⁰ : 1"), (np.nan, "–")])
+def test_bayes_factors_in_words(nats, said):
+    """Of 83 nats the power of ten is 36.05."""
+    assert bayes_factor(nats) == said
+
+
+@pytest.mark.parametrize(("value", "digits", "said"), [
+    (43870.0, 3, "43\u202f900"), (999.6, 3, "1\u202f000"), (0.50649, 3, "0.506"),
+    (2e-5, 2, "0.0000200"), (1e-9, 3, "0"), (-1234.0, 2, "-1\u202f200")])
+def test_decimals_have_no_exponent(value, digits, said):
+    assert decimals(value, digits) == said
 
 
 def test_paths_in_a_command_are_quoted():

@@ -293,7 +293,18 @@ def another_material(home):
             [home / "study.toml", home / "inferred" / "posterior.h5"])
 
 
+def other_results(home):
+    for name, verb, read, wrote in (("one", "sort", ["map.csv", "blocks.csv"], []),
+                                    ("two", "simulate-measurement", [], ["map.csv", "blocks.csv"])):
+        for file in read:
+            (home / file).write_text("an older one")
+        results(home / name, verb, reads=[home / "study.toml", *(home / file for file in read)],
+                files=wrote)
+
+
 @pytest.mark.parametrize(("change", "said"), [
+    (other_results, "one is out of date: it was computed with another map.csv and blocks.csv than "
+     "two holds. Run halbach-fe sort again, or leave out what does not belong to it."),
     (lambda home: (home / "field" / "solve.png").write_text("x"),
      "Changed since the run in field: solve.png."),
     (another_posterior, "ppm is out of date: it was computed with another posterior.h5 than "

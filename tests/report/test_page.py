@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 
 import matplotlib
+import matplotlib.image
 import pytest
 from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import own_style, save, write_page
+from halbach_fe.report.page import SMALL, own_style, save, write_page
+from halbach_fe.report.page_record import DPI, LEGIBLE_PX
 from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page
 
@@ -88,6 +91,37 @@ def test_every_page_has_its_own_style():
             if isinstance(node, ast.FunctionDef) and "save(" in ast.unparse(node) and (
                     path.name, node.name) != ("page.py", "save"):
                 assert [ast.unparse(one) for one in node.decorator_list] == ["own_style"], node.name
+
+
+def test_texts_of_figures_can_be_read(tmp_path):
+    """On a narrow screen a figure is pushed sideways instead of shrunk to nothing."""
+    figure = Figure(figsize=(8, 1))
+    figure.text(0.5, 0.5, "small", fontsize=SMALL)
+    picture, = save({"one.png": (figure, SEEN)}, tmp_path)
+    width_px = matplotlib.image.imread(tmp_path / "one.png").shape[1]
+    assert SMALL / 72 * DPI * picture.legible_px / width_px >= LEGIBLE_PX  # of the text, as shown
+    path = tmp_path / "page.html"
+    write_page(path, "calibration.html.j2", [picture], parse_study(DIPOLE), answer=ANSWER,
+               results={})
+    assert f'style="min-width: {picture.legible_px}px"' in path.read_text()
+    assert re.search(r'<div class="wide"><img [^>]*></div><figcaption>', path.read_text())
+
+
+def test_no_text_of_a_figure_is_smaller():
+    found = {path.name: small_texts(path.read_text())
+             for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
+    assert not any(found.values()), found
+    for code in ('axis.legend(fontsize="small")', "axis.text(0, 0, 'x', fontsize=7)",
+                 "axis.tick_params(labelsize=8)"):  # the controls
+        assert small_texts(code)
+
+
+def small_texts(code):
+    """Sizes of texts in a program that are neither SMALL nor as large as the others."""
+    allowed = {"SMALL", "'medium'", "'large'"}
+    return [ast.unparse(node.value) for node in ast.walk(ast.parse(code))
+            if isinstance(node, ast.keyword) and node.arg in ("fontsize", "labelsize")
+            and ast.unparse(node.value) not in allowed]
 
 
 @pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend", "nonsense", "tkagg"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
 
 from halbach_fe.measurement.positions import on_grid
 from halbach_fe.report.point_maps import curve, maps_figure, panels, residual_figure
@@ -45,6 +46,19 @@ def test_every_panel_shows_many_points(points, titles, lengths):
         assert len(panel.points) > 20
         assert len(np.unique(np.column_stack([panel.first, panel.second]).round(3), axis=0)) == len(
             panel.points)
+
+
+def test_rounding_does_not_tear_a_circle_apart(generator):
+    """Radii and angles that differ in the last bits are the same; the control is 1 mm."""
+    points = np.vstack([circle(0.075, 64, z, start=0.0) for z in np.linspace(-0.2, 0.2, 9)])
+    points *= 1 + 1e-14 * generator.standard_normal(points.shape)
+    shown, = panels(points)
+    assert len(shown.points) == len(points)
+    figure = maps_figure(points, {"Bx": points[:, 0]}, "mT")
+    mesh, = (part for part in figure.axes[0].collections if isinstance(part, QuadMesh))
+    assert mesh.get_array().shape == (64, 9)
+    points[:64, :2] *= 0.076 / 0.075
+    assert len(panels(points)) == 2
 
 
 def test_what_is_zero_is_not_drawn():

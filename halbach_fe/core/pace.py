@@ -1,4 +1,4 @@
-"""The time that a diagnosis takes: progress within its steps, time left, and the limit."""
+"""The time that a long search takes: progress within its steps, time left, and the limit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from halbach_fe.solver.session import Progress
+Progress = Callable[[int, int], None]
+"""Takes the numbers of finished and of all parts of a step."""
 
 QUIET_S = 10.0
 """Time in s between two lines about the progress of one step."""
