@@ -19,12 +19,8 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
-<<<<<<< HEAD
-from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
-from halbach_fe.report.stray_field import stray_pictures, stray_section
-=======
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, SMALL, own_style, save, write_page
->>>>>>> h24
+from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 

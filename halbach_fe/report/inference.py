@@ -14,12 +14,8 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
-<<<<<<< HEAD
-from halbach_fe.report.magnet_view_3d import view_of_inference
-from halbach_fe.report.magnetic_axis import axis_rows, definition
-=======
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
->>>>>>> h24
+from halbach_fe.report.magnetic_axis import axis_rows, definition
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
 from halbach_fe.report.prediction import (
@@ -145,13 +141,10 @@ def write_inference_report(
             result.study.noise.position_sd_m or () if result.study.noise else ())],
         solver_error=_solver_error(result), superposition=ppm(
             PPM * float(result.response.superposition_error)),
-<<<<<<< HEAD
         axis=axis_rows(result.magnetic_axis), axis_definition=(
             "" if result.magnetic_axis is None else definition(result.magnetic_axis)),
-        stray=stray_section(result.stray_field), view=view_of_inference(result))
-=======
-        view=view_of_inference(result), view_colours=colours_in_words(result))
->>>>>>> h24
+        stray=stray_section(result.stray_field), view=view_of_inference(result),
+        view_colours=colours_in_words(result))
 
 
 def _solver_error(result: InferenceResult) -> str:

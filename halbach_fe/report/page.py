@@ -36,13 +36,8 @@ IRON = "#56B4E9"
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
 
-<<<<<<< HEAD
-DPI = 130
-"""Resolution of figures in dots per inch."""
-=======
 SMALL = SMALLEST_PT
 """Size of the small texts of figures in points; a figure has no smaller ones."""
->>>>>>> h24
 
 own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
@@ -70,12 +65,8 @@ def png_of(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     figure.dpi = DPI
     buffer = io.BytesIO()
-<<<<<<< HEAD
     # savefig would draw everything twice, the first time to lay it out
     FigureCanvasAgg(figure).print_png(buffer)
-=======
-    figure.savefig(buffer, format="png", dpi=DPI)
->>>>>>> h24
     return buffer.getvalue()
 
 
