@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
 
-from halbach_fe.report.page import POSTERIOR, SECOND
+from halbach_fe.report.page import POSTERIOR, SECOND, SMALL
 from halbach_fe.report.words import decimals, with_error
 from halbach_fe.response.stray_field import NEAREST, StrayField
 
@@ -117,7 +117,7 @@ def stray_figure(stray: StrayField) -> Figure:
             lines = axis.contour(first, second, size, np.log(thin), colors="#777777",
                                  linewidths=0.6, linestyles="solid")
             axis.clabel(lines, fmt=lambda level: decimals(1e3 * float(np.exp(level)), 2),
-                        fontsize=7)
+                        fontsize=SMALL)
         if low < stray.limit_T < high:
             axis.contour(first, second, size, [np.log(stray.limit_T)], colors=POSTERIOR,
                          linewidths=2, linestyles="solid")
