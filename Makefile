@@ -69,9 +69,10 @@ study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrup
 	.venv/bin/halbach-fe diagnose studies/$*/study.toml -o results/$*/diagnosis \
 	    --measurements results/$*/campaign/map.csv --held-out results/$*/campaign/held-out.csv
 
-# The measured magnets: raw map, Maxwell's check, where the map lies, the updated blocks.
-study-emphatic: results/emphatic/measured/report.html
-study-mri4all: results/mri4all/measured/report.html
+# The measured magnets, each on one page: raw map, Maxwell's check, where the map lies, the updated
+# blocks, what is missing.
+study-emphatic: results/emphatic/measured.html
+study-mri4all: results/mri4all/measured.html
 
 results/emphatic/body.csv: studies/emphatic/measured/body_scan.csv | setup
 	.venv/bin/halbach-fe import-map $< -o $@ --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
@@ -92,6 +93,20 @@ results/emphatic/measured/report.html: results/emphatic/registered/study.registe
 	.venv/bin/halbach-fe infer $< -o $(@D)
 results/mri4all/measured/report.html: results/mri4all/registered/registration.html
 	.venv/bin/halbach-fe infer results/mri4all/registered/study.registered.toml -o $(@D) \
+	    --measurements results/mri4all/check/corrected_map.csv
+results/mri4all/diagnosed/diagnosis.html: results/mri4all/measured/report.html
+	.venv/bin/halbach-fe diagnose results/mri4all/registered/study.registered.toml -o $(@D) \
+	    --measurements results/mri4all/check/corrected_map.csv --check results/mri4all/check/check.json
+results/emphatic/measured.html: results/emphatic/measured/report.html
+	.venv/bin/halbach-fe report $(addprefix results/emphatic/,body fringe registered measured) -o $@
+results/mri4all/measured.html: results/mri4all/diagnosed/diagnosis.html
+	.venv/bin/halbach-fe report $(addprefix results/mri4all/,check registered measured diagnosed) -o $@
+
+# In the sphere of the map: the nominal magnet, the updated one, and the readings themselves.
+study-mri4all: results/mri4all/homogeneity/homogeneity.html
+results/mri4all/homogeneity/homogeneity.html: results/mri4all/measured/report.html
+	.venv/bin/halbach-fe homogeneity results/mri4all/registered/study.registered.toml -o $(@D) \
+	    --posterior results/mri4all/measured/posterior.h5 --sphere-m 0.05 \
 	    --measurements results/mri4all/check/corrected_map.csv
 
 # Everything between the wish and the shimmed magnet, on one page.

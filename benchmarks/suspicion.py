@@ -3,8 +3,10 @@
 Effects have the prior odds that the diagnosis states, and amplitudes from its priors, so that its
 probabilities should be true. Half of the cases have an effect, to see many suspicions; each kind of
 case is weighted by its prior probability. The field is magpylib's. The magnet is that of
-`benchmarks.unknown`, and the catalogue is that of the effects that are drawn. Cases are judged at
-the first linearization, which is exact for such small effects.
+`benchmarks.unknown`, and the catalogue is that of the effects that are drawn. Cases in which
+nothing is named are judged at the first linearization, which is exact for such small effects. An
+effect that is named may be large, and what its linearization leaves looks like another one: there
+the whole diagnosis tells what is suspected, with the named effect in the model.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from benchmarks.note import Note
 from benchmarks.unknown import FOLDER
 from halbach_fe.cli import common
 from halbach_fe.core.files import write_text
+from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.model_selection import (
     EFFECT_PRIOR_ODDS,
@@ -31,7 +34,7 @@ from halbach_fe.diagnosis.model_selection import (
     prior_log_odds,
     with_candidates,
 )
-from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
 from halbach_fe.diagnosis.unknown_cause import SUSPECTED, families_of, judge, suspicions
@@ -44,7 +47,7 @@ from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.support.unlisted import STUDY
 
-CASES = 300
+CASES = 3000
 NAMES = (
     "arm_sag", "gain_x", "gain_y", "gain_z", "mapper_roll", "mapper_tilt_x", "mapper_tilt_y",
     "misalignment_xy", "misalignment_xz", "misalignment_yx", "misalignment_yz", "misalignment_zx",
@@ -110,13 +113,21 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
             suspected: list[list[Any]] = []
             if probability_at_most(search, named) >= SUSPECTED:
                 judgement = judge(search, update, named, flexible)
-                suspected = [[list(one.effects), one.probability]
-                             for one in suspicions(judgement, search.hypotheses)]
+                suspected = _listed(suspicions(judgement, search.hypotheses))
+            if named and suspected:
+                whole = diagnose(STUDY, data, replace(session, folder=session.folder / str(seed)),
+                                 effects=effects)
+                named, suspected = whole.identified, _listed(whole.suspected)
             found.append({
                 "seed": seed, "hidden": name, "suspected": suspected,
                 "named": [effect.selection.candidate.effect for effect in named]})
             write_text(path, json.dumps(found) + "\n")
     return found
+
+
+def _listed(found: Sequence[Suspicion]) -> list[list[Any]]:
+    """Return the effects and the probability of each suspicion."""
+    return [[list(one.effects), one.probability] for one in found]
 
 
 def reliability(found: list[dict[str, Any]]) -> dict[str, float]:

@@ -3,6 +3,8 @@
 The region is a sphere, an ellipsoid or a cylinder: by default that of the study's table
 [homogeneity], or else the sphere about the centre of the magnet of half the radius of the bore.
 With --posterior the magnet is the measured one, otherwise those that the study's prior allows.
+With --measurements the homogeneity of the map itself is beside it, of a harmonic fit of its
+readings.
 Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and its
 figures.
 """
@@ -24,6 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_arguments(parser)
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
+    parser.add_argument("--measurements", type=common.input_file, metavar="MAP",
+                        help="measured map, whose own homogeneity is shown beside the magnet's")
     add_region_arguments(parser)
     parser.add_argument("--degrees", type=int, choices=range(1, HIGHEST_DEGREE + 1), metavar="L",
                         help=f"largest degree of the spherical harmonics, 1 to {HIGHEST_DEGREE} "
@@ -68,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import homogeneity
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.measurement.field_map import read_map
     from halbach_fe.report.homogeneity import (
         answer,
         harmonic_rows,
@@ -75,23 +80,27 @@ def run(arguments: argparse.Namespace) -> int:
         homogeneity_summary,
         write_homogeneity,
     )
+    from halbach_fe.report.stray_field import stray_rows
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
     magnet, region = build_magnet(study), region_of(arguments)
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
+    data = read_map(arguments.measurements) if arguments.measurements else None
     with common.session(arguments, study) as session:
         found = homogeneity(magnet, session, region, posterior,
-                            arguments.degrees or SHOWN_DEGREES)
+                            arguments.degrees or SHOWN_DEGREES, data)
     write_homogeneity(found, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(
-            {"study file": arguments.study, "posterior": arguments.posterior})})
+            {"study file": arguments.study, "posterior": arguments.posterior,
+             "map": arguments.measurements})})
     if arguments.json:
         common.print_json(homogeneity_summary(found))
     else:
-        common.print_table(homogeneity_rows(found.by_name),
+        common.print_table(homogeneity_rows({**found.by_name, **found.of_map}),
                            f"The field in {found.model.region.text}")
         common.print_table(harmonic_rows(found), "Spherical harmonics in ppm of the mean field")
+        common.print_table(stray_rows(found.stray_field), "Outside of the magnet")
         common.say_answer(arguments, answer(found), arguments.output / "homogeneity.html")
     return 0

@@ -11,6 +11,7 @@ found.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import StudyError, must_be
@@ -40,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.inference.infer import infer, observation_of
     from halbach_fe.inference.storage import inference_summary, write_inference
     from halbach_fe.measurement.campaign import refuse_open_instruments
+    from halbach_fe.response.magnetic_axis import magnetic_axis
+    from halbach_fe.response.stray_field import stray_field
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
@@ -80,6 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
                     mapped=pool.map)
             result = with_samples(result, sampled)
             write_sampled(sampled, arguments.output)
+        result = replace(
+            result, magnetic_axis=magnetic_axis(magnet, session, result.posterior),
+            stray_field=stray_field(magnet, session, result.posterior))
     if result.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
     from halbach_fe.report.campaign_inference import (
@@ -90,6 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     from halbach_fe.report.inference import score_table, write_inference_report
     from halbach_fe.report.inference_answer import answer
+    from halbach_fe.report.magnetic_axis import axis_rows
+    from halbach_fe.report.stray_field import stray_rows
 
     write_inference(result, arguments.output)
     write_inference_report(result, arguments.output, provenance={
@@ -105,5 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_table(term_table(result), "The instruments, estimated with the blocks")
         common.print_table(pose_table(result), "Where the maps lie in the magnet")
         common.print_table(overlap_table(result), "Maps where they overlap")
+        common.print_table(axis_rows(result.magnetic_axis), "Magnetic centre, axis and roll")
+        common.print_table(stray_rows(result.stray_field), "Outside of the magnet")
         common.say_answer(arguments, answer(result), arguments.output / "report.html")
     return 0

@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     summary = solution.summary() | {
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output)}
     from halbach_fe.report.solution import answer, field_table, write_solution_report
+    from halbach_fe.report.stray_field import stray_rows
 
     write_solution_report(solution, arguments.output, {
         "study file": common.digest(arguments.study), "GetDP": solution.getdp,
@@ -53,5 +54,6 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(summary)
     else:
         common.print_table(field_table(solution), "The field at the study's positions")
+        common.print_table(stray_rows(solution.stray_field), "Outside of the magnet")
         common.say_answer(arguments, answer(solution), arguments.output / "report.html")
     return 0

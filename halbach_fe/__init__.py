@@ -61,11 +61,15 @@ if TYPE_CHECKING:
     from halbach_fe.report.campaign_report import campaign_report as campaign_report
     from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.homogeneity import Region as Region
+    from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
+    from halbach_fe.response.magnetic_axis import magnetic_axis as magnetic_axis
     from halbach_fe.response.mesh_convergence import Verification as Verification
     from halbach_fe.response.mesh_convergence import verify as verify
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
+    from halbach_fe.response.stray_field import StrayField as StrayField
+    from halbach_fe.response.stray_field import stray_field as stray_field
     from halbach_fe.solver.session import Session as Session
     from halbach_fe.study.model import Study as Study
     from halbach_fe.study.reader import read_study as read_study
@@ -78,6 +82,8 @@ _HOME = {
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
+    "stray_field": "response.stray_field", "StrayField": "response.stray_field",
+    "magnetic_axis": "response.magnetic_axis", "MagneticAxis": "response.magnetic_axis",
     "forces": "design.forces",
     "plan": "api", "shim": "api", "shim_tray": "design.shim_tray",
     "FilledTray": "design.shim_tray",

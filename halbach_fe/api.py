@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -38,6 +38,7 @@ from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
@@ -55,6 +56,7 @@ from halbach_fe.response.multipoles import (
     Multipoles,
     multipole_models,
 )
+from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import Progress, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
@@ -108,6 +110,12 @@ class HomogeneityResult(ShownInNotebook):
     disagreement : str or None
         Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
         if that is not known.
+    stray_field : StrayField or None
+        How far outside the field of the last of these distributions is strong.
+    of_map : mapping of str to Homogeneity
+        That of a measured map itself, see `halbach_fe.inference.map_homogeneity`; empty without.
+    map_misfit : float
+        Noise that the fit of the map finds over the stated one; about 1 if that can be relied on.
 
     Examples
     --------
@@ -123,6 +131,9 @@ class HomogeneityResult(ShownInNotebook):
     by_name: Mapping[str, Homogeneity]
     distributions: Mapping[str, Gaussian]
     disagreement: str | None = None
+    stray_field: StrayField | None = None
+    of_map: Mapping[str, Homogeneity] = field(default_factory=dict)
+    map_misfit: float = 1.0
 
 
 @alone
@@ -252,7 +263,7 @@ def multipoles(
 def homogeneity(
     magnet: Magnet, session: Session, region: Region | None = None,
     posterior: Mapping[str, Gaussian] | InferenceResult | None = None,
-    degrees: int = SHOWN_DEGREES,
+    degrees: int = SHOWN_DEGREES, data: xr.Dataset | Mapping[str, xr.Dataset] | None = None,
 ) -> HomogeneityResult:
     """Compute mean field, homogeneity in ppm and spherical harmonics, with error bars.
 
@@ -268,6 +279,8 @@ def homogeneity(
         assembled magnet is the only distribution.
     degrees : int, optional
         Largest degree of the spherical harmonics.
+    data : Dataset or dict of str to Dataset, optional
+        The measured map, or all maps that the study lists, whose own homogeneity is put beside.
 
     Returns
     -------
@@ -278,7 +291,7 @@ def homogeneity(
     StudyError
         If the study is a cross-section, or the region reaches into material.
     MeasurementError
-        If the posterior is that of another magnet.
+        If the posterior is that of another magnet, or the region reaches beyond the map.
 
     Examples
     --------
@@ -293,9 +306,12 @@ def homogeneity(
     check_number("degrees", "homogeneity", degrees, 1, HIGHEST_DEGREE, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
+    of_map, misfit = ({}, 1.0) if data is None else map_homogeneity(magnet, data, model)
     return HomogeneityResult(magnet, model, {
         name: model.of(distribution) for name, distribution in distributions.items()},
-        distributions, disagreement_of(posterior))
+        distributions, disagreement_of(posterior),
+        stray_field(magnet, session, list(distributions.values())[-1]),
+        of_map, misfit)
 
 
 @alone

@@ -19,6 +19,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
+from halbach_fe.geometry.outline import points_on
 from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
@@ -186,10 +187,9 @@ class Magnet(ShownInNotebook):
 
         z is 0 for infinite blocks.
         """
-        t = np.linspace(0.0, 1.0, 9)[:-1]
         found = []
         for block in self.blocks:
-            outline = np.vstack([edge.at(t if edge.arc else t[:1])[0] for edge in block.outline])
+            outline = points_on(block.outline)
             ends = [0.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
             points = np.vstack([np.column_stack([outline, np.full(len(outline), z)])
                                 for z in ends])

@@ -21,7 +21,9 @@ from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
+from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
@@ -259,6 +261,12 @@ class InferenceResult(ShownInNotebook):
     noise_blocks : tuple of MagnetBlock or None
         Blocks in whose gradient uncertain positions make the noise, as a first update estimated
         them; None if they are the nominal ones.
+    stray_field : StrayField or None
+        How far outside the field of the updated magnet is strong; None if that was not computed,
+        see `halbach_fe.response.stray_field.stray_field`.
+    magnetic_axis : MagneticAxis or None
+        Centre, axis and roll of the updated magnet; None if they were not computed, see
+        `halbach_fe.response.magnetic_axis.magnetic_axis`.
 
     Examples
     --------
@@ -292,6 +300,8 @@ class InferenceResult(ShownInNotebook):
     terms: InstrumentTerms | None = None
     overlaps: tuple[Overlap, ...] = ()
     noise_blocks: tuple[MagnetBlock, ...] | None = None
+    stray_field: StrayField | None = None
+    magnetic_axis: MagneticAxis | None = None
 
     @property
     def noise_magnet(self) -> Magnet:

@@ -182,6 +182,9 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
             pose.name: {key: value for key, value in asdict(pose).items() if key != "name"}
             for pose in update.terms.poses},
         "instrument_at_rest": None if update.terms is None else update.terms.at_rest,
+        "stray_field": None if update.stray_field is None else update.stray_field.summary(),
+        "magnetic_axis": (None if update.magnetic_axis is None
+                          else update.magnetic_axis.summary()),
         "overlaps": [asdict(each) | {"disagreement": each.disagreement}
                      for each in update.overlaps],
         "scores": [asdict(score) for score in update.scores],

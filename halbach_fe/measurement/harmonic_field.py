@@ -11,8 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 
@@ -133,9 +135,46 @@ def _fields(points: Floats, places: Floats) -> Floats:
     return np.asarray(away / np.linalg.norm(away, axis=1)[:, None] ** 3)
 
 
+def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
+    """Return the gradients (n, 3, k) of the regular solid harmonics of degrees 1 to ``degrees``.
+
+    Each is scaled to an rms of 1 on the unit sphere, from whose middle the points (n, 3) count. The
+    functions are the real and imaginary parts of ``R_lm = r^l P_lm(cos theta) exp(i m phi) /
+    (l + m)!``, whose derivatives are functions of the next lower degree: ``d/dz R_lm = R_(l-1)m``,
+    ``(d/dx + i d/dy) R_lm = R_(l-1)(m+1)``, ``(d/dx - i d/dy) R_lm = -R_(l-1)(m-1)``.
+    """
+    x, y, z = points.T
+    square = x**2 + y**2 + z**2
+    known = {(0, 0): np.ones(len(points), complex)}
+    for m in range(degrees):
+        if m:
+            known[m, m] = -(x + 1j * y) / (2 * m) * known[m - 1, m - 1]
+        for degree in range(m + 1, degrees):
+            below = known.get((degree - 2, m), 0.0)
+            known[degree, m] = ((2 * degree - 1) * z * known[degree - 1, m] - square * below) / (
+                degree**2 - m**2)
+
+    def function(degree: int, m: int) -> NDArray[np.complex128]:
+        """Return R_lm of any m."""
+        if abs(m) > degree:
+            return np.zeros(len(points), complex)
+        return known[degree, m] if m >= 0 else (-1) ** m * np.conj(known[degree, -m])
+
+    columns = []
+    for degree in range(1, degrees + 1):
+        for m in range(degree + 1):
+            plus, minus = function(degree - 1, m + 1), -function(degree - 1, m - 1)
+            gradient = np.stack([(plus + minus) / 2, (plus - minus) / 2j,
+                                 function(degree - 1, m)], axis=1)
+            size = np.sqrt(degree / (factorial(degree + m) * factorial(degree - m)) / (
+                2 if m else 1))
+            columns += [gradient.real / size] + ([gradient.imag / size] if m else [])
+    return np.stack(columns, axis=2)
+
+
 @dataclass(frozen=True)
 class HarmonicFit:
-    """Amplitudes of charges that fit readings, without any instrument.
+    """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument.
 
     Attributes
     ----------

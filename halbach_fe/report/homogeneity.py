@@ -16,9 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, SMALL, own_style, save, write_page
+from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 
@@ -29,6 +31,9 @@ CONVENTION = (
 
 SIZES = ("Deviations are those of |B| from its mean over the volume; the rms is over the volume, "
          "peak to peak over all points of surface and volume.")
+
+MAP_ROWS = ("Those of the map are of a fit of its readings by solid harmonics, without "
+            "any magnet; the held-out part are readings that do not update the magnet.")
 
 ROUNDING = 1e-9
 """Size below which a harmonic is zero but for rounding, relative to the largest one."""
@@ -50,6 +55,7 @@ def answer(found: HomogeneityResult) -> Answer:
     question = f"How homogeneous is the field in {found.model.region.text}?"
     text = (f"The mean field is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
             f"rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
+    text += _of_map(found)
     low, middle, high = map(ppm, best.rms_range_ppm)
     trust, small = solver_error_text(found.model, best.rms_ppm)
     if name != "prior" and found.disagreement:
@@ -66,6 +72,26 @@ def answer(found: HomogeneityResult) -> Answer:
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
         "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
         "halbach-fe infer STUDY --measurements MAP -o DIR", small)
+
+
+def _of_map(found: HomogeneityResult) -> str:
+    """Say what the map itself has, of readings that did not update the magnet if there are some."""
+    if not found.of_map:
+        return ""
+    name, known = list(found.of_map.items())[-1]
+    low, _, high = map(ppm, known.rms_range_ppm)
+    if found.map_misfit > POOR:
+        return ""
+    return (f"; the readings themselves{' that were held out' if name == HELD_OUT_PART else ''} "
+            f"have {ppm(known.rms_ppm)} ppm rms ({low} to {high})")
+
+
+def _misfit(found: HomogeneityResult) -> str:
+    """Say that the fit of the map cannot be relied on; nothing if it can."""
+    return "" if found.map_misfit <= POOR else (
+        f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings are "
+        "too far apart for the field between them, or noisier than stated. What the map itself has "
+        "is uncertain beyond its error bars.")
 
 
 def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, bool]:
@@ -119,6 +145,7 @@ def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
     """Return a row of text for each of the largest harmonics; none if there are no harmonics."""
     names = list(found.by_name)
     best = found.by_name[names[-1]].harmonics
+    shown = {**found.by_name, **found.of_map}
     order = sorted(range(len(best)), key=lambda number: -abs(best[number].ppm))[:LISTED]
     rows = []
     for number in order:
@@ -126,8 +153,8 @@ def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
             break  # symmetry makes the others zero
         row = {"harmonic": best[number].name, "l": str(best[number].degree),
                "m": str(best[number].order)}
-        for name in names:
-            term = found.by_name[name].harmonics[number]
+        for name, known in shown.items():
+            term = known.harmonics[number]
             value = term.ppm if abs(term.ppm) > LEAST_OF_SD * term.sd_ppm else 0.0
             sign = "+" if value > 0 else ""
             row[f"{name} in ppm"] = f"{sign}{ppm(value)} ± {ppm(term.sd_ppm)}"
@@ -146,7 +173,10 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
         "study": found.magnet.name, "region": asdict(found.model.region),
         "solver_error_ppm": found.model.solver_error_ppm,
         "harmonics_convention": CONVENTION,
-        **{name: plain_homogeneity(known) for name, known in found.by_name.items()}}
+        "stray_field": None if found.stray_field is None else found.stray_field.summary(),
+        **{name: plain_homogeneity(known) for name, known in found.by_name.items()},
+        "map_misfit": found.map_misfit if found.of_map else None,
+        "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 
 def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
@@ -211,20 +241,24 @@ def write_homogeneity(
         slices_figure(found.model.slices(found.distributions[name].mean), best.mean_T),
         "Deviation of |B| from its mean over the region, in planes through its centre, "
         f"{_known_as(name)}")}
+    every = {**found.by_name, **found.of_map}
     if best.harmonics:
         figures["harmonics.png"] = (
             harmonics_figure(best), f"The largest spherical harmonics {_known_as(name)}, by "
             "degree; bars are two standard deviations")
         with atomic(folder / "harmonics.csv") as temporary:
             write_csv({
-                "magnet": [own for own, known in found.by_name.items() for _ in known.harmonics],
-                **{key: [getattr(each, key) for known in found.by_name.values()
+                "magnet": [own for own, known in every.items() for _ in known.harmonics],
+                **{key: [getattr(each, key) for known in every.values()
                          for each in known.harmonics]
                    for key in ("degree", "order", "letter", "ppm", "sd_ppm")}}, {
                 "study": found.magnet.name, "convention": CONVENTION}, temporary)
+    figures |= stray_pictures(found.stray_field)
     write_page(folder / "homogeneity.html", "homogeneity.html.j2", save(figures, folder),
                study=found.magnet.study, provenance=provenance, answer=answer(found),
-               region=found.model.region.text, rows=homogeneity_rows(found.by_name),
-               sizes=SIZES,
+               region=found.model.region.text,
+               rows=homogeneity_rows({**found.by_name, **found.of_map}),
+               sizes=SIZES, of_map=MAP_ROWS if found.of_map else "", misfit=_misfit(found),
+               stray=stray_section(found.stray_field),
                harmonics=harmonic_rows(found), convention=CONVENTION,
                solver_error=f"{found.model.solver_error_ppm:.2g}")

@@ -15,6 +15,7 @@ from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pos
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
+from halbach_fe.report.magnetic_axis import axis_rows, definition
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
 from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
 from halbach_fe.report.prediction import (
@@ -26,6 +27,7 @@ from halbach_fe.report.prediction import (
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
+from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, flux_density, ppm
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import circle_models
@@ -119,7 +121,7 @@ def write_inference_report(
         "contraction.png": (_contraction_figure(result), "Contraction of each block: "
                             "the decrease of its variance from prior to posterior; 0 % means that "
                             "the readings contain no information about the block"),
-    }
+    } | dict(stray_pictures(result.stray_field))
     multipoles: list[MultipoleTable] = [
         (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
         for model in ([] if result.is_campaign else circle_models(
@@ -139,7 +141,10 @@ def write_inference_report(
             result.study.noise.position_sd_m or () if result.study.noise else ())],
         solver_error=_solver_error(result), superposition=ppm(
             PPM * float(result.response.superposition_error)),
-        view=view_of_inference(result), view_colours=colours_in_words(result))
+        axis=axis_rows(result.magnetic_axis), axis_definition=(
+            "" if result.magnetic_axis is None else definition(result.magnetic_axis)),
+        stray=stray_section(result.stray_field), view=view_of_inference(result),
+        view_colours=colours_in_words(result))
 
 
 def _solver_error(result: InferenceResult) -> str:

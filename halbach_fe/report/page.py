@@ -17,6 +17,7 @@ import numpy as np
 import tomlkit
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
@@ -62,8 +63,10 @@ def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Pictur
 
 def png_of(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
+    figure.dpi = DPI
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
+    # savefig would draw everything twice, the first time to lay it out
+    FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 

@@ -25,6 +25,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
+from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, ppm
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
@@ -95,7 +96,8 @@ def write_solution_report(
         "field.png": (field_figure(solution),
                       "The field at the study's positions"
                       + (", and the solver's error bar of each reading"
-                         if solution.errors.any() and curve(solution.points) else ""))}
+                         if solution.errors.any() and curve(solution.points) else "")),
+        **stray_pictures(solution.stray_field)}
     multipoles: list[MultipoleTable] = [
         (model, {"nominal": known}) for model, known in solved_circles(
             solution.magnet, solution.points, solution.flux_density, solution.errors)]
@@ -107,6 +109,7 @@ def write_solution_report(
         magnet_rows=magnet_rows(solution.magnet),
         multipoles=middle_table(multipoles), provenance=provenance,
         answer=answer(solution), rows=field_table(solution),
+        stray=stray_section(solution.stray_field),
         view=view_of_nominal_magnet(
             solution.magnet, field_points(solution.points, solution.flux_density)))
 

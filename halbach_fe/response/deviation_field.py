@@ -15,7 +15,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import Variations
-from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.study.materials import MU_0
 
 
@@ -54,6 +54,20 @@ class Deviations:
         if self.variations is not None:
             found = found + self.variations.field(amplitudes, points)
         return found
+
+    def columns(self, points: Floats) -> Floats:
+        """Return the matrix (3 n, parameters) from deviations to B at points (n, 3) in m, in T.
+
+        Its rows are Bx, By and Bz of the first point, then those of the second.
+        """
+        size = self.magnet.dimension
+        found = [unit[:, :, :size] @ (MU_0 * block.recoil_tensor[:size, :size])
+                 for block, unit in zip(self.magnet.blocks, unit_fields(
+                     self.magnet.blocks, points), strict=True)]
+        matrix = np.concatenate(found, axis=2).reshape(3 * len(points), -1)
+        if self.variations is None:
+            return matrix
+        return np.hstack([matrix, self.variations.fields(points).reshape(3 * len(points), -1)])
 
 
 def with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:

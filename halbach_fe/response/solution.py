@@ -18,6 +18,7 @@ from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session, alone
 
@@ -39,6 +40,8 @@ class Solution(ShownInNotebook):
         The readings, and the solver's error bar of each reading.
     getdp : str
         Version of GetDP.
+    stray_field : StrayField or None
+        How far outside the field is strong; None for a cross-section.
     field_map : Dataset
         B at the study's positions as a labelled map.
 
@@ -58,6 +61,7 @@ class Solution(ShownInNotebook):
     readings: Floats
     errors: Floats
     getdp: str
+    stray_field: StrayField | None = None
 
     @property
     def field_map(self) -> xr.Dataset:
@@ -75,7 +79,8 @@ class Solution(ShownInNotebook):
             "readings": len(self.readings), "method": self.magnet.study.solver.method,
             "max_B_T": float(size.max()), "max_B_at_m": self.points[strongest].tolist(),
             "min_B_T": float(size.min()), "largest_error_T": float(self.errors.max()),
-            "mean_B_T": self.flux_density.mean(axis=0).tolist()}
+            "mean_B_T": self.flux_density.mean(axis=0).tolist(),
+            "stray_field": None if self.stray_field is None else self.stray_field.summary()}
 
 
 def study_observation(magnet: Magnet) -> Observation:
@@ -137,7 +142,8 @@ def solve(magnet: Magnet, session: Session) -> Solution:
         parts, nominal=parts.nominal[sensors],
         error=None if parts.error is None else parts.error[sensors]), error_bar_session(session))
     return Solution(magnet, points, field[:len(points)], observation,
-                    observation.apply(field[sensors]), errors, session.getdp.version)
+                    observation.apply(field[sensors]), errors, session.getdp.version,
+                    stray_field(magnet, session))
 
 
 def write_solution(solution: Solution, folder: Path) -> None:

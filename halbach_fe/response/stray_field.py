@@ -1,0 +1,316 @@
+"""How far outside of a magnet its field is strong: the 0.5 mT line of rooms for MRI.
+
+Outside of its sources every component of B is harmonic, so that |B| has no maximum there. The
+largest |B| on a cylinder around the magnet therefore falls strictly with the cylinder's radius, and
+that on the planes beyond both ends with their distance: the largest distances at which |B| reaches
+a limit are roots of these functions, whatever lobes the field has.
+
+The field is that of the magnet alone, without the study's external sources. Permeable blocks and
+iron answer to the nominal magnet; what they answer to deviations from it is neglected, see
+`halbach_fe.response.deviation_field`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import PointsOutsideError
+from halbach_fe.core.numbers import check_number
+from halbach_fe.geometry.blocks import vector
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.response.deviation_field import Deviations, with_magnetizations
+from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
+from halbach_fe.solver.session import Session, alone
+from halbach_fe.stats.gaussian import Gaussian
+
+LIMIT_T = 5e-4
+"""Flux density above which people with pacemakers must not be (IEC 60601-2-33): 5 gauss."""
+
+NEAREST = 0.01
+"""Distance from the cylinder around the magnet at which the search begins, relative to the radius
+of the magnet. Nearer to the edges of blocks the field is strong in any magnet."""
+
+FEWEST, MOST = 16, 64
+"""Limits of the number of places about the axis and along the other direction at which the largest
+|B| of a surface is looked for. They lie as far apart as the surface is from the magnet: finer
+patterns of the field have decayed there."""
+
+DISTANCES: Floats = np.array([0.125, 0.25, 0.5, 1.0, 2.0])
+"""Distances from the magnet with which the search begins, relative to its radius."""
+
+BETWEEN = 5
+"""Number of distances from one of these to the next at which it is then looked for."""
+
+ZOOM = 11
+"""Number of places along both directions, within the steps around the largest |B| before, among
+which it is looked for in the end."""
+
+AROUND, OUTWARD = 96, 20
+"""Numbers of points of a plane's picture around the magnet, and outwards."""
+
+WIDER = 1.5
+"""Distance from the magnet up to which pictures go, relative to that of the line."""
+
+Surface = Callable[[float, Floats], Floats]
+"""Takes a distance in m from the cylinder around the magnet, and places (n, 2): angles about the
+axis, and coordinates from -1 to 1. Returns points (n, 3) in m."""
+
+Field = Callable[[Floats], Floats]
+"""Takes points (n, 3) in m and returns B (n, 3) in T."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The largest distance at which |B| reaches the limit.
+
+    Attributes
+    ----------
+    distance_m : float
+        From the z axis, or from the plane z = 0.
+    sd_m : float
+        Its standard deviation, linearized; 0 for the nominal magnet.
+    at_m : tuple of float
+        The point.
+    """
+
+    distance_m: float
+    sd_m: float
+    at_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class StrayPlane:
+    """|B| outside of the magnet in a plane through its middle.
+
+    Attributes
+    ----------
+    across : str
+        The axis that is normal to the plane.
+    first_m, second_m, size_T : ndarray, shape (k, m)
+        Coordinates along the other axes, in the order of x, y and z, and |B|: k curves around the
+        magnet, from the nearest outwards, of which the last point is the first one again.
+    """
+
+    across: str
+    first_m: Floats
+    second_m: Floats
+    size_T: Floats
+
+
+@dataclass(frozen=True)
+class StrayField:
+    """How far outside of a magnet |B| reaches a limit.
+
+    Attributes
+    ----------
+    limit_T : float
+    radius_m, half_length_m : float
+        Of the smallest cylinder around the magnet that is symmetric about z = 0.
+    radial, axial : Reach or None
+        The largest distance from the z axis beside the magnet, and from the plane z = 0 beyond its
+        ends; None if |B| is below the limit wherever it is looked for, see `NEAREST`.
+    planes : tuple of StrayPlane
+        The planes across x, y and z.
+    unknown : str
+        Why the field outside is not computed; empty if it is.
+    """
+
+    limit_T: float
+    radius_m: float
+    half_length_m: float
+    radial: Reach | None = None
+    axial: Reach | None = None
+    planes: tuple[StrayPlane, ...] = ()
+    unknown: str = ""
+
+    def summary(self) -> dict[str, object]:
+        """Return the distances as plain data for JSON."""
+        return {"limit_T": self.limit_T, "unknown": self.unknown or None,
+                "radial": None if self.radial is None else asdict(self.radial),
+                "axial": None if self.axial is None else asdict(self.axial)}
+
+
+@alone
+def stray_field(
+    magnet: Magnet, session: Session, magnetizations: Gaussian | None = None,
+    limit_T: float = LIMIT_T,
+) -> StrayField | None:
+    """Tell how far outside of a magnet |B| reaches a limit, by default 0.5 mT.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+    magnetizations : Gaussian, optional
+        Distribution of the magnetizations in A/m, for example the posterior of
+        `halbach_fe.infer`; by default the nominal ones.
+    limit_T : float, optional
+
+    Returns
+    -------
+    StrayField or None
+        None for a cross-section, whose magnet has no ends. If the blocks or their iron are meshed
+        together, it only says that the field far outside is not known.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> stray = hf.stray_field(magnet, hf.Session.open("results"))
+    >>> stray.radial.distance_m > magnet.radius
+    True
+    """
+    check_number("limit_T", "stray_field", limit_T, 1e-9, 1.0)
+    if magnet.dimension == 2:
+        return None
+    radius, half = magnet.radius, magnet.half_length
+    if not applies(magnet):
+        return StrayField(limit_T, radius, half, unknown=(
+            "The magnet is solved on a mesh as a whole, which does not tell the field far "
+            "outside."))
+    field = _field(magnet, session, magnetizations)
+    near = NEAREST * radius
+
+    def beside(distance: float, place: Floats) -> Floats:
+        angle, along = place.T
+        away = radius + distance
+        return np.column_stack([away * np.cos(angle), away * np.sin(angle),
+                                (half + distance) * along])
+
+    def beyond(distance: float, place: Floats) -> Floats:
+        angle, along = place.T
+        out = np.abs(along) * (radius + distance)
+        return np.column_stack([out * np.cos(angle), out * np.sin(angle),
+                                np.where(along < 0, -1, 1) * (half + distance)])
+
+    try:
+        found = [_farthest(field, surface, near, radius * DISTANCES, limit_T)
+                 for surface in (beside, beyond)]
+        reached = max((distance for distance, _ in found), default=near)
+        planes = _planes(field, radius, half, near, max(WIDER * reached, radius / 2))
+    except PointsOutsideError:
+        return StrayField(limit_T, radius, half, unknown=(
+            "The mesh around the iron ends before the field has fallen to that."))
+    radial, axial = (
+        None if point is None else Reach(
+            start + distance, _sd(magnet, field, magnetizations, point, outwards), vector(point))
+        for start, (distance, point), outwards in (
+            (radius, found[0], np.array([1.0, 1.0, 0.0])), (half, found[1], np.array([0, 0, 1.0]))))
+    return StrayField(limit_T, radius, half, radial, axial, planes)
+
+
+def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) -> Field:
+    """Return the field of a magnet alone, of the mean magnetizations."""
+    blocks = magnet.blocks
+    if magnetizations is not None:
+        uniform = magnetizations.mean[:len(magnet.parameter_names)]
+        blocks = with_magnetizations(magnet, uniform)
+    vacuum = field_in_vacuum(blocks)
+    if magnet.is_vacuum:
+        return vacuum
+    coarse = magnet if magnet.has_losses else magnet.with_(mesh__cells_per_side=1)
+    reaction = solve_separate(coarse, session.within("stray"), estimate=False)
+    return lambda points: vacuum(points) + reaction.field(points)
+
+
+def _farthest(
+    field: Field, surface: Surface, near: float, distances: Floats, limit_T: float
+) -> tuple[float, Floats | None]:
+    """Return the largest distance in m at which |B| reaches a limit, and the point (3,) in m.
+
+    The search begins with some distances in m. If |B| is smaller at the distance
+    ``near`` already, the point is None.
+    """
+    largest = _largest(field, surface, distances)
+    while largest[-1][0] > limit_T:
+        distances = distances[-1] * np.array([1.0, 2.0, 4.0])
+        largest = _largest(field, surface, distances)
+    if largest[0][0] <= limit_T:
+        distances = np.geomspace(near, distances[0], BETWEEN)
+        largest = _largest(field, surface, distances)
+    if largest[0][0] <= limit_T:
+        return near, None
+    last = max(number for number, (size, _, _) in enumerate(largest) if size > limit_T)
+    distances = np.geomspace(distances[last], distances[last + 1], BETWEEN)
+    largest = _largest(field, surface, distances)
+    last = max((number for number, (size, _, _) in enumerate(largest) if size > limit_T), default=0)
+    middle = distances[last]
+    _, place, step = largest[last]
+    around = np.linspace(-1, 1, ZOOM)
+    for _ in range(2):
+        places = place + step * np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
+        places[:, 1] = np.clip(places[:, 1], -1, 1)
+        size = np.linalg.norm(field(surface(middle, places)), axis=1)
+        place, step = places[int(np.argmax(size))], step * (around[1] - around[0])
+    # along the line through that place; the field is a power of the distance, nearly
+    logarithms = np.log(middle) + np.linspace(-0.1, 0.4, 21)
+    line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
+    falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
+    distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
+    return distance, surface(distance, place[None])[0]
+
+
+def _largest(
+    field: Field, surface: Surface, distances: Floats
+) -> list[tuple[float, Floats, Floats]]:
+    """Return the largest |B| in T at each distance, its place, and the steps of places, (2,)."""
+    found, every = [], []
+    for distance in distances:
+        (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
+        out = float(np.hypot(x, y))
+        angles, rows = (int(np.clip(length / distance, FEWEST, MOST))
+                        for length in (2 * np.pi * out, 2 * max(abs(z), out)))
+        places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
+                                      np.linspace(-1, 1, rows)), axis=-1).reshape(-1, 2)
+        every.append((places, np.array([2 * np.pi / angles, 2 / (rows - 1)]),
+                      surface(distance, places)))
+    size = np.linalg.norm(field(np.vstack([points for _, _, points in every])), axis=1)
+    ends = np.cumsum([len(places) for places, _, _ in every])[:-1]
+    for (places, step, _), own in zip(every, np.split(size, ends), strict=True):
+        number = int(np.argmax(own))
+        found.append((float(own[number]), places[number], step))
+    return found
+
+
+def _sd(
+    magnet: Magnet, field: Field, magnetizations: Gaussian | None, point: Floats, outwards: Floats
+) -> float:
+    """Return the standard deviation in m of the distance at which |B| falls to that at a point.
+
+    It is that of |B| there, divided by the slope of |B| outwards.
+    """
+    if magnetizations is None:
+        return 0.0
+    direction = outwards * point / np.linalg.norm(outwards * point)
+    step = 1e-3 * float(np.linalg.norm(point))
+    there = field(point + step * np.outer([-1.0, 0.0, 1.0], direction))
+    inner, size, outer = np.linalg.norm(there, axis=1)
+    row = there[1] / size @ Deviations.of(magnet).columns(point[None])
+    return float(magnetizations.sd_of(row[None])[0] * 2 * step / abs(inner - outer))
+
+
+def _planes(
+    field: Field, radius: float, half: float, near: float, far: float
+) -> tuple[StrayPlane, ...]:
+    """Return |B| in three planes, from one distance in m from the cylinder around to another."""
+    distances = np.geomspace(near, far, OUTWARD)[:, None]
+    turn = np.linspace(0, 2 * np.pi, AROUND + 1)
+    ring = (np.outer(radius + distances, np.cos(turn)), np.outer(radius + distances, np.sin(turn)))
+    # around a rectangle: equal steps along its four sides, which grow with the distance
+    side = np.linspace(-1, 1, AROUND // 4 + 1)[:-1]
+    one = np.ones_like(side)
+    along = np.concatenate([side, one, -side, -one, side[:1]])
+    up = np.concatenate([-one, side, one, -side, -one[:1]])
+    box = ((radius + distances) * along, (half + distances) * up)
+    found = []
+    for number, (across, (first, second)) in enumerate((("x", box), ("y", box), ("z", ring))):
+        points = np.zeros((*first.shape, 3))
+        a, b = (axis for axis in range(3) if axis != number)
+        points[..., a], points[..., b] = first, second
+        size = np.linalg.norm(field(points.reshape(-1, 3)), axis=1).reshape(first.shape)
+        found.append(StrayPlane(across, first, second, size))
+    return tuple(found)

@@ -1,0 +1,109 @@
+"""The homogeneity of a map itself, beside magpylib's field in the same region."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from halbach_fe.api import homogeneity
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
+from halbach_fe.report.result_files import write_report
+from halbach_fe.response.homogeneity import Region, real_harmonics, region_points, sphere_points
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+from tests.response.test_magnetic_axis import true_field
+from tests.support.cuboids import DOCUMENT
+
+NOISE_T = 2e-5
+GRID = 0.01 * np.stack(np.meshgrid(*3 * [np.arange(-4, 5)], indexing="ij"), axis=-1).reshape(-1, 3)
+REGION = Region.sphere(0.035)
+
+
+def study(noise_T=NOISE_T):
+    document = copy.deepcopy(DOCUMENT)
+    document["array"] |= {"first_block_angle_deg": 0.0, "first_magnetization_angle_deg": 0.0}
+    document["noise"] = {"regions": [{"name": "all", "sigma_T": noise_T}]}
+    return parse_study(document | {"inference": {"held_out": {"scan_lines_every": 3}}})
+
+
+@pytest.fixture
+def errors(generator):
+    """Polarizations of the blocks that deviate by per cents, of which the study says nothing."""
+    return 0.03 * generator.standard_normal((3, 12, 3))
+
+
+def measured(generator, errors, noise_T=NOISE_T):
+    field = true_field(1, GRID, errors=errors)
+    return field_map(GRID, field + noise_T * generator.standard_normal(field.shape))
+
+
+def test_beside_the_true_field(generator, tmp_path, errors):
+    magnet = build_magnet(study())
+    found = homogeneity(magnet, Session.open(tmp_path), REGION, data=measured(generator, errors))
+    points, weights, degree = region_points(magnet, REGION)
+    field = true_field(1, points, errors=errors)
+    size = np.linalg.norm(field, axis=1)
+    mean = float(weights @ size)
+    rms = 1e6 * float(np.sqrt(weights @ (size / mean - 1)**2))
+    direction = weights @ field / np.linalg.norm(weights @ field)
+    surface = int((weights == 0).sum())
+    terms, functions = real_harmonics(6, degree)
+    harmonics = 1e6 / mean * functions @ (field[:surface] @ direction)
+    assert list(found.of_map) == [MAP, HELD_OUT_PART]
+    for known in found.of_map.values():
+        assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T)
+        low, _, high = known.rms_range_ppm
+        assert low - (high - low) / 2 < rms < high + (high - low) / 2  # twice the 95 % range
+        score = np.array([(each.ppm - true) / each.sd_ppm
+                          for each, true in zip(known.harmonics, harmonics, strict=True)])
+        # of 48 harmonics the rms of normal ones is within 0.7 to 1.3; the prior, which is not the
+        # magnet's, may widen or narrow bars of what the readings hardly tell
+        assert np.sqrt(np.mean(score**2)) < 1.6
+        assert [(each.degree, each.order, each.letter) for each in known.harmonics] == terms
+    assert found.map_misfit == pytest.approx(1, abs=0.05)  # of 2187 readings: 1.5 % is one sd
+    # fewer readings tell less
+    assert found.of_map[HELD_OUT_PART].mean_sd_T > found.of_map[MAP].mean_sd_T
+    # control: the nominal magnet is another one
+    nominal = found.by_name["prior"]
+    assert abs(nominal.mean_T - mean) > 20 * found.of_map[HELD_OUT_PART].mean_sd_T
+    score = np.array([(other.ppm - true) / own.sd_ppm for own, other, true in zip(
+        found.of_map[HELD_OUT_PART].harmonics, nominal.harmonics, harmonics, strict=True)])
+    assert np.sqrt(np.mean(score**2)) > 20
+
+
+def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
+    """Noise of a tenth shows what harmonics of higher degrees than the fit's do."""
+    magnet = build_magnet(study(0.1 * NOISE_T))
+    found = homogeneity(magnet, Session.open(tmp_path), REGION,
+                        data=measured(generator, errors, 0.1 * NOISE_T))
+    assert found.map_misfit > POOR
+    write_report(found, tmp_path / "page")
+    assert "times the stated noise" in (tmp_path / "page" / "homogeneity.html").read_text()
+
+
+def test_solid_harmonics_are_harmonic_fields(generator):
+    """Their divergence and curl vanish, and each is independent of the others."""
+    points, step = 0.4 * generator.standard_normal((6, 3)), 1e-5
+    gradient = np.stack([(solid_harmonic_fields(points + step * unit, 6) - solid_harmonic_fields(
+        points - step * unit, 6)) / (2 * step) for unit in np.eye(3)], axis=-1)
+    rounding = 1e-8 * np.abs(gradient).max()
+    assert np.abs(np.einsum("nckc->nk", gradient)).max() < rounding
+    assert np.abs(gradient - gradient.transpose(0, 3, 2, 1)).max() < rounding
+    # control: x^2 along x is no such field
+    assert np.abs(gradient + gradient.transpose(0, 3, 2, 1)).max() > 1e3 * rounding
+    sphere, weights = sphere_points(14)
+    fields = solid_harmonic_fields(sphere, 6)
+    products = np.einsum("n,nck,ncl->kl", weights, fields, fields)
+    assert products == pytest.approx(np.eye(48), abs=1e-12)
+
+
+def test_regions_beyond_the_map_are_refused(generator, tmp_path, errors):
+    with pytest.raises(MeasurementError, match="within its points"):
+        homogeneity(build_magnet(study()), Session.open(tmp_path), Region.sphere(0.05),
+                    data=measured(generator, errors))

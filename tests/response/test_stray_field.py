@@ -1,0 +1,142 @@
+"""The 0.5 mT line outside of a magnet, beside magpylib's field there."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.response.stray_field import NEAREST, stray_field
+from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.reader import parse_study
+from tests.support.cuboids import DOCUMENT
+
+CUBE_M, REMANENCE_T = 0.02, 1.3
+LONE = {
+    "name": "lone", "mesh": {"block_size_m": 0.01},
+    "array": {"multipole_order": 1, "free_blocks": {
+        "name": ["cube"], "x_m": [0.1], "y_m": [0.0], "z_m": [0.03], "shape": ["cuboid"],
+        "size_x_m": [CUBE_M], "size_y_m": [CUBE_M], "size_z_m": [CUBE_M],
+        "remanence_x_T": [0.0], "remanence_y_T": [0.0], "remanence_z_T": [REMANENCE_T]}},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "points", "points_m": [[0.0, 0.0, 0.0]]}}}
+
+
+def cuboids():
+    """magpylib's magnet of the study of three rings of 12 cuboids."""
+    sources = []
+    for slot in range(12):
+        place, direction = np.radians(90 + 30 * slot), np.radians(180 + 60 * slot)
+        turn = Rotation.from_euler("z", place)
+        sources += [magpylib.magnet.Cuboid(
+            dimension=(0.05, 0.04, 0.06), orientation=turn,
+            polarization=turn.inv().apply(1.2 * np.array([np.cos(direction), np.sin(direction),
+                                                          0.0])),
+            position=(0.125 * np.cos(place), 0.125 * np.sin(place), z)) for z in (-0.06, 0, 0.06)]
+    return magpylib.Collection(*sources)
+
+
+def largest(source, generator, radial_m, axial_m):
+    """The largest |B| beside a cylinder of a radius, and beyond planes, from random points."""
+    angle, along = generator.uniform(-np.pi, np.pi, 5000), generator.uniform(-1, 1, 5000)
+    beside = np.column_stack([radial_m * np.cos(angle), radial_m * np.sin(angle),
+                              2 * axial_m * along])
+    out = radial_m * np.sqrt(np.abs(along))
+    beyond = np.column_stack([out * np.cos(angle), out * np.sin(angle),
+                              np.sign(along) * axial_m])
+    return (float(np.linalg.norm(source.getB(points), axis=1).max())
+            for points in (beside, beyond))
+
+
+@pytest.fixture
+def magnet():
+    return build_magnet(parse_study(DOCUMENT))
+
+
+@pytest.mark.parametrize("limit_T", [5e-4, 5e-3, 0.05])
+def test_the_field_is_at_the_limit_there(generator, tmp_path, magnet, limit_T):
+    stray = stray_field(magnet, Session.open(tmp_path), limit_T=limit_T)
+    source = cuboids()
+    for reach in (stray.radial, stray.axial):
+        # the search ends within 1e-4 of the distance, and |B| falls by its fourth power or so
+        assert np.linalg.norm(source.getB(reach.at_m)) == pytest.approx(limit_T, rel=2e-3)
+        assert reach.sd_m == 0
+    assert np.hypot(*stray.radial.at_m[:2]) == pytest.approx(stray.radial.distance_m)
+    assert abs(stray.axial.at_m[2]) == pytest.approx(stray.axial.distance_m)
+    # the random points come within some per cent of the largest field
+    for size in largest(source, generator, stray.radial.distance_m, stray.axial.distance_m):
+        assert 0.97 * limit_T < size < 1.005 * limit_T
+    # control: 2 % nearer to the magnet the field is above the limit
+    nearer = largest(source, generator, magnet.radius + 0.95 * (
+        stray.radial.distance_m - magnet.radius), magnet.half_length + 0.95 * (
+        stray.axial.distance_m - magnet.half_length))
+    assert all(size > 1.01 * limit_T for size in nearer)
+
+
+def test_a_lone_cube_far_from_the_axis(tmp_path):
+    """Its line is that of a dipole, to the cube's octupole: 2 m / (4 pi r^3) on its axis."""
+    stray = stray_field(build_magnet(parse_study(LONE)), Session.open(tmp_path))
+    moment = REMANENCE_T * CUBE_M**3 / MU_0
+    above = (2e-7 * moment / 5e-4)**(1 / 3)
+    assert stray.axial.distance_m == pytest.approx(0.03 + above, rel=2e-3)
+    assert stray.axial.at_m[:2] == pytest.approx((0.1, 0.0), abs=5e-3)
+    # beside a dipole the largest r sin(theta) of r^3 = sqrt(1 + 3 cos^2 theta) decides
+    angle = np.linspace(0, np.pi, 10_001)
+    aside = (1e-7 * moment / 5e-4)**(1 / 3) * float(np.max(
+        (1 + 3 * np.cos(angle)**2)**(1 / 6) * np.sin(angle)))
+    assert stray.radial.distance_m == pytest.approx(0.1 + aside, rel=2e-3)
+
+
+def test_the_pictures_show_the_field(tmp_path, magnet):
+    stray = stray_field(magnet, Session.open(tmp_path))
+    source = cuboids()
+    for number, plane in enumerate(stray.planes):
+        first, second = (axis for axis in range(3) if axis != number)
+        points = np.zeros((*plane.size_T.shape, 3))
+        points[..., first], points[..., second] = plane.first_m, plane.second_m
+        size = np.linalg.norm(source.getB(points.reshape(-1, 3)), axis=1)
+        assert plane.size_T.ravel() == pytest.approx(size, rel=1e-6)
+        assert plane.size_T.ravel() != pytest.approx(1.01 * size, rel=1e-6)  # the control
+        assert plane.size_T[-1].max() < stray.limit_T < plane.size_T[0].max()
+
+
+def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path, magnet):
+    nominal, session = magnet.nominal_magnetization, Session.open(tmp_path)
+    root = 0.01 * np.abs(nominal).max() * np.eye(len(nominal))
+    known = Gaussian(nominal, root)
+    stray = stray_field(magnet, session, known)
+    drawn = [stray_field(magnet, session, Gaussian(one, 0 * root))
+             for one in known.sample(40, generator)]
+    for name in ("radial", "axial"):
+        sd = np.std([getattr(each, name).distance_m for each in drawn])
+        # of 40 draws a standard deviation is known to 11 %; where the largest distance has a twin
+        # on the other side, drawn ones are the larger of two
+        assert 0.6 * sd < getattr(stray, name).sd_m < 1.6 * sd
+
+
+def test_recoil_permeability_counts(tmp_path, magnet):
+    session = Session.open(tmp_path)
+    permeable = magnet.with_(array__recoil_permeability=1.1)
+    one, other = (stray_field(each, session) for each in (magnet, permeable))
+    assert other.radial.distance_m != pytest.approx(one.radial.distance_m, rel=2e-3)
+    finer = stray_field(permeable.with_(mesh__cells_per_side=3), session)
+    assert other.radial.distance_m == pytest.approx(finer.radial.distance_m, rel=1e-3)
+
+
+def test_no_line_outside_of_a_weak_magnet(tmp_path, magnet):
+    weak = stray_field(magnet.with_(array__remanence_T=1e-4), Session.open(tmp_path))
+    assert (weak.radial, weak.axial, weak.unknown) == (None, None, "")
+    assert max(plane.size_T.max() for plane in weak.planes) < weak.limit_T
+    assert weak.planes[0].first_m[0].max() == pytest.approx((1 + NEAREST) * weak.radius_m)
+
+
+def test_what_a_mesh_does_not_tell(tmp_path, magnet, dipole):
+    direct = stray_field(magnet.with_(solver__method="direct"), Session.open(tmp_path))
+    assert "mesh" in direct.unknown
+    assert direct.radial is None
+    flat = build_magnet(dipole())
+    assert stray_field(flat, Session.open(tmp_path)) is None
