@@ -42,9 +42,9 @@ def answer(check: MapCheck) -> Answer:
             "halbach-fe check MAP -o DIR", sound=False)
     if not check.suffices:
         return Answer(
-            question, verdict(check), "No: nothing on this page tests the map: too many numbers were "
-            "fitted to too few readings.", "Measure in a volume, with a smaller spacing, and check "
-            "that map.", "halbach-fe check MAP -o DIR", sound=False)
+            question, verdict(check), "No: nothing on this page tests the map: too many numbers "
+            "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
+            "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
     noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
     if check.position_noise_m * 1e6 >= 1:
@@ -106,8 +106,9 @@ def verdict(check: MapCheck) -> str:
                 "changes more from point to point than its neighbours show: what a field without "
                 "sources leaves of it changes sign from each reading to the next.")
     if not check.suffices:
-        return (f"The map cannot tell: {100 * (1 - check.redundancy):.0f}\u00a0% of its readings are needed to "
-                "describe any field in its region. Measure in a volume, with a smaller spacing.")
+        return (f"The map cannot tell: {100 * (1 - check.redundancy):.0f}\u00a0% of its readings "
+                "are needed to describe any field in its region. Measure in a volume, with a "
+                "smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{_share(share)} of the largest field ({flux_density(check.size_T)})")

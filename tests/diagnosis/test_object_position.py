@@ -60,7 +60,7 @@ def test_the_position_is_that_of_the_sphere(session, generator, there):
 
 
 def test_no_object_is_where_the_probe_was():
-    """A map along the axis passes through places of the grid; the control is the field of a point."""
+    """A map along the axis passes through places of the grid; the control is a point's field."""
     effect = FerromagneticObjectEffect()
     place = next(one for one in effect.places(STUDY) if one.at_m[:2] == (0.0, 0.0))
     points = np.array(place.at_m) + [[0.0, 0.0, z] for z in (-0.01, 0.0, 0.01)]

@@ -22,8 +22,8 @@ BEYOND_M = (0.03, 0.08, 0.15, 0.25)
 
 
 NEAREST_M = 1e-3
-"""Distance from the object below which a reading shows nothing of it: a place of the grid may be one
-where the probe was, and the field of a point is infinite there."""
+"""Distance in m from the object below which a reading shows nothing of it: a place of the grid may
+be one where the probe was, and the field of a point dipole is infinite there."""
 
 
 class FerromagneticObjectEffect(Effect):
@@ -88,7 +88,7 @@ class FerromagneticObjectEffect(Effect):
 
 
 def _field(position: Floats, moment: Floats, points: Floats) -> Floats:
-    """Return B (n, 3) in T of a dipole at points (n, 3) in m, 0 where `NEAREST_M` is undercut."""
+    """Return B (n, 3) in T of a dipole at points (n, 3) in m, 0 nearer than `NEAREST_M`."""
     field = np.zeros_like(points)
     far = np.linalg.norm(points - position, axis=1) >= NEAREST_M
     field[far] = dipole_field(position, moment, points[far])
