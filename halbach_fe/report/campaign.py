@@ -49,9 +49,9 @@ def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, bloc
         f"{counted(blocks, 'single block')}. The largest reading is "
         f"{flux_density(float(np.nanmax(fields)), 4)}, the noise is "
         f"{flux_density(float(np.nanmin(sigma)), 2)} at least.",
-        "This magnet was never built: its blocks were drawn at random, and its field was computed "
-        "with programs other than halbach-fe. A campaign may contain a hidden error, also of the "
-        "positions that the map states.",
+        "Only as a test: the magnet was never built. Its blocks were drawn at random, and "
+        "its field was computed with programs other than halbach-fe. A campaign may contain a "
+        "hidden error, also of the positions that the map states.",
         "Update the magnet with the map, as if it were measured, then compare with the truth.",
         "halbach-fe infer STUDY --measurements DIR/map.csv --blocks DIR/blocks.csv"
         + (" --held-out DIR/held-out.csv" if held_out is not None else "") + " -o DIR")

@@ -12,7 +12,7 @@ from pathlib import PurePath
 from typing import Any
 
 from halbach_fe.report.campaign_folders import Chapter
-from halbach_fe.report.words import counted
+from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.differences import differences
 from halbach_fe.study.model import Study, magnet_description
 
@@ -57,7 +57,7 @@ def _out_of_date(chapters: Sequence[Chapter]) -> list[str]:
             if holders and digest not in present:
                 hold = f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}"
                 names.setdefault(hold, []).append(name)
-        found += [f"{one.label} is out of date: it was computed with another {_in_a_row(files)} "
+        found += [f"{one.label} is out of date: it was computed with another {in_a_row(files)} "
                   f"than {hold}. Run {one.record.command} again, or leave out what does not belong "
                   "to it." for hold, files in names.items()]
     return found
@@ -172,10 +172,4 @@ def _short(value: Any) -> str:
 
 def _listed(chapters: Sequence[Chapter]) -> str:
     """Return the names of folders in words."""
-    return _in_a_row([one.label for one in chapters])
-
-
-def _in_a_row(names: Sequence[str]) -> str:
-    """Return names in words: one, two and three."""
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
+    return in_a_row([one.label for one in chapters])

@@ -68,9 +68,9 @@ def answer(found: Forces) -> Answer:
     error = float(found.in_place.error_N[worst])
     return Answer(
         question, " ".join([*text, _mass(found)]),
-        f"To {_newton(error)} by the quadrature. The blocks are those of the study, at rest in "
-        "their places: a block that is 1 % stronger feels 1 % more, and one that comes nearer to "
-        "its neighbours than its place is may feel more.", *plan, sound=error <= ROUGH * size)
+        f"Yes, to {_newton(error)} by the quadrature. The blocks are those of the study, at rest "
+        "in their places: a block that is 1 % stronger feels 1 % more, and one that comes nearer "
+        "to its neighbours than its place is may feel more.", *plan, sound=error <= ROUGH * size)
 
 
 def _mass(found: Forces) -> str:
@@ -226,4 +226,5 @@ def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> 
         "their part in the plane. Right: forces in the order of the assembly")}, folder)
     write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
                provenance=provenance, answer=answer(found), rows=force_rows(found), found=found,
+               imbalance=_newton(found.imbalance_N),
                permeable=not found.magnet.is_vacuum)

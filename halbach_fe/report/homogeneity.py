@@ -69,7 +69,7 @@ def answer(found: HomogeneityResult) -> Answer:
     return Answer(
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
-        f"As far as the study's tolerances are right: it is no measured magnet. {trust}",
+        f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
         "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
         "halbach-fe infer STUDY --measurements MAP -o DIR", small)
 

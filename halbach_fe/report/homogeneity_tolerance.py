@@ -76,9 +76,9 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
-        f"As far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % and "
-        f"{prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that those "
-        f"tolerances come on top. {len(found.rms_ppm)} magnets were drawn. {text}", *step,
+        f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
+        f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
+        f"those tolerances come on top. {len(found.rms_ppm)} magnets were drawn. {text}", *step,
         sound=small)
 
 

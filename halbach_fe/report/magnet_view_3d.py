@@ -256,7 +256,8 @@ def magnet_view(
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
         scene={"aspectmode": "data",
-               **{f"{axis}axis": {"title": {"text": f"{axis} in mm"}} for axis in "xyz"},
+               **{f"{axis}axis": {"title": {"text": f"{axis} in mm"}, "nticks": 6}
+                  for axis in "xyz"},
                **({"zaxis": {"visible": False}} if magnet.dimension == 2 else {}),
                "camera": {"eye": camera, "center": {"x": 0, "y": BELOW, "z": 0},
                           "up": {"x": 0, "y": 1, "z": 0}}})

@@ -42,9 +42,9 @@ def answer(check: MapCheck) -> Answer:
             "halbach-fe check MAP -o DIR", sound=False)
     if not check.suffices:
         return Answer(
-            question, verdict(check), "Nothing on this page tests the map: too many numbers were "
-            "fitted to too few readings.", "Measure in a volume, with a smaller spacing, and check "
-            "that map.", "halbach-fe check MAP -o DIR", sound=False)
+            question, verdict(check), "No: nothing on this page tests the map: too many numbers "
+            "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
+            "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
     noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
     if check.position_noise_m * 1e6 >= 1:
@@ -54,7 +54,7 @@ def answer(check: MapCheck) -> Answer:
              "cannot show everything, though: see below.")
     if _violates(check):
         return Answer(
-            question, f"{verdict(check)} {noise}.", "Nothing that the probe may plausibly be "
+            question, f"{verdict(check)} {noise}.", "No: nothing that the probe may plausibly be "
             "explains this map: do not update a magnet with it.", "Look for rows, axes and units "
             "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
@@ -106,8 +106,9 @@ def verdict(check: MapCheck) -> str:
                 "changes more from point to point than its neighbours show: what a field without "
                 "sources leaves of it changes sign from each reading to the next.")
     if not check.suffices:
-        return (f"The map cannot tell: {1 - check.redundancy:.0%} of its readings are needed to "
-                "describe any field in its region. Measure in a volume, with a smaller spacing.")
+        return (f"The map cannot tell: {100 * (1 - check.redundancy):.0f}\u00a0% of its readings "
+                "are needed to describe any field in its region. Measure in a volume, with a "
+                "smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{_share(share)} of the largest field ({flux_density(check.size_T)})")
@@ -139,7 +140,7 @@ def _component(name: str) -> str:
 
 def _share(value: float) -> str:
     """Return a part of 1 in % or ppm."""
-    return f"{value:.2%}" if value >= 1e-3 else f"{value * 1e6:.0f} ppm"
+    return f"{100 * value:.2f}\u00a0%" if value >= 1e-3 else f"{value * 1e6:.0f} ppm"
 
 
 def instrument_table(check: MapCheck) -> list[dict[str, str]]:

@@ -148,7 +148,7 @@ def answer(
     question = "Which unwanted multipoles does the field have?"
     if not measured:
         return Answer(
-            question, said, "This is the magnet as ordered, not as it was built: ± is what the "
+            question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "
             "tolerances of its blocks (the study's prior) and the solver leave open.",
             "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
             "halbach-fe infer STUDY --measurements MAP -o DIR")

@@ -101,8 +101,8 @@ def answer(plan: MeasurementPlan) -> Answer:
                  "points for that.")
     return Answer(
         "Where should the magnet be measured?", said,
-        "As far as the study's prior and noise are right: the readings themselves do not matter. "
-        "Chosen one after another, the positions are nearly the best ones."
+        "Yes, as far as the study's prior and noise are right: the readings themselves do not "
+        "matter. Chosen one after another, the positions are nearly the best ones."
         + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
            else ""),
         "Set plan.points for a shorter plan, or name other places in plan.candidates. Measure "

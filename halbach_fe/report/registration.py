@@ -66,7 +66,7 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
         said = ("This magnet does not explain the map. The least bad answer: "
                 f"{said[0].lower()}{said[1:]}")
         trust.insert(0, (
-            f"Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
+            f"No. Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
             "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
             "than the study says, or the study lacks something."))
     return Answer(

@@ -81,7 +81,7 @@ def answer(found: Sensitivity, plans: Mapping[str, Mapping[str, Any]]) -> Answer
             + (f", and {same} tell as much as the whole circle." if same else "."))
     return Answer(
         "How much does the field tell about the blocks, and where should it be measured?", said,
-        "As far as the study's prior and noise are right, for small changes: the iron is "
+        "Yes, as far as the study's prior and noise are right, for small changes: the iron is "
         "linearized about the nominal magnet.",
         "Plan the measurement of your own magnet.", "halbach-fe plan STUDY -o DIR")
 

@@ -74,7 +74,7 @@ def _ranges(tray: ShimTray | None) -> str:
     """Say what the ranges contain."""
     shims = (f"{100 * tray.strength_sd:g} % of each shim's strength and {100 * tray.common_sd:g} % "
              "that all shims share" if tray else "the strength of the shims")
-    return f"As far as the update is right: ranges contain what it leaves open, and {shims}."
+    return f"Yes, as far as the update is right: ranges contain what it leaves open, and {shims}."
 
 
 def rows(found: FilledTray) -> list[dict[str, str]]:

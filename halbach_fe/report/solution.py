@@ -54,8 +54,8 @@ def answer(solution: Solution) -> Answer:
     fine = error <= (sigma or ROUGH * high)
     compared = ("" if not sigma else "Yes: the error is below the noise of the readings, "
                 f"{flux_density(sigma)}. " if fine else
-                f"The error is {decimals(error / sigma, 2)} times the noise of the readings, "
-                f"{flux_density(sigma)}; error bars of what follows include it. ")
+                f"Yes, to that error. It is {decimals(error / sigma, 2)} times the noise of the "
+                f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
         "How strong is the field?",
         f"{said} Mesh and boundary make a reading wrong by {flux_density(error)} at most "

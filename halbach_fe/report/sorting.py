@@ -22,7 +22,7 @@ from halbach_fe.report.multipoles import (
     reference_text,
 )
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
-from halbach_fe.report.words import counted, ppm
+from halbach_fe.report.words import counted, in_a_row, ppm
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
@@ -117,15 +117,15 @@ def answer(found: SortedBlocks) -> Answer:
             f"{types_in_words(found.alike)}, or measure spare blocks, and sort again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
     spread, prior = _uncertainty(found), found.study.prior
-    more = "".join(words for words, there in (
-        (", of the calibration of the coil", prior.common_mode_sd > 0),
-        (" and of the mounting", prior.mounting_sd_deg > 0)) if there)
+    known = ["the measured moments", *(words for words, there in (
+        ("the calibration of the coil", prior.common_mode_sd > 0),
+        ("the mounting", prior.mounting_sd_deg > 0)) if there)]
     return Answer(
         question,
         f"As blocks.sorted.csv says: {what} then {text(best)} {unit}{sizes}, instead of "
         f"{text(own)} for the blocks {found.own_order}, and {text(low)} to {text(high)} for 98 % "
         f"of random orders.{left}{turned}",
-        f"The uncertainty of the measured moments{more} adds {text(spread)} {unit}, whatever the "
+        f"Yes. The uncertainty of {in_a_row(known)} adds {text(spread)} {unit}, whatever the "
         f"order{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks.",
         "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")

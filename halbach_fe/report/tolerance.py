@@ -103,9 +103,9 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
              "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(
         "Which multipoles do the tolerances of the blocks make?", said,
-        f"As far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % and "
-        f"{prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that those "
-        f"tolerances come on top. {len(found.sizes)} magnets were drawn.", *step)
+        f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
+        f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
+        f"those tolerances come on top. {len(found.sizes)} magnets were drawn.", *step)
 
 
 @own_style

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from halbach_fe.core.numbers import decimals as decimals
@@ -76,6 +78,12 @@ def p_value(value: float) -> str:
 def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a number and its noun: 1 move, 2 moves."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def in_a_row(names: Sequence[str]) -> str:
+    """Return names in words: one, two and three."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def place_of(block: MagnetBlock) -> str:

@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects.ferromagnetic_object import FerromagneticObjec
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.solver.external_field import dipole_field
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured
 
 POSITION_M = np.array([0.043, 0.171, 0.148])
@@ -56,6 +57,21 @@ def test_the_position_is_that_of_the_sphere(session, generator, there):
     entry = diagnosis_summary(found)["effects"][0]
     assert entry["place"] == named.place.name
     assert entry["parameters"][3]["value"] == pytest.approx(values[3])
+
+
+def test_no_object_is_where_the_probe_was():
+    """A map along the axis passes through places of the grid; the control is a point's field."""
+    effect = FerromagneticObjectEffect()
+    place = next(one for one in effect.places(STUDY) if one.at_m[:2] == (0.0, 0.0))
+    points = np.array(place.at_m) + [[0.0, 0.0, z] for z in (-0.01, 0.0, 0.01)]
+    nominal = NominalFields(STUDY, points, np.zeros(3), np.zeros_like)
+    with np.errstate(invalid="ignore"):
+        assert not np.isfinite(dipole_field(points[1], np.ones(3), points)).all()
+    shown = [effect.signature(nominal, place), effect.derivative(nominal, place, [1.0, 2.0, 3.0])]
+    for found in shown:
+        assert np.isfinite(found).all()
+        assert not found[:3, 1].any()
+        assert found[:3, [0, 2]].all(axis=1).any()
 
 
 def test_derivatives_by_the_position():

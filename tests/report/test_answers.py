@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import shlex
 
 import numpy as np
@@ -171,6 +172,7 @@ def check(found, numbers):
         assert number in text, number
     assert found.question.endswith("?")
     assert found.sound
+    assert re.match("Yes|No|Only", found.trust), found.trust
     for word in ("nan", "None", "e-0", "e+0", "r01s", "nats"):
         assert word not in text, word
     program, *words = shlex.split(found.command)

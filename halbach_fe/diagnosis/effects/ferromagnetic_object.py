@@ -21,6 +21,11 @@ BEYOND_M = (0.03, 0.08, 0.15, 0.25)
 """Distances of the candidate places from the magnet's ends."""
 
 
+NEAREST_M = 1e-3
+"""Distance in m from the object below which a reading shows nothing of it: a place of the grid may
+be one where the probe was, and the field of a point dipole is infinite there."""
+
+
 class FerromagneticObjectEffect(Effect):
     """A small magnetized object, modelled as a point dipole.
 
@@ -53,15 +58,15 @@ class FerromagneticObjectEffect(Effect):
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         position = np.array(place.at_m)
-        return np.array([dipole_field(position, moment, nominal.points) for moment in np.eye(3)])
+        return np.array([_field(position, moment, nominal.points) for moment in np.eye(3)])
 
     def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.derivative`."""
         position, moment = _at(place, values), np.array(values[:3])
-        slopes = [(dipole_field(position + step, moment, nominal.points)
-                   - dipole_field(position - step, moment, nominal.points)) / (2 * STEP_M)
+        slopes = [(_field(position + step, moment, nominal.points)
+                   - _field(position - step, moment, nominal.points)) / (2 * STEP_M)
                   for step in STEP_M * np.eye(3)]
-        fields = [dipole_field(position, unit, nominal.points) for unit in np.eye(3)]
+        fields = [_field(position, unit, nominal.points) for unit in np.eye(3)]
         return np.array([*fields, *slopes])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -80,6 +85,14 @@ class FerromagneticObjectEffect(Effect):
         if len(values) == len(self.parameters):
             return values, sd
         return np.concatenate([values[:3], _at(place, values.tolist())]), sd
+
+
+def _field(position: Floats, moment: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) in T of a dipole at points (n, 3) in m, 0 nearer than `NEAREST_M`."""
+    field = np.zeros_like(points)
+    far = np.linalg.norm(points - position, axis=1) >= NEAREST_M
+    field[far] = dipole_field(position, moment, points[far])
+    return field
 
 
 def _at(place: Place, values: Sequence[float]) -> Floats:
