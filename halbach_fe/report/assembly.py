@@ -29,7 +29,8 @@ def answer(assembly: Assembly) -> Answer:
                if copies else " go without a holder.")]
     said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
              for reason in assembly.reasons]
-    trust = "Shapes and places are those of the study; the holder does not know the forces."
+    trust = ("Yes, as far as shapes and places of the study are right; the holder does not know "
+             "the forces.")
     if assembly.plates:
         wall = min(plate.wall_m for plate in assembly.plates)
         said.append(f"Pockets are {1e3 * assembly.holder.clearance_m:.3g}\u00a0mm larger than the "

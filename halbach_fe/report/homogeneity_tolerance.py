@@ -14,7 +14,15 @@ from halbach_fe.core.files import write_text
 from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, solver_error_text
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    begin_at_zero,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import ppm
 
 ENOUGH = 0.9
@@ -105,10 +113,12 @@ def _figure(found: HomogeneityTolerance) -> Figure:
             (right, found.peak_to_peak_ppm, found.ordered.peak_to_peak_ppm, "peak to peak")):
         axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
         axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
-        axis.set(xlabel=f"{name} deviation in ppm", xlim=(0, None), ylim=(0, 1.02))
+        axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
         axis.grid(alpha=0.3)
     left.set_ylabel("share of magnets")
     if found.limit is not None:
         left.axvline(found.limit, color=PRIOR, ls="--", label="limit")
+    for axis in (left, right):
+        begin_at_zero(axis)
     left.legend(loc="lower right")
     return figure

@@ -147,6 +147,13 @@ def stacked_axes(
     return figure, list(axes[:, 0])
 
 
+def begin_at_zero(axis: Axes) -> None:
+    """Let the x axis of what is drawn begin at 0, unless that would hide how the values differ."""
+    low, high = axis.get_xlim()
+    if low < high / 2:
+        axis.set_xlim(0, None)
+
+
 def axis_of_points(points: Floats) -> tuple[Floats, str]:
     """Return the abscissae (n,) of points (n, 3) in m in a figure, and the label of that axis.
 

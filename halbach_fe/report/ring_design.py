@@ -38,9 +38,9 @@ def answer(found: Designed) -> Answer:
                     f"{ppm(stronger[0].peak_to_peak_ppm)} ppm peak to peak.")
     return Answer(
         f"Which rings make a homogeneous field in {region}?", " ".join(text),
-        ("It is the best that the search found, which does not prove that there is no better one. "
-         "These are blocks as ordered: their tolerances leave more.")
-        if found.reached else "It is not what was asked for: the limits of [design] exclude it.",
+        ("Yes, as the best that the search found, which does not prove that there is no better "
+         "one. These are blocks as ordered: their tolerances leave more.")
+        if found.reached else "No. What was asked for is excluded by the limits of [design].",
         "See what the tolerances of the blocks leave of it." if found.reached else
         "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
         f"halbach-fe {'homogeneity DIR/' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
@@ -118,9 +118,12 @@ def front_figure(found: Designed) -> Figure:
 
 def side_figure(found: Designed) -> Figure:
     """Draw the rings of the best design from the side, and the region."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    rings = found.study.array.ring
+    length = max(ring.z_m or 0.0 for ring in rings) - min(ring.z_m or 0.0 for ring in rings)
+    shape = length / max(ring.outer_radius_m or length for ring in rings)
+    figure = Figure(figsize=(np.clip(1.5 + 3.0 * shape, 5.0, 11.0), 3.6), layout="constrained")
     axis = figure.subplots()
-    for ring in found.study.array.ring:
+    for ring in rings:
         assert ring.z_m is not None  # those of a design are not stacked
         assert ring.ring_length_m is not None
         assert ring.inner_radius_m is not None

@@ -107,7 +107,7 @@ def write_solution_report(
         folder / "report.html", "solution.html.j2", save(figures, folder),
         study=solution.magnet.study,
         magnet_rows=magnet_rows(solution.magnet),
-        multipoles=middle_table(multipoles), provenance=provenance,
+        multipoles=middle_table(multipoles), exact=not solution.errors.any(), provenance=provenance,
         answer=answer(solution), rows=field_table(solution),
         stray=stray_section(solution.stray_field),
         view=view_of_nominal_magnet(

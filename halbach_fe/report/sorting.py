@@ -21,7 +21,15 @@ from halbach_fe.report.multipoles import (
     reference_summary,
     reference_text,
 )
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    begin_at_zero,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import counted, in_a_row, ppm
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
@@ -196,6 +204,7 @@ def _random_orders_figure(found: SortedBlocks) -> Figure:
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
     axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
     axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")
-    axis.set(xlabel=f"rms of {_axis_text(found)}", ylabel="random orders", xlim=(0, None))
+    axis.set(xlabel=f"rms of {_axis_text(found)}", ylabel="random orders")
+    begin_at_zero(axis)
     axis.legend()
     return figure

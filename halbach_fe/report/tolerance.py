@@ -20,7 +20,15 @@ from halbach_fe.report.homogeneity_tolerance import (
     write_homogeneity_tolerance,
 )
 from halbach_fe.report.multipoles import main_in_words, reference_summary, reference_text
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    begin_at_zero,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.response.multipoles import plain
 
 LEAST_OF_SD = 5e-3
@@ -155,7 +163,7 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
         axis.legend(loc="lower right")
     axis.axhline(1, color=PUBLISHED, lw=0.8)
-    axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02),
-             xlim=(0, None))
+    axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02))
+    begin_at_zero(axis)
     axis.grid(alpha=0.3)
     return figure

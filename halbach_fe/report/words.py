@@ -22,6 +22,8 @@ CERTAIN = 100
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
+TO_ONE = "\u00a0:\u00a01"
+
 BAYES_FACTOR_IN_WORDS = ("The Bayes factor of an effect says how many times as probable the "
                          "readings are with it as without it.")
 
@@ -64,10 +66,10 @@ def bayes_factor(log_bayes_factor: float) -> str:
         return EMPTY_CELL
     power = log_bayes_factor / np.log(10)
     if power >= CERTAIN:
-        return f"over 10{str(CERTAIN).translate(RAISED)} : 1"
+        return f"over 10{str(CERTAIN).translate(RAISED)}{TO_ONE}"
     if power >= 4:
-        return f"10{str(int(power)).translate(RAISED)} : 1"
-    return f"{decimals(float(np.exp(log_bayes_factor)), 2)} : 1"
+        return f"10{str(int(power)).translate(RAISED)}{TO_ONE}"
+    return f"{decimals(float(np.exp(log_bayes_factor)), 2)}{TO_ONE}"
 
 
 def p_value(value: float) -> str:

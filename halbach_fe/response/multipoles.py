@@ -558,14 +558,15 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     """Return a row of text per order, with ``b_n ± sd`` and ``a_n ± sd`` in units.
 
     The columns are multipoles of the same orders, each by a name for the heading. The main
-    multipole, 10 000 units by definition, is no error: its cell has a word.
+    multipole, 10 000 units by definition, is no error: its cell has a word. What is exact has no
+    standard deviation.
     """
     def text(known: Multipoles, number: int) -> str:
         if known.mean[number] > MAIN_UNITS:
             return "main"
         value, sd = round(float(known.mean[number]), 2), float(known.sd[number])
-        spread = "<0.01" if 0 < sd < 0.005 else f"{sd:.2f}"
-        return f"{value:+.2f} ± {spread}" if value else f"0 ± {spread}"
+        spread = "" if not sd else " ± <0.01" if sd < 0.005 else f" ± {sd:.2f}"
+        return f"{value:+.2f}{spread}" if value else f"0{spread}"
 
     first = next(iter(columns.values()))
     rows = []

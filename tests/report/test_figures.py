@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import halbach_fe as hf
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
+from halbach_fe.report.page import begin_at_zero
 from halbach_fe.report.prior import type_table
 from halbach_fe.report.solution import field_figure
 from halbach_fe.report.sorting import write_sorted
@@ -44,6 +46,15 @@ def test_fourier_coefficients_are_at_no_point(document, points, tmp_path):
     found = hf.infer(hf.build_magnet(study), map_, Session.open(tmp_path))
     assert ("measured points" in colours_in_words(found)) == points
     assert ('"measured points"' in view_of_inference(found)) == points
+
+
+@pytest.mark.parametrize(("values", "zero"), [([1.0, 9.0], True), ([99.0, 100.0], False)])
+def test_axes_begin_at_zero_unless_that_hides_the_differences(values, zero):
+    axis = Figure().subplots()
+    axis.plot(values, [0, 1])
+    begin_at_zero(axis)
+    assert (axis.get_xlim()[0] == 0) == zero
+    assert axis.get_xlim()[1] > values[1]
 
 
 @pytest.mark.filterwarnings("ignore:Every block of study:halbach_fe.core.errors.HalbachWarning")
