@@ -18,6 +18,7 @@ from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
+from halbach_fe.core.pace import Progress
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -57,7 +58,7 @@ from halbach_fe.response.multipoles import (
     multipole_models,
 )
 from halbach_fe.response.stray_field import StrayField, stray_field
-from halbach_fe.solver.session import Progress, Session, alone
+from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
