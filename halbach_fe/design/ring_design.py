@@ -72,9 +72,10 @@ class RingDesign:
     rings : tuple of Option
         The ring of each layer in each place, None where it is empty.
     mean_T : float
-        Mean of the component along the main field.
+        Mean of |B| over the region's volume.
     rms_ppm, peak_to_peak_ppm : float
-        Deviations of that component, over the volume and over the surface.
+        Deviations of |B| from it, over the volume and over all points of surface and volume, as
+        those of `halbach_fe.response.homogeneity`.
     mass_kg : float
     blocks : int
     """
@@ -161,8 +162,9 @@ def design_rings(
     region = region or default_region(build_magnet(study))
     catalogue = Catalogue.of(study, region, _density(study))
     design, generator = catalogue.design, np.random.default_rng(seed)
-    reaction = np.zeros(len(catalogue.sample.points))
-    task = task_of(catalogue, reaction)
+    direction = catalogue.sample.direction
+    reaction = np.zeros_like(catalogue.sample.points)
+    task = task_of(catalogue, reaction @ direction)
     places, options = task.table.shape[:2]
     starts = np.linspace(0, options - 1, STARTS).round().astype(int)
     found = min((search(task, np.full(places, start), RESTARTS, generator)
@@ -177,7 +179,7 @@ def design_rings(
         reaction = _reaction(catalogue, chosen, session)
         if not reaction.any():
             break
-        task = task_of(catalogue, reaction)
+        task = task_of(catalogue, reaction @ direction)
         found = search(task, chosen, RESTARTS, generator)
         if np.array_equal(chosen, found.chosen):
             break
@@ -188,9 +190,12 @@ def design_rings(
     if number:
         reaction = _reaction(catalogue, found.chosen, session)
     others = [_judged(catalogue, catalogue.rings(one.chosen), reaction) for one in every]
-    best = others[number]
+    # the search worked for the component along the main field
+    best = min((one for one, at in zip(others, every, strict=True) if at.ppm < MISSES),
+               key=lambda one: one.deviation_ppm(design.objective), default=others[number])
     if design.between_radii:
-        best = _judged(catalogue, moved_radii(catalogue, best.rings, reaction, task), reaction)
+        best = _judged(catalogue, moved_radii(catalogue, best.rings, reaction @ direction, task),
+                       reaction)
     result = designed(study, tables_of(study, catalogue.z_m, best.rings))
     return Designed(result, region, best, _not_beaten([*others, best], design.objective),
                     found.ppm < MISSES, _slices(result, region, session))
@@ -214,11 +219,11 @@ def _density(study: Study) -> float:
 
 
 def _reaction(catalogue: Catalogue, chosen: Ints, session: Session) -> Floats:
-    """Return what permeability adds to the component (k,) in T along the main field."""
+    """Return what permeability adds to B (k, 3) in T at the points of the catalogue's sample."""
     study = designed(catalogue.study, tables_of(catalogue.study, catalogue.z_m,
                                                 catalogue.rings(chosen)))
     magnet, sample = build_magnet(study), catalogue.sample
-    return np.asarray(_added(magnet, sample.points, session) @ sample.direction)
+    return _added(magnet, sample.points, session)
 
 
 def _added(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -243,17 +248,16 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
 
 
 def _judged(catalogue: Catalogue, rings: tuple[Option, ...], reaction: Floats) -> RingDesign:
-    """Return a design with its field."""
+    """Return a design with its field, to which permeability adds ``reaction`` (k, 3) in T."""
     sample = catalogue.sample
-    field = reaction + np.sum([
+    size = np.linalg.norm(reaction + np.sum([
         fields_with_images(catalogue.study, ring, catalogue.z_m[place:place + 1], sample.points)[0]
-        @ sample.direction for place, option in enumerate(rings) for ring in option if ring],
-        axis=0)
-    mean = float(sample.weights @ field)
-    deviation = PPM * (field / mean - 1)
+        for place, option in enumerate(rings) for ring in option if ring], axis=0), axis=1)
+    mean = float(sample.weights @ size)
+    deviation = PPM * (size / mean - 1)
     return RingDesign(
         catalogue.z_m, rings, mean, float(np.sqrt(sample.weights @ deviation**2)),
-        float(np.ptp(deviation[sample.surface])), catalogue.mass_of(rings),
+        float(np.ptp(deviation)), catalogue.mass_of(rings),
         catalogue.blocks_of(rings))
 
 

@@ -8,7 +8,8 @@ O. C. Martin and T. Stutzle, Handbook of Metaheuristics (2003) 320). What is ask
 field and largest mass, comes first: of two designs that miss it, the one that misses it by less is
 better.
 
-Deviations are those of the component along the main field. Its extremes lie on the surface of the
+Deviations are those of the component along the main field, which is linear in the rings and
+differs from |B| by the square of the components across it. Its extremes lie on the surface of the
 region, as it is a harmonic function there. Permeable blocks are taken as they are in vacuum while
 the search runs; then their reaction in the design that was found is added to every design, and the
 search goes on from there.

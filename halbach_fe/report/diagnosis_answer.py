@@ -40,9 +40,26 @@ def answer(diagnosis: Diagnosis) -> Answer:
         diagnosis))
     if sound and diagnosis.identified and len(doubts) == 1:  # only how well the model fits now
         doubts = [f"Yes. {doubts[0]}"]
-    return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or (
-        "Yes: the readings are explained to their noise, with the blocks' tolerances integrated "
-        "out."), *_next(diagnosis), sound)
+    if not diagnosis.identified:
+        doubts.insert(0, _trust(diagnosis, sound))
+    return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
+        diagnosis, sound), *_next(diagnosis), sound)
+
+
+def _trust(diagnosis: Diagnosis, sound: bool) -> str:
+    """Say whether an answer without named effects can be trusted."""
+    chi2 = f"chi² per training reading is {decimals(diagnosis.after.prior_conflict)}"
+    if sound:
+        return ("Yes: the readings are explained to their noise, with the blocks' tolerances "
+                "integrated out.")
+    if diagnosis.solver_error:
+        return "No: the mesh is too coarse for readings of this noise."
+    if diagnosis.unknown:
+        return (f"No: what is missing can be described but not added to the model. Without it "
+                f"{chi2}, so that error bars of an update with this map are too small.")
+    if diagnosis.suspected:
+        return f"Only in part: a suspicion is no certainty. Without it {chi2}."
+    return f"No: {chi2}."
 
 
 def _next(diagnosis: Diagnosis) -> tuple[str, str]:

@@ -34,7 +34,8 @@ def definition(axis: MagneticAxis) -> str:
             "right-handed.")
     if axis.order == 1:
         return ("A dipole has no axis. Its centre is the point near the middle, of a magnet of "
-                f"finite length, where the gradient of the main component vanishes. {roll}")
+                "finite length, where the gradient of the main component vanishes; a homogeneous "
+                f"field may have none there. {roll}")
     return (f"The centre is where the multipole of order {axis.order - 1} vanishes"
             + (", the axis the straight line through the centres along the middle half of the "
                "magnet; the centre is its point at z = 0. " if axis.slope_rad is not None

@@ -16,7 +16,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_design import Designed, RingDesign
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.homogeneity import slices_figure
+from halbach_fe.report.homogeneity import SIZES, slices_figure
 from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SMALL, own_style, save, write_page
 from halbach_fe.report.words import ppm
 from halbach_fe.study.edit_file import write_edited
@@ -30,8 +30,8 @@ def answer(found: Designed) -> Answer:
     start = "" if found.reached else ("No design reaches what is asked. The one that misses it by "
                                       "least: ")
     text = [f"{start}{best.blocks} blocks in {_count(found.best)} make {1e3 * best.mean_T:.4g} mT "
-            f"in {region}, homogeneous to {ppm(best.peak_to_peak_ppm)} ppm peak to peak and "
-            f"{ppm(best.rms_ppm)} ppm rms. They weigh {best.mass_kg:.3g} kg."]
+            f"in {region}; |B| deviates from it by {ppm(best.rms_ppm)} ppm rms and "
+            f"{ppm(best.peak_to_peak_ppm)} ppm peak to peak. They weigh {best.mass_kg:.3g} kg."]
     stronger = [one for one in found.front if one.mean_T > best.mean_T]
     if stronger:
         text.append(f"{1e3 * stronger[0].mean_T:.4g} mT are possible with "
@@ -172,4 +172,4 @@ def write_design(
         folder)
     write_page(folder / "design.html", "design.html.j2", pictures, study=found.study,
                provenance=provenance, answer=answer(found), rows=design_rows(found),
-               rings=ring_rows(found), settings=found.study.design)
+               rings=ring_rows(found), sizes=SIZES, settings=found.study.design)

@@ -7,7 +7,7 @@ import numpy as np
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Suspicion, UnknownCause, UnknownPart
 from halbach_fe.diagnosis.summary import place_in_words
-from halbach_fe.report.words import bayes_factor
+from halbach_fe.report.words import bayes_factor, decimals
 
 COORDINATES = {
     "z": "z", "angle": "the azimuth", "radius": "the radius", "time": "the time",
@@ -52,7 +52,7 @@ def unknown_sentences(unknown: UnknownCause, beside_effects: bool) -> list[str]:
              "them" if unknown.ambiguous else "Something outside the catalogue "
              + ("remains" if beside_effects else "is missing"))
     sentences = [f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
-                 f"{1e3 * unknown.largest_T:.2g} mT (Bayes factor "
+                 f"{decimals(1e3 * unknown.largest_T, 2)} mT (Bayes factor "
                  f"{bayes_factor(unknown.log_bayes_factor)})."]
     if unknown.parts:
         sentences.append("It looks like " + "; and ".join(map(part_in_words, unknown.parts)) + ".")
@@ -71,22 +71,23 @@ def unknown_advice(unknown: UnknownCause) -> str:
 
 def part_in_words(part: UnknownPart) -> str:
     """Describe one term of an unknown cause."""
-    size = f"{1e3 * part.rms_T:.2g} mT rms and {1e3 * part.largest_T:.2g} mT at most"
+    rms, largest = (decimals(1e3 * one, 2) for one in (part.rms_T, part.largest_T))
+    size = f"{rms} mT rms and {largest} mT at most"
     if part.acts_on == "field":
         return f"a field that Maxwell's equations allow in the bore, {size}"
     texture = "smooth" if part.smooth else "rough"
     names = ", ".join(part.components)
     target = {
         "readings": f"an error of the readings of B{names.replace(', ', ', B')}",
-        "gains": f"an error of {1e2 * part.size:.2g} % rms of the gain of B"
+        "gains": f"an error of {decimals(1e2 * part.size, 2)} % rms of the gain of B"
                  f"{names.replace(', ', ', B')}",
-        "positions": f"an error of {1e3 * part.size:.2g} mm rms of the probe's position along "
-                     f"{names}"}[part.acts_on]
+        "positions": f"an error of {decimals(1e3 * part.size, 2)} mm rms of the probe's position "
+                     f"along {names}"}[part.acts_on]
     where = f" in map {part.map}" if part.map else ""
     text = f"{target}{where}, a {texture} function of {COORDINATES[part.along]}"
     if part.half_wave is not None:
         factor, unit = HALF_WAVES[part.along]
-        text += f" that changes within some {factor * part.half_wave:.2g} {unit}"
+        text += f" that changes within some {decimals(factor * part.half_wave, 2)} {unit}"
     text += f" ({size} in the readings"
     if part.or_else:
         text += "; as well explained by " + ", ".join(map(_alternative, part.or_else))

@@ -42,7 +42,19 @@ INSIDE = 0.5
 """Radius of the default sphere, relative to that of the bore."""
 
 INTEGRATION_DEGREE = 10
-"""Degree of the functions whose means over the volume are exact."""
+"""Degree of the functions of the radius, and of z in a panel, whose means are exact."""
+
+ANGULAR_DEGREE = 32
+"""Largest degree of the functions of the angles whose means are exact: squares of harmonics of half
+of it. Of a magnet that was designed to be homogeneous only harmonics of high degrees are left: with
+a degree of 10 the rms of one of 3 009 cubes was 15 % too small (26.8 instead of 31.4 ppm)."""
+
+SHELL_TAIL = 0.02
+"""Size, relative to that on the surface, up to which harmonics are left out on shells within a
+region: there a smaller angular degree suffices."""
+
+ELONGATED = 1.5
+"""Ratio of length and width from which an ellipsoid is integrated in panels along z."""
 
 SURFACE_DEGREE = 36
 """Least degree of the functions that the points of the surface resolve. They are 10° from each
@@ -159,7 +171,9 @@ class Region:
             return np.asarray((np.hypot(x, y) <= 1) & (np.abs(z) <= 1))
         return np.asarray(x**2 + y**2 + z**2 <= 1)
 
-    def points(self, surface_degree: int, panel_m: float = np.inf) -> tuple[Floats, Floats]:
+    def points(
+        self, surface_degree: int, panel_m: float = np.inf, angular_degree: int = ANGULAR_DEGREE
+    ) -> tuple[Floats, Floats]:
         """Return points (n, 3) in m, those of the surface first, and weights (n,).
 
         The weights, 0 on the surface, are those of means over the volume.
@@ -172,14 +186,17 @@ class Region:
         panel_m : float
             Length along z within which the field is a polynomial of `INTEGRATION_DEGREE`; longer
             regions are integrated in several panels.
+        angular_degree : int
+            Degree of the functions of the angles whose means over the outermost shells are exact.
         """
         surface = (_cylinder_surface if self.shape == "cylinder" else _sphere_surface)(
             surface_degree)
         size = INTEGRATION_DEGREE // 2 + 1
         panels = int(np.ceil(2 * self.half_axes_m[2] / panel_m))
-        if self.shape == "cylinder" or panels > 1:
+        width = max(self.half_axes_m[:2])
+        if self.shape == "cylinder" or (panels > 1 and self.half_axes_m[2] > ELONGATED * width):
             radii, radial = _on_radius(size, 1)
-            angles = 2 * np.pi * np.arange(INTEGRATION_DEGREE + 1) / (INTEGRATION_DEGREE + 1)
+            angles = 2 * np.pi * np.arange(angular_degree + 1) / (angular_degree + 1)
             heights, along = _in_panels(size, max(panels, 1))
             r, phi, z = (part.ravel() for part in np.meshgrid(radii, angles, heights,
                                                               indexing="ij"))
@@ -188,10 +205,14 @@ class Region:
             weights = wide**2 * np.einsum(
                 "r,p,z->rpz", radial, np.ones(len(angles)), along).ravel()
         else:
-            directions, angular = sphere_points(INTEGRATION_DEGREE)
-            radii, radial = _on_radius(size, 2)
-            inner = (radii[:, None, None] * directions).reshape(-1, 3)
-            weights = np.outer(radial, angular).ravel()
+            shells = []
+            for radius, weight in zip(*_on_radius(size, 2), strict=True):
+                needed = 2 * int(np.ceil(np.log(SHELL_TAIL) / np.log(radius)))
+                directions, angular = sphere_points(
+                    int(np.clip(needed, INTEGRATION_DEGREE, angular_degree)))
+                shells.append((radius * directions, weight * angular))
+            inner = np.vstack([points for points, _ in shells])
+            weights = np.concatenate([own for _, own in shells])
         unit = np.vstack([surface, inner])
         return (np.array(self.centre_m) + unit * self.half_axes_m,
                 np.append(np.zeros(len(surface)), weights / weights.sum()))
@@ -480,7 +501,9 @@ def region_points(
     resolved = MOST_DEGREES if reach >= 1 else min(
         MOST_DEGREES, int(np.ceil(np.log(HIGHER_DEGREES) / np.log(reach))))
     surface_degree = max(resolved + degrees, SURFACE_DEGREE)
-    points, weights = region.points(surface_degree, magnet.bore_radius)
+    points, weights = region.points(
+        surface_degree, magnet.bore_radius,
+        int(np.clip(resolved, INTEGRATION_DEGREE, ANGULAR_DEGREE)))
     inside = magnet.contains(points)
     if inside.any():
         x, y, z = 1e3 * points[int(np.argmax(inside))]

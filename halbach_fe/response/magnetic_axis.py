@@ -48,9 +48,9 @@ STEP = 1 / 4
 """Distance of the points from which gradient and curvatures of a dipole's field follow, relative
 to the radius of the bore."""
 
-MOST_STEPS = 4
+MOST_STEPS = 1
 """Farthest stationary point of a dipole's field that counts, in steps from the middle. Farther away
-the field has other curvatures than in the middle."""
+the field has other curvatures; that of a homogeneous magnet may be anywhere."""
 
 
 @dataclass(frozen=True)

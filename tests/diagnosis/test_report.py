@@ -128,6 +128,8 @@ def test_verdicts(flat):
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
     assert verdict(alone).startswith("Something outside the catalogue is missing")
     assert "near (200, 0, 0) mm" in verdict(alone)
+    assert "No: what is missing can be described" in verdict(alone)
+    assert "Yes: " not in verdict(alone)
     part = UnknownPart("positions", "angle", ("readings z",), ("x", "y"), False, 2e-4, 6e-4, 3e-4,
                        40.0, 90.0)
     assert (
@@ -141,11 +143,13 @@ def test_verdicts(flat):
     text = verdict(doubt)
     assert "Suspected with a probability of 90 % (odds 9.0 : 1)" in text
     assert "Nothing is missing" not in text
+    assert "Only in part: a suspicion is no certainty" in text
     assert "Measure the same map 2 times in all" in text
     assert diagnosis_summary(doubt)["verdict"] == "suspected"
     assert diagnosis_summary(doubt)["suspected"][0]["effects"] == {"gain_x": 0.6, "gain_y": 0.3}
     fine = replace(found.before, prior_conflict=1.0)
     assert verdict(replace(nothing, before=fine, after=fine)).startswith("Nothing is missing")
+    assert "Yes: the readings are explained" in verdict(replace(nothing, before=fine, after=fine))
 
 
 def test_the_page_of_what_is_unknown(flat, tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import eval_legendre
 from scipy.stats import qmc
 
 from halbach_fe.api import homogeneity
@@ -92,6 +93,25 @@ def test_beside_random_points(generator, tmp_path, region):
     assert bool(known.harmonics) == (region.shape == "sphere")
 
 
+@pytest.mark.parametrize("degree", [2, 6, 10, 12, 14])
+def test_mean_squares_of_harmonics_of_high_degree(degree):
+    """What a good design leaves: r^l P_l(z / r), and the real part of (x + i y)^l."""
+    def mean_squares(**options):
+        points, weights = Region.sphere(1.0).points(4, **options)
+        radius = np.maximum(np.linalg.norm(points, axis=1), 1e-12)
+        zonal = radius**degree * eval_legendre(degree, points[:, 2] / radius)
+        sectoral = ((points[:, 0] + 1j * points[:, 1])**degree).real
+        return np.array([weights @ zonal**2, weights @ sectoral**2])
+
+    steps = np.arange(1, degree + 1)
+    on_sphere = np.array([1 / (2 * degree + 1), float(np.prod(2 * steps / (2 * steps + 1))) / 2])
+    true = 3 / (2 * degree + 3) * on_sphere
+    # six radii leave some per mille of r^28, and shells within the sphere another per cent
+    assert mean_squares() == pytest.approx(true, rel=0.02)
+    if degree > 5:  # the control
+        assert mean_squares(angular_degree=10) != pytest.approx(true, rel=0.02)
+
+
 @pytest.mark.parametrize("region", [Region("cylinder", (0.008, 0.008, 0.2)),
                                     Region("ellipsoid", (0.008, 0.006, 0.2))],
                          ids=lambda region: region.text)
@@ -104,7 +124,8 @@ def test_regions_longer_than_the_magnet(generator, tmp_path, region, monkeypatch
     assert known.mean_T == pytest.approx(size.mean(), rel=0.02)
     assert known.rms_ppm == pytest.approx(1e6 * size.std() / size.mean(), rel=0.03)
     one_panel = Region.points
-    monkeypatch.setattr(Region, "points", lambda own, degree, _: one_panel(own, degree))
+    monkeypatch.setattr(Region, "points", lambda own, degree, *_: one_panel(
+        own, degree, angular_degree=10))
     control = known_magnet(generator, tmp_path / "control", region)[0].by_name["posterior"]
     assert control.mean_T != pytest.approx(size.mean(), rel=0.02)
 
