@@ -21,7 +21,7 @@ from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, SMALL
-from halbach_fe.report.prediction import axis_of_readings
+from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 
 MAX_BARS = 8
 """Largest number of bars of a chart, and of rows of residuals."""
@@ -238,13 +238,14 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
 def profile(diagnosis: Diagnosis) -> Figure:
     """Draw the readings with the largest residuals, their predictions and residuals."""
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
-    label, index, along, name = _line(before, diagnosis.loo_residuals_before)
+    label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
+    line = {"lw": 1.2} if connected else {"ls": "none", "marker": "_", "ms": 8}
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
     for state in shown:
         mean, colour = state.update.prediction_posterior.mean, state.colour
-        top.plot(along, 1e3 * mean[index], color=colour, lw=1.2, label=f"predicted, {state.when}")
+        top.plot(along, 1e3 * mean[index], color=colour, label=f"predicted, {state.when}", **line)
         residual = 1e3 * (state.update.readings - mean)[index]
         bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
         bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
@@ -253,12 +254,16 @@ def profile(diagnosis: Diagnosis) -> Figure:
     top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
              label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
-    bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
+    if connected:
+        bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
+    else:
+        bottom.errorbar(along, 0 * along, band, fmt="none", color=POSTERIOR, alpha=0.2, lw=4)
     where = (before.observation.places if before.is_campaign
              else before.observation.positions)[index[0]]
     x, y, _ = 1e3 * where.round(6) + 0.0  # no -0
     of_map = f" of map {before.maps[index[0]]}" if before.is_campaign else ""
-    top.set_title(f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
+    top.set_title(f"{label}{of_map} at all points" if not connected else
+                  f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     top.set_ylabel(f"{label} in mT")
     top.legend(fontsize=SMALL)
@@ -269,11 +274,11 @@ def profile(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Floats, str]:
+def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Floats, str, bool]:
     """Return the readings of the profile.
 
     These are the readings with the largest residuals of all lines along z, circles, or coefficients
-    of one kind.
+    of one kind. If no line has as many as `FEWEST_ON_A_LINE`, they are all of one component.
 
     Parameters
     ----------
@@ -291,6 +296,8 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
         Their coordinates on the abscissa.
     name : str
         Name of the abscissa.
+    connected : bool
+        Whether they lie on a line.
     """
     worst = np.full(len(update.readings), np.nan)
     worst[~update.held_out] = loo_residuals**2
@@ -307,8 +314,11 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
     index = max((group for group in groups if 2 * len(group) >= longest
                  and not np.isnan(worst[group]).all()),
                 key=lambda group: float(np.nanmean(worst[group])))
+    connected = longest >= FEWEST_ON_A_LINE
+    if not connected:
+        index = np.flatnonzero(labels == labels[index[0]])
     order = np.argsort(along[index], kind="stable")
-    return str(labels[index[0]]), index[order], along[index][order], name
+    return str(labels[index[0]]), index[order], along[index][order], name, connected
 
 
 def _lines_of_maps(update: InferenceResult) -> Floats:

@@ -83,7 +83,7 @@ def panels(points: Floats) -> list[Panel]:
     radii = np.hypot(points[:, 0], points[:, 1])
     if np.ptp(points[:, 2]) <= SAME * size:
         return [_slice(points, every, 2)]
-    from_middle = np.linalg.norm(points - (points.max(axis=0) + points.min(axis=0)) / 2, axis=1)
+    from_middle = np.linalg.norm(points - _centre(points), axis=1)
 
     def unrolled(title: str, chosen: Ints) -> Panel:
         return Panel(title, chosen, z[chosen], _angle(points[chosen]),
@@ -103,6 +103,15 @@ def panels(points: Floats) -> list[Panel]:
         if len(chosen) >= FEWEST:
             found.append(_slice(points, chosen, axis))
     return found or [unrolled("all points", every)]
+
+
+def _centre(points: Floats) -> Floats:
+    """Return the centre (3,) of the sphere on which points (n, 3) lie, if they do.
+
+    It solves p² = 2 c·p + constant by least squares.
+    """
+    matrix = np.column_stack([2 * points, np.ones(len(points))])
+    return np.asarray(np.linalg.lstsq(matrix, np.sum(points**2, axis=1))[0][:3])
 
 
 def _different(values: Floats, apart: float) -> tuple[Floats, Ints]:

@@ -169,8 +169,16 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
 
 
 def has_profile(result: InferenceResult, name: str | None = None) -> bool:
-    """Whether enough readings lie on the line of the strongest one to draw a profile."""
-    return len(main_line(result, name).index) >= FEWEST_ON_A_LINE
+    """Whether enough readings lie on the line of the strongest one to draw a profile.
+
+    Of scattered points, a few have the radius of the strongest one by chance, at few of all z.
+    """
+    line = main_line(result, name)
+    if len(line.index) < FEWEST_ON_A_LINE or not line.axis.startswith("z"):
+        return len(line.index) >= FEWEST_ON_A_LINE
+    same = np.array(result.maps) == result.maps[line.index[0]]
+    heights = np.unique(axis_of_readings(result)[0][same].round(6))
+    return 2 * len(line.index) >= len(heights)
 
 
 def residual_maps_figure(result: InferenceResult) -> Figure | None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
 from halbach_fe.measurement.positions import on_grid
+from halbach_fe.report.diagnosis_figures import _line
 from halbach_fe.report.point_maps import curve, maps_figure, panels, residual_figure
 from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
 from tests.conftest import circle
@@ -17,6 +20,13 @@ GRID = on_grid([0.01 * np.arange(-2, 3)] * 3)
 FLAT = on_grid([0.01 * np.arange(-2, 3), 0.01 * np.arange(-2, 3), np.zeros(1)])
 SPHERE = np.array(parse_new_study(new_study("s", MagnetTemplate(
     ring_length_m=0.05, dsv_m=0.04))).observation.positions.points_m)
+
+
+NUMBER = np.arange(64)
+SPIRAL = 0.03 * np.column_stack([
+    np.sqrt(1 - (HEIGHT := 1 - (2 * NUMBER + 1) / 80) ** 2) * np.cos(2.4 * NUMBER),
+    np.sqrt(1 - HEIGHT**2) * np.sin(2.4 * NUMBER), HEIGHT]) + [0.001, 0.0, 0.002]
+"""Scattered points on a part of a sphere, whose centre is not that of their extremes."""
 
 
 @pytest.mark.parametrize(("points", "label"), [
@@ -35,6 +45,7 @@ def test_lines_and_circles(points, label):
     (CIRCLES, ["at the radius of 30 mm"], False),
     (TWO_RADII, ["at the radius of 30 mm", "at the radius of 15 mm"], False),
     (SPHERE, ["on the sphere of 40 mm diameter"], False),
+    (SPIRAL, ["on the sphere of 60 mm diameter"], False),
     (GRID, ["at y = 0 mm", "at z = 0 mm"], True), (FLAT, ["at z = 0 mm"], True)])
 def test_every_panel_shows_many_points(points, titles, lengths):
     """No panel shows a single one, as the equator of a sphere of many latitudes would."""
@@ -59,6 +70,20 @@ def test_rounding_does_not_tear_a_circle_apart(generator):
     assert mesh.get_array().shape == (64, 9)
     points[:64, :2] *= 0.076 / 0.075
     assert len(panels(points)) == 2
+
+
+@pytest.mark.parametrize(("points", "shown", "on_a_line"), [
+    (SPIRAL, len(SPIRAL), False), (CIRCLES, 7, True)])
+def test_the_profile_of_a_diagnosis_shows_many_points(points, shown, on_a_line):
+    """Of scattered points every one has a line of its own."""
+    observation = SimpleNamespace(positions=points, places=points, labels=["Bx"] * len(points),
+                                  components=[True] * len(points),
+                                  radii=np.hypot(*points[:, :2].T))
+    update = SimpleNamespace(readings=np.ones(len(points)), held_out=np.zeros(len(points), bool),
+                             observation=observation, is_campaign=False)
+    label, index, along, name, connected = _line(update, np.arange(1.0, len(points) + 1))
+    assert (label, name, connected) == ("Bx", "z in mm", on_a_line)
+    assert len(index) == len(along) == shown
 
 
 def test_what_is_zero_is_not_drawn():
