@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.diagnosis.gross_errors import misfit_of
+from halbach_fe.diagnosis.gross_errors import MIN_READINGS, misfit_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.campaign_registration import register_maps, registered_study
 from halbach_fe.inference.pose_result import Registration
@@ -81,8 +81,12 @@ class FoundPose:
 
 
 def misfits_of(study: Study, data: Data) -> dict[str, float]:
-    """Return the `misfit_of` of each map in its stated place, by name."""
-    return {one.name: misfit_of(one.study, one.data) for one in maps_of(study, data)}
+    """Return the `misfit_of` of each map in its stated place, by name.
+
+    It is 0 for maps with so few readings that some pose would fit any of them.
+    """
+    return {one.name: misfit_of(one.study, one.data) if one.data["B_T"].notnull().sum()
+            >= MIN_READINGS else 0.0 for one in maps_of(study, data)}
 
 
 def find_poses(

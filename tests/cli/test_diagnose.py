@@ -351,7 +351,7 @@ def test_the_documentation_says_what_is_in_the_file():
         readings=np.zeros(1), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
-        before=update, after=update, gross_errors=(), outliers=(), identified=(),
+        before=update, after=update, gross_errors=(), poses=(), outliers=(), identified=(),
         position_noise=(), solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, converged=True, positions=(), limits=None,
