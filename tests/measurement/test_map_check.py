@@ -151,7 +151,8 @@ def trust_white_noise(monkeypatch):
     """Let the check believe that whatever the charges do not follow is white noise."""
     terms = map_check._terms
     monkeypatch.setattr(map_check, "_terms", lambda fitted, _: terms(fitted, 1.0))
-    monkeypatch.setattr(map_check, "_confirmed", lambda model, *given: (model, given[-1]))
+    monkeypatch.setattr(map_check, "_confirmed",
+                        lambda model, rows, left_out, fit, start, pace: (model, start))
 
 
 def far_dipole(points, place):
