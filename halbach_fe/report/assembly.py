@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import Assembly
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.assembly_sheets import common_beginning, drawing, sheets
 from halbach_fe.report.page import write_page
-from halbach_fe.report.solids import Progress, holder_name, write_solids
+from halbach_fe.report.solids import holder_name, write_solids
 from halbach_fe.report.words import counted
 
 FRAME = ("x, y, z of the magnet; x is at the large notch of a plate, the pockets are open towards "

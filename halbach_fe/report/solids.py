@@ -8,7 +8,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.core.pace import Progress as Progress
+from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import Plate
 from halbach_fe.geo.solid import PER_M, solid

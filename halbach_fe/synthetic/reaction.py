@@ -6,8 +6,9 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.pace import Progress
 from halbach_fe.synthetic import ngsolve_reaction
-from halbach_fe.synthetic.magpylib_field import Progress, no_progress
+from halbach_fe.synthetic.magpylib_field import no_progress
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.separate_reaction import separate_reaction
 from halbach_fe.synthetic.shapes import PrismBody

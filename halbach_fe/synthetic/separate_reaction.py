@@ -29,10 +29,10 @@ from scipy.spatial import cKDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import CheckFailedError
+from halbach_fe.core.pace import Progress
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.magpylib_field import (
     WHOLE,
-    Progress,
     no_progress,
     piece_field,
     unit_fields,
