@@ -174,11 +174,12 @@ def has_profile(result: InferenceResult, name: str | None = None) -> bool:
     Of scattered points, a few have the radius of the strongest one by chance, at few of all z.
     """
     line = main_line(result, name)
-    if len(line.index) < FEWEST_ON_A_LINE or not line.axis.startswith("z"):
+    if result.is_campaign or not line.axis.startswith("z"):
         return len(line.index) >= FEWEST_ON_A_LINE
-    same = np.array(result.maps) == result.maps[line.index[0]]
-    heights = np.unique(axis_of_readings(result)[0][same].round(6))
-    return 2 * len(line.index) >= len(heights)
+    # a stage's steps are not exact, so that heights count in parts of the spacing
+    step_mm = 250 * point_spacing(np.unique(result.observation.positions, axis=0))
+    heights = np.unique(np.round(axis_of_readings(result)[0] / step_mm))
+    return len(line.index) >= max(FEWEST_ON_A_LINE, len(heights) / 2)
 
 
 def residual_maps_figure(result: InferenceResult) -> Figure | None:
