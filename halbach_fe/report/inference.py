@@ -28,7 +28,7 @@ from halbach_fe.report.prediction import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.stray_field import stray_pictures, stray_section
-from halbach_fe.report.words import decimals, flux_density, ppm
+from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import circle_models
 
@@ -54,7 +54,7 @@ def score_table(result: InferenceResult,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "before, rms": flux_density(score.rms_error_prior_T),
             "after, rms": flux_density(score.rms_error_posterior_T),
-            "of the largest reading": f"{ppm(PPM * score.rms_error_posterior_T / largest)}\u00a0ppm"
+            "of the largest reading": relative(score.rms_error_posterior_T / largest)
             if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),

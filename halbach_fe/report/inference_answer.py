@@ -28,8 +28,8 @@ def answer(result: InferenceResult) -> Answer:
     flat = result.magnet.dimension == 2
     return Answer(
         question, said, "Yes. Model and readings agree: chi² per reading "
-        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more than "
-        f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}",
+        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
         f"See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
         f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
         f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "

@@ -18,7 +18,7 @@ from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
 from halbach_fe.report.point_maps import draw, panels
-from halbach_fe.report.words import decimals, flux_density
+from halbach_fe.report.words import decimals, flux_density, relative
 from halbach_fe.study.types import COMPONENTS
 
 REMAINS = 0.3
@@ -111,7 +111,7 @@ def verdict(check: MapCheck) -> str:
                 "smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
-            f"{_share(share)} of the largest field ({flux_density(check.size_T)})")
+            f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
     if share > VIOLATED:
         return f"The map does not obey div B = 0 and curl B = 0: they leave {size}."
     wrong = _impossible(check)
@@ -136,11 +136,6 @@ def _violates(check: MapCheck) -> bool:
 def _component(name: str) -> str:
     """Return the name of a component with its sign, -Bz of ``-z``."""
     return f"{name[:-1].replace('-', '−')}B{name[-1]}"
-
-
-def _share(value: float) -> str:
-    """Return a part of 1 in % or ppm."""
-    return f"{100 * value:.2f}\u00a0%" if value >= 1e-3 else f"{value * 1e6:.0f} ppm"
 
 
 def instrument_table(check: MapCheck) -> list[dict[str, str]]:

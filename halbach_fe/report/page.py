@@ -91,19 +91,20 @@ def write_page(
     provenance : mapping, optional
         Text by name of the entry.
     answer : Answer, optional
-        What the page says first; every page of a command has one.
+        What the page says first, with the paths that are known; every page of a command has one.
     rows : sequence of mapping of str to str
         The main table of the page, which page.json has too.
     **data
         Variables of the template.
     """
     provenance = {**(provenance or {}), "programs": programs()}
-    text = rendered(template, pictures=pictures, study=study, answer=answer, rows=rows,
-                    provenance=provenance, **data)
+    text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
+                    answer=answer and answer.with_known_paths(), **data)
     write_text(path, text)
     title = re.search("<title>(.*?)</title>", text, re.S)
-    write_record(path, html.unescape(title[1]) if title else "", answer, pictures, rows,
-                 provenance, study)
+    write_record(path, html.unescape(title[1]) if title else "",
+                 answer and answer.with_known_paths(folder=False), pictures, rows, provenance,
+                 study)
 
 
 def programs() -> str:
