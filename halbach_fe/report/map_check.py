@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import VIOLATED, MapCheck
+from halbach_fe.measurement.map_check import VIOLATED, MapCheck, Reach
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
@@ -59,9 +59,16 @@ def answer(check: MapCheck) -> Answer:
             "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
     if check.structure > REMAINS:
-        trust = (f"Nearly: what remains is no noise, as neighbouring residuals have a correlation "
-                 f"of {check.structure:.2f}. Something that this check does not know, such as a "
-                 "probe that moves in its holder, is still in the map.")
+        trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
+                 f"correlation of {check.structure:.2f}. Something that this check does not know, "
+                 "such as a probe that moves in its holder, is still in the map.")
+    if (reach := check.reach) is not None:
+        trust = (f"Only {_where(check, reach)}. " if np.isfinite(reach.limit_m) else
+                 "Only roughly. ") + (
+            f"{'Beyond that,' if np.isfinite(reach.limit_m) else 'Everywhere,'} held-out lines are "
+            f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
+            "either the field is steeper there than the lines show, as near edges of magnets, or "
+            "these readings are wrong. An update of the magnet tells which.")
     used = "DIR/oriented_map.csv" if better else "MAP"
     return Answer(
         question, f"{verdict(check)} {noise}: that belongs into the study as sigma_T.", trust,
@@ -119,8 +126,22 @@ def verdict(check: MapCheck) -> str:
         return (f"The map does not obey div B = 0 and curl B = 0 with any likely instrument: it "
                 f"would take an impossible one ({wrong[0]}"
                 f"{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}), which leaves {size}.")
+    if check.reach is not None and np.isfinite(check.reach.limit_m):
+        return (f"The map obeys div B = 0 and curl B = 0 to {flux_density(check.reach.inside_T, 2)}"
+                f" rms on scan lines that were held out {_where(check, check.reach)}, and to "
+                f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
+                f"{flux_density(check.size_T)}.")
     return (f"The map obeys div B = 0 and curl B = 0 to {size}. A model of the magnet can "
             "explain it better only near edges of the magnet.")
+
+
+def _where(check: MapCheck, reach: Reach) -> str:
+    """Describe the region in which held-out lines are predicted."""
+    limit = f"{1e3 * reach.limit_m:.3g}\u00a0mm"
+    if reach.along == "r":
+        return (f"within {limit} of the line through the middle of the map along "
+                f"{check.windows[0]}")
+    return f"at {reach.along} of {limit} and {'less' if reach.below else 'more'}"
 
 
 def _impossible(check: MapCheck) -> list[str]:
