@@ -346,6 +346,13 @@ def check_map(
     usable = np.isfinite(field).all(axis=1)
     for rows in broken.values():
         usable[np.array(rows, int) - 1] = False
+    missing = [f"B{name}" for name, column in zip(COMPONENTS, field.T, strict=True)
+               if not np.isfinite(column).any()]
+    if missing:
+        raise MeasurementError(must_be(
+            where, "Maxwell's check", "with all three components of B",
+            f"a map without {' and '.join(missing)}", "How B changes along the magnet is not in a "
+            "map of a cross-section: test that by the chi² of `halbach-fe infer`."))
     if usable.sum() < FEWEST_POINTS:
         raise MeasurementError(must_be(
             where, "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "

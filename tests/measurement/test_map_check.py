@@ -214,6 +214,8 @@ def test_a_small_map_cannot_tell(generator):
         check_map(field_map(GRID[:9], source().getB(GRID[:9])))
     partly = read_by(generator)
     partly[:, 2] = np.nan
+    with pytest.raises(MeasurementError, match=r"a map without Bz\. How B changes along"):
+        check_map(field_map(GRID, partly))
     for wrong in (partly, 0 * GRID, np.ones_like(GRID)):
         with pytest.raises(MeasurementError, match="all three components"):
             check_map(field_map(GRID, wrong))

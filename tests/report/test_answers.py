@@ -20,6 +20,7 @@ from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.report import (
     campaign,
     demagnetization,
+    diagnosis_figures,
     forces,
     homogeneity,
     inference_answer,
@@ -163,6 +164,31 @@ def of_sort(given):
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     size = np.sqrt(np.mean(found.best.sizes**2))
     return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv"]
+
+
+@pytest.mark.filterwarnings("ignore:Every block of study")
+@pytest.mark.parametrize(("rings", "types", "said"), [
+    (2, {"a": list(range(1, 9))}, "random orders"), (2, None, "It does not matter"),
+    (1, None, "there is no choice")])
+def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings, types, said):
+    """A slot's own type lets a block change its ring alone, which the field along z does not see.
+
+    Random orders are in the units of the sorted one: where all are alike they are equal to it.
+    """
+    study = parse_study(changed(MAGNET, array__rings=rings, prior={
+        "magnitude_sd": 0.05, "direction_sd_deg": 1.0} | ({"types": types} if types else {})))
+    found = hf.sort(build_magnet(study), simulate_campaign(study, 3).blocks, given.session)
+    sorting.write_sorted(found, None, tmp_path)
+    text = (tmp_path / "sort.html").read_text()
+    assert said in text
+    assert ("as placed in the table" in text) == (said == "random orders")
+    assert ("every order" in str(sorting.order_table(found))) != (said == "random orders")
+    if said == "random orders":
+        assert found.best.rms_of_mean < found.random.min()
+    else:
+        # 4e-7 were measured: the integral along z ends somewhere; a main multipole that is that
+        # of blocks of median strength was 2e-3 off
+        np.testing.assert_allclose(found.random, found.best.rms_of_mean, rtol=1e-5)
 
 
 def of_shim(given):
@@ -374,3 +400,17 @@ def test_means_that_are_zero_but_for_the_mesh_are_zero(given):
     rows = {row["n"]: row["|c_n| of the mean"] for row in tolerance.quantile_table(found)}
     assert rows["2"] == "0"  # forbidden by the symmetry
     assert float(rows["9"]) > 1  # which eight cubes do make
+
+
+@pytest.mark.parametrize("scattered", [True, False])
+def test_scattered_points_have_maps_and_no_profile(given, scattered):
+    """40 points on a sphere; the control: 12 circles of 8 points, which are lines along z too."""
+    turn = np.pi * (1 + 5**0.5) * (np.arange(40) + 0.5)
+    height = 1 - 2 * (np.arange(40) + 0.5) / 40
+    across = np.sqrt(1 - height**2)
+    points = 0.03 * np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    positions = {"kind": "points", "points_m": points.tolist()} if scattered else {
+        **MAGNET["observation"]["positions"], "count": 12}
+    study = parse_study(changed(MAGNET, observation__positions=positions))
+    update = hf.infer(build_magnet(study), simulate_campaign(study, 3).readings, given.session)
+    assert diagnosis_figures.is_scattered(update) == scattered
