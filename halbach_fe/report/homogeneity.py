@@ -149,7 +149,7 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
             "peak to peak, 95 % of magnets in ppm": known.peak_to_peak_range_ppm}
         rows.append({
             "magnet": name, "mean of |B|": _field(known),
-            "direction of the mean of the vector B": "none: it cancels"
+            "direction of the mean B": "none: it cancels"
             if _cancels(known) else direction_in_words(known.direction, known.direction_sd_rad),
             "rms in ppm": ppm(known.rms_ppm),
             "peak to peak in ppm": ppm(known.peak_to_peak_ppm),
