@@ -691,9 +691,8 @@ def _reach(
                 break
             if inside.sum() > most:
                 most = inside.sum()
-                best = Reach(along, below, float(end if below else -end),
-                             *(float(np.sqrt(squares[part].mean())) for part in (inside, ~inside)),
-                             noise_T)
+                within, beyond = (float(np.sqrt(squares[part].mean())) for part in (inside, ~inside))
+                best = Reach(along, below, float(end if below else -end), within, beyond, noise_T)
     return best
 
 
