@@ -691,7 +691,8 @@ def _reach(
                 break
             if inside.sum() > most:
                 most = inside.sum()
-                within, beyond = (float(np.sqrt(squares[part].mean())) for part in (inside, ~inside))
+                within, beyond = (float(np.sqrt(squares[part].mean()))
+                                  for part in (inside, ~inside))
                 best = Reach(along, below, float(end if below else -end), within, beyond, noise_T)
     return best
 
