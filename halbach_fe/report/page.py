@@ -8,6 +8,7 @@ import io
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -116,11 +117,17 @@ def rendered(template: str, study: Study | None = None, **data: object) -> str:
     """Return the HTML of a template of this folder; all texts in ``data`` are escaped."""
     text = None if study is None else tomlkit.dumps(_without_empty_cells(
         study.model_dump(mode="json", exclude_unset=True, exclude_none=True)))
+    return _templates().get_template(template).render(study=study, study_text=text, **data)
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    """Return the templates of this folder, which are compiled once in a process."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["is_nonlinear"] = is_nonlinear
-    return environment.get_template(template).render(study=study, study_text=text, **data)
+    return environment
 
 
 def _without_empty_cells(value: Any) -> Any:
