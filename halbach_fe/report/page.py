@@ -9,7 +9,6 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, Picture, write_record
@@ -109,7 +109,7 @@ def write_page(
 
 def programs() -> str:
     """Return the names and versions of the programs that a page is made with."""
-    return ", ".join([*(f"{name} {metadata.version(name)}" for name in PROGRAMS),
+    return ", ".join([*(f"{name} {version(name)}" for name in PROGRAMS),
                       f"Python {platform.python_version()}"])
 
 
