@@ -13,7 +13,6 @@ import json
 import math
 import multiprocessing
 import os
-import shlex
 import sys
 import threading
 import time
@@ -174,14 +173,18 @@ def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> 
     """Take the output folder for this command and study until the end of the run.
 
     It is called before the first file is written, and after the input was read, so that a refused
-    input leaves no folder. See `halbach_fe.core.result_folder.result_folder`.
+    input leaves no folder. See `halbach_fe.core.result_folder.result_folder`. Pages that are
+    written until then name the files of the command line.
     """
     from halbach_fe.core.result_folder import result_folder
+    from halbach_fe.report.answer import known_paths
 
     inputs = [value for value in (*vars(arguments).values(),
                                   *getattr(arguments, "listed_maps", {}).values())
               if isinstance(value, InputFile)]
     arguments.at_end.enter_context(result_folder(arguments.output, command, study, inputs))
+    arguments.at_end.enter_context(known_paths({
+        word: _from_here(path) for word, path in _paths_of(arguments).items()}))
 
 
 def keep_input(output: Path, *inputs: Path) -> None:
@@ -563,22 +566,30 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None = None) -> None:
     """Say the answer of a command, the command to go on with, and where its page is."""
-    named = answer.with_paths({
-        "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
-        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
-        "POSTERIOR": getattr(arguments, "posterior", None),
-        "DIR": getattr(arguments, "output", None)})
+    named = answer.with_paths(_paths_of(arguments))
     for sentence in named.sentences:
         say(sentence)
     if named.command:
-        command = named.command
-        blocks = getattr(arguments, "blocks", None)
-        if blocks is not None and "--measurements" in command and not {
-                "--blocks", "NEW_MAP"} & set(command.split()):
-            command = command.replace(" -o ", f" --blocks {shlex.quote(str(blocks))} -o ")
-        say(f"  {command}")
+        say(f"  {named.command}")
     if page is not None:
         say(f"Report: {page}")
+
+
+def _paths_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+    """Return the paths of the command line by the words for them in commands of an answer."""
+    return {
+        "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
+        "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
+        "POSTERIOR": getattr(arguments, "posterior", None),
+        "DIR": getattr(arguments, "output", None)}
+
+
+def _from_here(path: Path | None) -> str | None:
+    """Return a path for a page, relative to the current folder if it is in it."""
+    if path is None:
+        return None
+    here = Path.cwd()
+    return printable(str(path.relative_to(here) if path.is_relative_to(here) else path), MAX_QUOTED)
 
 
 def print_json(value: object) -> None:

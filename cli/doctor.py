@@ -6,13 +6,13 @@ import argparse
 import platform
 import tempfile
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import GetDP, blas_of, find_getdp
@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; fail if GetDP is missing or its solve is wrong."""
-    findings: dict[str, object] = {"halbach-fe": metadata.version("halbach-fe"),
+    findings: dict[str, object] = {"halbach-fe": version("halbach-fe"),
                 "python": platform.python_version(), "system": platform.platform()}
-    findings |= {name: metadata.version(name) for name in PACKAGES}
+    findings |= {name: version(name) for name in PACKAGES}
     try:
         getdp = find_getdp(arguments.getdp)
     except GetDPNotFoundError:

@@ -7,13 +7,13 @@ import ast
 import importlib
 import sys
 from collections.abc import Collection, Sequence
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from halbach_fe.cli import common, streams
 from halbach_fe.core.errors import EXIT_CODES
+from halbach_fe.core.versions import version
 
 VERBS = {
     "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
@@ -75,7 +75,7 @@ def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
     top = Parser(
         prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
         epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
-    top.add_argument("--version", action="version", version=metadata.version("halbach-fe"))
+    top.add_argument("--version", action="version", version=version("halbach-fe"))
     subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, module in VERBS.items():
         text = _docstring(module)

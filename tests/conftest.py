@@ -14,7 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import settings
+from matplotlib.figure import Figure
 
+from halbach_fe.report import page
+from halbach_fe.report.page import png_of
 from halbach_fe.solver.getdp import GetDP, find_getdp
 from halbach_fe.solver.getdp_cache import LIMIT_VARIABLE
 from halbach_fe.solver.session import Session
@@ -75,6 +78,31 @@ def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
             table = table.setdefault(part, {})
         table[last] = value
     return result
+
+
+@pytest.fixture(scope="session")
+def drawn_pictures() -> dict[tuple[Any, ...], bytes]:
+    """The pictures that were drawn, by their sizes and labels."""
+    return {}
+
+
+@pytest.fixture(autouse=True)
+def similar_pictures_once(request, monkeypatch, drawn_pictures):
+    """Draw pictures of the same kind once, but in the tests of pages.
+
+    To lay out their texts again and again would take a third of the time of all tests.
+    """
+    if request.path.parent.name == "report":
+        return
+
+    def once(figure: Figure) -> bytes:
+        kind = (*figure.get_size_inches().round(1), *(
+            (axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes))
+        if kind not in drawn_pictures:
+            drawn_pictures[kind] = png_of(figure)
+        return drawn_pictures[kind]
+
+    monkeypatch.setattr(page, "png_of", once)
 
 
 @pytest.fixture(scope="session")

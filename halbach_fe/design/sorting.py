@@ -60,6 +60,10 @@ WORTHWHILE = 1e-3
 measurement's uncertainty contributes to that sum, which no assignment changes."""
 
 
+SAME = 1e-4
+"""Part of their mean by which random orders differ at most where the order does not matter."""
+
+
 @dataclass(frozen=True)
 class SortedBlocks(ShownInNotebook):
     """Measured blocks assigned to slots, and what results.
@@ -111,6 +115,14 @@ class SortedBlocks(ShownInNotebook):
     def has_choice(self) -> bool:
         """Whether any block fits more than one slot, or any slot more than one block."""
         return len(set(self.table.type)) < len(self.table)
+
+    @property
+    def matters(self) -> bool:
+        """Whether orders differ at all in what is made small.
+
+        Blocks that only change rings do not: the multipoles are those of the field along all of z.
+        """
+        return bool(np.ptp(self.random) > SAME * np.mean(self.random))
 
     @property
     def turned(self) -> int:
@@ -175,7 +187,8 @@ def sort_blocks(
     count = len(model.orders) if isinstance(model, MultipoleModel) else 1
     numbered = _with_places(magnet, table, _table_order(blocks))
     known = _assembled(magnet, numbered, model)
-    floor = float(np.sum(model.of(known).root ** 2))
+    as_numbered = model.of(known)
+    floor = float(np.sum(as_numbered.root ** 2))
     peers = [np.flatnonzero(blocks.slot_types == number) for number in blocks.slot_types]
     fitting = [np.flatnonzero(blocks.types == number) for number in blocks.slot_types]
     best = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset)
@@ -189,6 +202,9 @@ def sort_blocks(
     random = np.array([Assignment.of(
         blocks.slots, _random_order(blocks, generator), blocks.offset).square
         for _ in range(RANDOM_ORDERS)])
+    # assignments count in units of a main multipole that no order changes; results in their own
+    in_these_units = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset).square / count
+    unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
     if (placed := _placed_order(table, magnet)) is not None:
         known = _assembled(magnet, _with_places(magnet, table, placed), model)
     turned = np.zeros((len(table), 3))
@@ -199,7 +215,7 @@ def sort_blocks(
         magnet.study, model, result, turned, model.of(after), model.of(known),
         (model.homogeneity.of(after), model.homogeneity.of(known))
         if isinstance(model, DeviationModel) else None,
-        np.sqrt(random / count),
+        unit * np.sqrt(random / count),
         "as numbered" if placed is None else "as placed in the table", alike)
 
 

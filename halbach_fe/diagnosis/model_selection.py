@@ -53,6 +53,9 @@ class Candidate:
         missing block.
     unique : bool
         Whether the effect can be present at one place at most.
+    places : int or None
+        Number of places of the effect, which share its prior probability; None if all of them are
+        candidates.
     """
 
     effect: str
@@ -60,6 +63,7 @@ class Candidate:
     columns: tuple[int, ...]
     is_binary: bool = False
     unique: bool = False
+    places: int | None = None
 
     @property
     def free(self) -> tuple[int, ...]:
@@ -106,7 +110,8 @@ def prior_log_odds(candidates: Sequence[Candidate]) -> Floats:
     """Return the log prior odds (candidates,) of each candidate."""
     names = [candidate.effect for candidate in candidates]
     counts = {name: names.count(name) for name in set(names)}
-    return np.array([np.log(EFFECT_PRIOR_ODDS / counts[name]) for name in names])
+    return np.array([np.log(EFFECT_PRIOR_ODDS / (candidate.places or counts[candidate.effect]))
+                     for candidate in candidates])
 
 
 def log_bayes_factors(evidence: Evidence, candidates: Sequence[Candidate]) -> Floats:

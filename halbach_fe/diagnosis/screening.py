@@ -1,7 +1,8 @@
 """Leave hypotheses out of the comparison that are hopeless by themselves.
 
-Thousands of blocks, each of which may be displaced, turned, missing ..., make tens of thousands of
-signatures. All of them together would need a matrix of their products. One by one they are cheap.
+Hundreds of blocks, each of which may be displaced, turned, missing ..., make thousands of
+signatures. A matrix of the products of all of them takes longer than everything else in a round.
+One by one they are cheap.
 """
 
 from __future__ import annotations
@@ -12,29 +13,36 @@ from dataclasses import replace
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors
+from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors, with_candidates
 
-MOST_COLUMNS = 6000
-"""Largest number of signatures that are compared with each other: their products take 0.3 GB."""
+MOST_COLUMNS = 1500
+"""Largest number of signatures that are compared with each other: their products take a tenth of
+a second for each thousand readings."""
 
-AT_ONCE = 1000
-"""Number of hypotheses that are judged by themselves at a time."""
+AT_ONCE = 30
+"""Number of hypotheses that are judged by themselves at a time. Their products with each other are
+computed needlessly, but few calls of the linear algebra are faster than many."""
 
 FEW_PLACES = 100
 """Effects of at most so many places are never left out."""
+
+NOTICEABLE_CHI2 = 9.0
+"""Part of chi-squared that a signature must account for if others like it are to be computed: three
+standard deviations of its amplitude."""
 
 
 def most_likely(
     candidates: Sequence[Candidate], columns: Sequence[Floats], marginal: Marginal,
     residual: Floats, in_model: Collection[int]
-) -> list[int]:
-    """Return the numbers of the candidates that are compared with each other, in order.
+) -> tuple[list[int], Evidence]:
+    """Return the numbers of the candidates that are compared with each other, in order, and the
+    evidence of their signatures.
 
     These are all candidates, unless they have more than `MOST_COLUMNS` signatures. Then those in
     the model and those of effects of a few places are compared with the others whose evidence is
-    largest by themselves. An effect that another one hides is found in a later round, when that one
-    is in the model.
+    largest beside the model. An effect that another one hides is found in a later round, when that
+    one is in the model.
 
     Parameters
     ----------
@@ -45,19 +53,28 @@ def most_likely(
     residual : ndarray, shape (rows,)
         Whitened residual to which the signatures are fitted.
     in_model : collection of int
-        Numbers of candidates that must be compared.
+        Numbers of candidates that are in the model, and must be compared.
     """
-    width = np.array([part.shape[1] for part in columns])
+    width = np.array([part.shape[1] for part in columns], int)
+    ends = np.cumsum(width)
+    own = [np.arange(end - size, end) for end, size in zip(ends, width, strict=True)]
+    stacked = np.hstack([np.zeros((len(residual), 0)), *columns, residual[:, None]])
+    absorbed = marginal.absorbed(stacked)
+
+    def evidence(numbers: Sequence[int]) -> Evidence:
+        index = np.concatenate([np.zeros(0, int), *(own[number] for number in numbers)])
+        return marginal.evidence(stacked[:, index], residual,
+                                 absorbed[:, np.append(index, len(stacked[0]) - 1)])
+
     if width.sum() <= MOST_COLUMNS:
-        return list(range(len(candidates)))
+        return list(range(len(candidates))), evidence(range(len(candidates)))
     factors = np.empty(len(candidates))
+    model = sorted(in_model)
     for first in range(0, len(candidates), AT_ONCE):
-        some = range(first, min(first + AT_ONCE, len(candidates)))
-        ends = np.cumsum(width[some])
-        alone = [replace(candidates[number], columns=tuple(range(end - width[number], end)))
-                 for number, end in zip(some, ends.tolist(), strict=True)]
-        factors[some] = log_bayes_factors(
-            marginal.evidence(np.hstack([columns[number] for number in some]), residual), alone)
+        some = list(range(first, min(first + AT_ONCE, len(candidates))))
+        numbered = renumbered([candidates[number] for number in (*model, *some)])
+        beside = with_candidates(evidence([*model, *some]), numbered[:len(model)])
+        factors[some] = log_bayes_factors(beside, numbered[len(model):])
     names = [candidate.effect for candidate in candidates]
     places = {name: names.count(name) for name in dict.fromkeys(names)}
     chosen = {number for number, name in enumerate(names)
@@ -67,4 +84,24 @@ def most_likely(
         if number not in chosen and width[number] <= left:
             chosen.add(number)
             left -= width[number]
-    return sorted(chosen)
+    return sorted(chosen), evidence(sorted(chosen))
+
+
+def renumbered(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates whose columns are numbered one after the other."""
+    ends = np.cumsum([len(candidate.columns) for candidate in candidates]).tolist()
+    return [replace(candidate, columns=tuple(range(end - len(candidate.columns), end)))
+            for candidate, end in zip(candidates, ends, strict=True)]
+
+
+def is_noticeable(
+    signature: Floats, fixed: Floats, marginal: Marginal, residual: Floats
+) -> bool:
+    """Tell whether a whitened signature (rows, k) accounts for a part of chi-squared that is not
+    chance, beside those (rows, f) of what is in the model.
+    """
+    free = np.arange(fixed.shape[1], fixed.shape[1] + signature.shape[1])
+    beside = marginal.evidence(np.hstack([fixed, signature]), residual).given(
+        range(fixed.shape[1]))
+    score = beside.score[free]
+    return bool(score @ np.linalg.lstsq(beside.part(free), score)[0] > NOTICEABLE_CHI2)

@@ -26,7 +26,7 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene
-from halbach_fe.diagnosis.screening import most_likely
+from halbach_fe.diagnosis.screening import is_noticeable, most_likely, renumbered
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
@@ -205,10 +205,17 @@ def score_hypotheses(
     candidates: list[Candidate] = []
     columns: list[Floats] = []
     scored: list[Hypothesis] = []
-    uncompared = 0
+    uncompared = done = 0
     improvable: dict[str, list[int]] = {}
-    for number, hypothesis in enumerate(shortlisted):
-        progress(number, len(shortlisted))
+    places = {effect.name: [one.place for one in shortlisted if one.effect is effect]
+              for effect in effects}
+    first = {effect.name: set(effect.representatives(places[effect.name])) for effect in effects}
+
+    def compare(hypothesis: Hypothesis) -> None:
+        """Compute the signature of a hypothesis, unless it is known or the time is up."""
+        nonlocal residual, uncompared, done
+        progress(done, len(shortlisted))
+        done += 1
         effect, place = hypothesis.effect, hypothesis.place
         key = effect.name, place
         present = in_model.get(key)
@@ -216,7 +223,7 @@ def score_hypotheses(
             signature = signatures.get(key)
             if signature is None and is_over():
                 uncompared += 1
-                continue
+                return
             if signature is None:
                 if key not in known:
                     known[key] = whitened(update.observation.read(
@@ -241,13 +248,28 @@ def score_hypotheses(
         candidates.append(Candidate(
             effect.name, place.name, tuple(range(signature.shape[1])),
             effect.is_binary or (effect.applied_in_full
-                                 and signature.shape[1] > len(effect.parameters)), effect.unique))
+                                 and signature.shape[1] > len(effect.parameters)), effect.unique,
+            len(places[effect.name])))
         if present is None and effect.refinements and not effect.applied_in_full:
             improvable.setdefault(effect.name, []).append(len(scored) - 1)
-    progress(len(shortlisted), len(shortlisted))
+
+    def is_first(hypothesis: Hypothesis) -> bool:
+        """Tell whether a signature is computed whatever those of other places are."""
+        name, place = hypothesis.effect.name, hypothesis.place
+        return place in first[name] or (name, place) in in_model or (name, place) in signatures
+
+    for hypothesis in filter(is_first, shortlisted):
+        compare(hypothesis)
     fixed = np.hstack([np.zeros((len(residual), 0)), *(
         part for part, one in zip(columns, scored, strict=True)
         if (one.effect.name, one.place) in in_model)])
+    noticed = {one.effect.name for part, one in zip(columns, scored, strict=True)
+               if len(first[one.effect.name]) < len(places[one.effect.name])
+               and is_noticeable(part, fixed, marginal, residual)}
+    for hypothesis in shortlisted:
+        if not is_first(hypothesis) and hypothesis.effect.name in noticed:
+            compare(hypothesis)
+    progress(len(shortlisted), len(shortlisted))
     for numbers in improvable.values():
         effect = scored[numbers[0]].effect
 
@@ -265,17 +287,15 @@ def score_hypotheses(
             scored.append(hypothesis)
             columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
-                                        effect.is_binary, effect.unique))
-    chosen = most_likely(candidates, columns, marginal, residual, {
+                                        effect.is_binary, effect.unique,
+                                        len(places[effect.name]) + 1))
+    chosen, evidence = most_likely(candidates, columns, marginal, residual, {
         number for number, hypothesis in enumerate(scored)
         if (hypothesis.effect.name, hypothesis.place) in in_model})
-    ends = np.cumsum([columns[number].shape[1] for number in chosen]).tolist()
-    compared = [replace(candidates[number], columns=tuple(range(
-        end - columns[number].shape[1], end))) for number, end in zip(chosen, ends, strict=True)]
     stacked = np.hstack([np.zeros((len(residual), 0)), *(columns[number] for number in chosen)])
-    return Search(tuple(scored[number] for number in chosen), tuple(compared),
-                  marginal.evidence(stacked, residual), stacked, residual, marginal, training,
-                  campaign, nominal_start, uncompared)
+    return Search(tuple(scored[number] for number in chosen),
+                  tuple(renumbered([candidates[number] for number in chosen])), evidence, stacked,
+                  residual, marginal, training, campaign, nominal_start, uncompared)
 
 
 def _improved_place(

@@ -118,6 +118,14 @@ ALTERNATES = -0.3
 varies more than the spacing shows. Of a field with a curl or of shuffled lines it is positive or
 near 0."""
 
+FAR_OFF = 5.0
+"""Times the noise from which held-out lines are far off: charges follow the field badly there, or
+the map is wrong. It was 1.1 to 2.9 in four maps by magpylib that end some spacings from magnets,
+and 16 to 36 in the outer lines of three maps in steps of 20 mm that end 30 mm from magnets."""
+
+FEWEST_KEPT = 0.1
+"""Smallest part of the held-out readings that makes a region in which they are well predicted."""
+
 WINDOWS = 6
 """Number of parts along the longest axis for which the residual is given."""
 
@@ -155,6 +163,38 @@ class InstrumentTerm:
 
 
 @dataclass(frozen=True)
+class Reach:
+    """The region of a map in which held-out scan lines are predicted to about their noise.
+
+    Attributes
+    ----------
+    along : str
+        What limits it: x, y or z, or "r", the distance from the line through the middle of the map
+        along its longest axis.
+    below : bool
+        Whether it is what is below the limit.
+    limit_m : float
+        Coordinate or distance of the farthest held-out readings in it; NaN if no region is.
+    inside_T, beyond_T : float
+        Rms difference of held-out lines from the field of all others in and beyond it.
+    noise_T : float
+        Noise with which they are compared.
+    """
+
+    along: str
+    below: bool
+    limit_m: float
+    inside_T: float
+    beyond_T: float
+    noise_T: float
+
+    @property
+    def times(self) -> float:
+        """How many times the noise the readings beyond it are off."""
+        return self.beyond_T / self.noise_T
+
+
+@dataclass(frozen=True)
 class MapCheck:
     """What a map shows by itself.
 
@@ -184,6 +224,8 @@ class MapCheck:
     noise_T, position_noise_m : float
         Noise of the readings, and of their positions: the part of the residual that grows with the
         field's gradient.
+    reach : Reach or None
+        Where held-out lines are predicted; None if all are within `FAR_OFF` times the noise.
     structure : float
         Correlation of the residuals of neighbours: 0 for noise, near 1 if a smooth part remains.
     redundancy : float
@@ -192,6 +234,9 @@ class MapCheck:
         Rows that were not fitted.
     residual_T : ndarray, shape (n, 3)
         Residual in the given columns; NaN where nothing was measured.
+    unseen_T : ndarray, shape (n, 3)
+        Difference of held-out scan lines from the field of all others, in the given columns; NaN in
+        other rows.
     corrected_T : ndarray, shape (n, 3)
         What a probe without errors would have read: Bx, By and Bz at the points of the map, by the
         instrument that the lines show which are not held out.
@@ -211,10 +256,12 @@ class MapCheck:
     windows: tuple[str, tuple[tuple[float, float, tuple[float, float, float]], ...]]
     noise_T: float
     position_noise_m: float
+    reach: Reach | None
     structure: float
     redundancy: float
     excluded: NDArray[np.bool_]
     residual_T: Floats
+    unseen_T: Floats
     corrected_T: Floats
 
     @property
@@ -241,12 +288,18 @@ class MapCheck:
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
-        left_out = ("excluded", "residual_T", "corrected_T")
+        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T")
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, value in self.__dict__.items()
-                if name not in left_out and name != "terms"} | {
+                if name not in left_out and name not in ("terms", "reach")} | {
             "terms": [asdict(term) | {"found": term.found} for term in self.terms],
+            "reach": None if self.reach is None else _finite(asdict(self.reach)),
             "floor_rms_T": self.floor_rms_T, "suffices": self.suffices}
+
+
+def _finite(values: dict[str, object]) -> dict[str, object]:
+    """Return plain data with None for NaN, which JSON does not have."""
+    return {name: None if value != value else value for name, value in values.items()}
 
 
 def check_map(
@@ -293,6 +346,13 @@ def check_map(
     usable = np.isfinite(field).all(axis=1)
     for rows in broken.values():
         usable[np.array(rows, int) - 1] = False
+    missing = [f"B{name}" for name, column in zip(COMPONENTS, field.T, strict=True)
+               if not np.isfinite(column).any()]
+    if missing:
+        raise MeasurementError(must_be(
+            where, "Maxwell's check", "with all three components of B",
+            f"a map without {' and '.join(missing)}", "How B changes along the magnet is not in a "
+            "map of a cross-section: test that by the chi² of `halbach-fe infer`."))
     if usable.sum() < FEWEST_POINTS:
         raise MeasurementError(must_be(
             where, "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
@@ -350,10 +410,14 @@ def check_map(
             train = fit_probe(model, chosen & ~held_out, fit, train)
         whole = fit_probe(model, chosen, fit, train)
     floor = turned[held_out] - model.readings(train, held_out)
+    unseen = np.full(field.shape, np.nan)
+    unseen[held_out] = floor
     residual = turned - model.readings(whole)
     beyond = _rms(floor * model.weights[held_out]) / _rms(residual[chosen] * model.weights[chosen])
-    noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes),
-                                residual[chosen])
+    redundancy = 1 - whole.used / (3 * int(chosen.sum()))
+    # a fit takes its part of the noise along
+    left = residual[chosen] / np.sqrt(max(redundancy, ENOUGH))
+    noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes), left)
     (as_given,) = fit_fields(charges, places, [readings])
     given = readings - charges.fields(places) @ as_given.amplitudes
     return MapCheck(
@@ -366,8 +430,9 @@ def check_map(
         windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
         noise_T=noise, position_noise_m=displaced,
         structure=_structure(points[chosen], residual[chosen]),
-        redundancy=1 - whole.used / (3 * int(chosen.sum())), excluded=~usable,
-        residual_T=residual @ matrix, corrected_T=model.ideal(train))
+        reach=_reach(points[held_out], floor, points[chosen], float(np.sqrt(np.mean(left**2)))),
+        redundancy=redundancy, excluded=~usable,
+        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train))
 
 
 def _begin(pace: Pace, step: int, what: str) -> None:
@@ -595,6 +660,41 @@ def _windows(
             x, y, z = _rms(residual[number == window]).tolist()
             found.append((float(edges[window]), float(edges[window + 1]), (x, y, z)))
     return COMPONENTS[axis], tuple(found)
+
+
+def _reach(
+    points: Floats, floor: Floats, every: Floats, noise_T: float
+) -> Reach | None:
+    """Return where held-out readings (n, 3) at points (n, 3) in m are off by little; see `Reach`.
+
+    The middle is that of ``every`` point (m, 3) of the map. Of all regions on one side of a plane
+    across x, y or z, or within a distance from the line through the middle, it is the one with the
+    most readings; None if that is all of them.
+    """
+    squares = np.mean(floor**2, axis=1)
+    limit = (FAR_OFF * noise_T) ** 2
+    if not noise_T or squares.mean() <= limit:
+        return None
+    middle = (every.max(axis=0) + every.min(axis=0)) / 2
+    across = np.delete(points - middle, int(np.argmax(np.ptp(every, axis=0))), axis=1)
+    families = [("r", True, np.linalg.norm(across, axis=1))]
+    families += [(name, below, column if below else -column) for below in (True, False)
+                 for name, column in zip(COMPONENTS, points.T, strict=True)]
+    best, most = Reach("r", True, np.nan, np.nan, float(np.sqrt(squares.mean())), noise_T), (
+        FEWEST_KEPT * len(points))
+    for along, below, place in families:
+        place = place.round(6)  # points of a ring differ by rounding
+        for end in np.unique(place)[:-1]:
+            inside = place <= end
+            # each of its parts must be good, not their mean only
+            if squares[inside].mean() > limit or squares[place == end].mean() > limit:
+                break
+            if inside.sum() > most:
+                most = inside.sum()
+                within, beyond = (float(np.sqrt(squares[part].mean()))
+                                  for part in (inside, ~inside))
+                best = Reach(along, below, float(end if below else -end), within, beyond, noise_T)
+    return best
 
 
 def _structure(points: Floats, residual: Floats) -> float:

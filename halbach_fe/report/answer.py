@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+_NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
+
+
+@contextmanager
+def known_paths(paths: Mapping[str, object]) -> Iterator[None]:
+    """While the block runs, let answers of pages name these files, see `Answer.with_paths`."""
+    token = _NAMES.set(paths)
+    try:
+        yield
+    finally:
+        _NAMES.reset(token)
 
 
 @dataclass(frozen=True)
@@ -43,7 +57,10 @@ class Answer:
         return self.said, self.trust, f"Next: {self.step}"
 
     def with_paths(self, paths: Mapping[str, object]) -> Answer:
-        """Return the answer with the paths that are known in place of the words of its command."""
+        """Return the answer with the paths that are known in place of the words of its command.
+
+        An update with a map gets the table of blocks too, if its path is known.
+        """
         def known(word: str) -> str:
             name, slash, rest = word.partition("/")
             path = paths.get(name)
@@ -51,7 +68,20 @@ class Answer:
                 return word
             return shlex.quote(str(Path(str(path), rest)))
 
-        return replace(self, command=" ".join(map(known, self.command.split(" "))))
+        words = self.command.split(" ")
+        if paths.get("BLOCKS") is not None and "--measurements" in words and not {
+                "--blocks", "NEW_MAP"} & set(words):
+            words[words.index("-o"):words.index("-o")] = ["--blocks", "BLOCKS"]
+        return replace(self, command=" ".join(map(known, words)))
+
+    def with_known_paths(self, folder: bool = True) -> Answer:
+        """Return the answer with the paths of the command that is running, see `known_paths`.
+
+        Without ``folder``, its own folder stays ``DIR/``: results may be moved, and a report of
+        several names them by its own place.
+        """
+        return self.with_paths({
+            name: path for name, path in (_NAMES.get() or {}).items() if folder or name != "DIR"})
 
 
 def agreement(disagreement: str | None) -> str:

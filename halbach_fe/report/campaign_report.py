@@ -98,10 +98,10 @@ class Campaign:
         if instead:
             said += f" Use {', '.join(instead)}."
         trust = (
-            "The results do not all fit together, as is said below." if self.doubts else
-            "They are of versions of the study that follow from each other, and no file was "
-            "changed since." if self.versions else
-            "They are of one study, and no file was changed since.")
+            "No: the results do not all fit together, as is said below." if self.doubts else
+            f"{'Only those that are not named here' if left else 'Yes'}: they are of " + (
+                "versions of the study that follow from each other" if self.versions else
+                "one study") + ", and no file was changed since.")
         last = self._next()
         return Answer("What is known of this magnet?", said, trust,
                       last.step if last else "Nothing that the results name is left to do.",
@@ -123,12 +123,16 @@ class Campaign:
     def _with_what_was_found(self, chapter: Chapter, answer: Answer) -> Answer:
         """Return the next step of an answer that may not be used.
 
-        It is its own, or to repeat the command if the study has been diagnosed already.
+        It is its own, or to repeat the command if the study has been diagnosed already; if that
+        diagnosis may not be used either, it is what the diagnosis says.
         """
         found = next((one for one in self.chapters if one.verb == "diagnose"
                       and DIAGNOSED in one.record.files and not chapter.has_study_of(one)), None)
         if found is None:
             return answer
+        if not found.sound:
+            return next(own.with_paths({"DIR": found.folder}) for one, _, own in self.answered
+                        if one is found)
         return replace(answer, step=f"Repeat {chapter.label} with {found.label}/{DIAGNOSED}, which "
                        "has what its study lacks.", command="")
 

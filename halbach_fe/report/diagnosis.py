@@ -64,6 +64,10 @@ FIGURES = {
                        "magnet")}
 """Function that draws each figure of the page, and its caption."""
 
+SCATTERED = ("Measured less predicted over the map, before and after the diagnosis: what remains "
+             "after it should be noise, without a pattern")
+"""Caption of the profile of points that lie on no line or circle."""
+
 
 def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Return the rows of a table of all findings, as text."""
@@ -141,6 +145,8 @@ def write_diagnosis_report(
         Sentences that the page shows before the result.
     """
     drawn = {name: (draw(diagnosis), text) for name, (draw, text) in FIGURES.items()}
+    if figures.is_scattered(diagnosis.before):
+        drawn["profile"] = drawn["profile"][0], SCATTERED
     pictures = save({f"diagnosis_{name}.png": each for name, each in drawn.items()}, folder)
     titles = catalogue_titles(diagnosis)
     write_page(

@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, SMALL
+from halbach_fe.report.point_maps import residual_figure
 from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 
 MAX_BARS = 8
@@ -235,8 +236,19 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
+def is_scattered(update: InferenceResult) -> bool:
+    """Whether the readings are of B at points of one map that lie on no lines or circles."""
+    return not update.is_campaign and all(update.observation.components) and not _line(
+        update, np.zeros(int(np.sum(~update.held_out))))[-1]
+
+
 def profile(diagnosis: Diagnosis) -> Figure:
-    """Draw the readings with the largest residuals, their predictions and residuals."""
+    """Draw the readings with the largest residuals, their predictions and residuals.
+
+    Of scattered points it is what remains of each component, over the points.
+    """
+    if is_scattered(diagnosis.before):
+        return _residual_maps(diagnosis)
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
     line = {"lw": 1.2} if connected else {"ls": "none", "marker": "_", "ms": 8}
@@ -272,6 +284,23 @@ def profile(diagnosis: Diagnosis) -> Figure:
     for axis in (top, bottom):
         axis.grid(alpha=0.3)
     return figure
+
+
+def _residual_maps(diagnosis: Diagnosis) -> Figure:
+    """Draw measured less predicted of all readings, before and after, as maps of the components."""
+    update = diagnosis.before
+    points, number = np.unique(update.observation.positions.round(9), axis=0, return_inverse=True)
+    labels = np.array(update.observation.labels)
+    rows: dict[str, dict[str, Floats]] = {}
+    for label in dict.fromkeys(labels.tolist()):
+        mine = labels == label
+        rows[label] = {}
+        for state in states(diagnosis):
+            values = np.full(len(points), np.nan)
+            values[number.ravel()[mine]] = 1e6 * (
+                state.update.readings - state.update.prediction_posterior.mean)[mine]
+            rows[label][state.when] = values
+    return residual_figure(points, rows, "µT")
 
 
 def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Floats, str, bool]:

@@ -24,11 +24,12 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    SMALL,
     own_style,
     save,
     write_page,
 )
-from halbach_fe.report.words import decimals, place_of, with_error
+from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
 from halbach_fe.study.types import COMPONENTS
 
 LISTED = 12
@@ -39,6 +40,12 @@ MAIN = 0.9
 
 ROUGH = 0.1
 """Error of a force, relative to it, above which the answer is not to be trusted."""
+
+EQUAL = 1e-3
+"""Part of the largest force by which others may be smaller that are as large for who assembles."""
+
+NUMBERED_SLOTS = 48
+"""Largest number of blocks of a ring that have their numbers in the figure."""
 
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
@@ -56,7 +63,8 @@ def answer(found: Forces) -> Answer:
                       "Yes: nothing else is there.", *plan)
     block = found.blocks[worst]
     text = [f"The largest force is {_newton(size)} (as heavy as {_heavy(size)}), on "
-            f"{place_of(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."]
+            f"{place_of(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."
+            f"{_as_large(found, worst)}"]
     if len(found.blocks) > 1:
         next_one = int(np.argmax(found.inserted.magnitude))
         inserted, block = found.inserted.magnitude[next_one], found.blocks[next_one]
@@ -71,6 +79,22 @@ def answer(found: Forces) -> Answer:
         f"Yes, to {_newton(error)} by the quadrature. The blocks are those of the study, at rest "
         "in their places: a block that is 1 % stronger feels 1 % more, and one that comes nearer "
         "to its neighbours than its place is may feel more.", *plan, sound=error <= ROUGH * size)
+
+
+def _as_large(found: Forces, worst: int) -> str:
+    """Name the other blocks whose force is as large as that of the block ``worst``, by symmetry."""
+    size = found.in_place.magnitude
+    slots: dict[int, list[str]] = {}
+    for number in np.flatnonzero(size >= (1 - EQUAL) * size[worst]).tolist():
+        if number != worst:
+            slots.setdefault(found.blocks[number].ring, []).append(str(found.blocks[number].slot))
+    count = sum(map(len, slots.values()))
+    if not count:
+        return ""
+    named = "; ".join(f"ring {ring}, slot{'s' if len(own) > 1 else ''} {in_a_row(own)}"
+                      for ring, own in slots.items())
+    return (f" It is as large on {counted(count, 'other block')}"
+            f"{f': {named}' if count < LISTED else ''}.")
 
 
 def _mass(found: Forces) -> str:
@@ -198,6 +222,13 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
         corners.append(1e3 * block.from_frame(
             np.column_stack([outline, np.full(len(outline), height)]))[:, :2])
     colours = Normalize(0, float(size[chosen].max()) or 1.0)
+    if len(chosen) <= NUMBERED_SLOTS:
+        outside = 1.1 * max(float(np.hypot(*corner.T).max()) for corner in corners)
+        for number in chosen:
+            block, (x, y, _) = found.blocks[number], found.blocks[number].middle
+            if radius := float(np.hypot(x, y)):
+                axis.text(outside * x / radius, outside * y / radius, str(block.slot),
+                          ha="center", va="center", fontsize=SMALL)
     axis.add_collection(PolyCollection(
         corners, array=size[chosen], cmap="Blues", norm=colours, edgecolor="#777777", lw=0.6))
     middles = np.array([corner.mean(axis=0) for corner in corners])
@@ -223,7 +254,8 @@ def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> 
         write_csv(force_columns(found), {"study": found.magnet.name}, temporary)
     pictures = save({"forces.png": (
         forces_figure(found), "Left: forces in place in the ring of the largest one; arrows show "
-        "their part in the plane. Right: forces in the order of the assembly")}, folder)
+        "their part in the plane, numbers are slots. Right: forces in the order of the assembly")},
+        folder)
     write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
                provenance=provenance, answer=answer(found), rows=force_rows(found), found=found,
                imbalance=_newton(found.imbalance_N),

@@ -45,6 +45,10 @@ LISTED = 12
 LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a number is 0 in tables."""
 
+NO_DIRECTION_RAD = 0.5
+"""Standard deviation of the angle of the mean of B from which it has no direction: in a multipole
+that mean is what the errors of the blocks leave."""
+
 DRAWN = 24
 """Number of the harmonics in the figure: the largest ones, with names that can be read."""
 
@@ -53,10 +57,15 @@ def answer(found: HomogeneityResult) -> Answer:
     """Say how homogeneous the field of the best known magnet is, and what to do next."""
     name, best = list(found.by_name.items())[-1]
     question = f"How homogeneous is the field in {found.model.region.text}?"
-    text = (f"The mean field is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
+    text = (f"The mean of |B| is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
             f"rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
     text += _of_map(found)
     low, middle, high = map(ppm, best.rms_range_ppm)
+    if _cancels(best):
+        return Answer(
+            question, f"{text}.", "Only as a property of |B|: the mean of the vector B over this "
+            "region is 0 but for errors of the blocks, as in a multipole.", "See its multipoles.",
+            "halbach-fe multipoles STUDY -o DIR", sound=False)
     trust, small = solver_error_text(found.model, best.rms_ppm)
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
@@ -70,7 +79,8 @@ def answer(found: HomogeneityResult) -> Answer:
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
-        "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
+        "Measure it, and update its blocks with the map; then ask again with --posterior and the "
+        "posterior.h5 that this command writes into its DIR:",
         "halbach-fe infer STUDY --measurements MAP -o DIR", small)
 
 
@@ -125,6 +135,11 @@ def direction_in_words(unit: Floats, sd_rad: float) -> str:
             f"{decimals(1e3 * sd_rad, 2)}\u00a0mrad")
 
 
+def _cancels(known: Homogeneity) -> bool:
+    """Whether the mean of B has no direction, as in a multipole."""
+    return known.direction_sd_rad > NO_DIRECTION_RAD
+
+
 def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]:
     """Return a row of text per distribution of the magnetizations."""
     rows = []
@@ -133,8 +148,9 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
             "rms, 95 % of magnets in ppm": known.rms_range_ppm,
             "peak to peak, 95 % of magnets in ppm": known.peak_to_peak_range_ppm}
         rows.append({
-            "magnet": name, "mean field": _field(known),
-            "direction": direction_in_words(known.direction, known.direction_sd_rad),
+            "magnet": name, "mean of |B|": _field(known),
+            "direction of the mean B": "none: it cancels"
+            if _cancels(known) else direction_in_words(known.direction, known.direction_sd_rad),
             "rms in ppm": ppm(known.rms_ppm),
             "peak to peak in ppm": ppm(known.peak_to_peak_ppm),
             **{key: f"{ppm(low)} to {ppm(high)}" for key, (low, _, high) in ranges.items()}})
@@ -142,9 +158,9 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
 
 
 def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
-    """Return a row of text for each of the largest harmonics; none if there are no harmonics."""
+    """Return a row of text for each of the largest harmonics; none if B has no direction."""
     names = list(found.by_name)
-    best = found.by_name[names[-1]].harmonics
+    best = () if _cancels(found.by_name[names[-1]]) else found.by_name[names[-1]].harmonics
     shown = {**found.by_name, **found.of_map}
     order = sorted(range(len(best)), key=lambda number: -abs(best[number].ppm))[:LISTED]
     rows = []
@@ -242,7 +258,7 @@ def write_homogeneity(
         "Deviation of |B| from its mean over the region, in planes through its centre, "
         f"{_known_as(name)}")}
     every = {**found.by_name, **found.of_map}
-    if best.harmonics:
+    if best.harmonics and not _cancels(best):
         figures["harmonics.png"] = (
             harmonics_figure(best), f"The largest spherical harmonics {_known_as(name)}, by "
             "degree; bars are two standard deviations")

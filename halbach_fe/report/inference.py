@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.inference.result import InferenceResult
+from halbach_fe.inference.result import TRAINING, InferenceResult
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
@@ -28,7 +28,7 @@ from halbach_fe.report.prediction import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.stray_field import stray_pictures, stray_section
-from halbach_fe.report.words import decimals, flux_density, ppm
+from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import circle_models
 
@@ -41,21 +41,26 @@ def score_table(result: InferenceResult,
                 published: PublishedErrors | None = None) -> list[dict[str, str]]:
     """Return the rows, as text, of the table that compares predictions before and after.
 
-    Beside published errors, which are medians of relative ones, there are such medians of ours.
+    Before the update, chi² is that of all training readings together, which the answer states: in
+    their own row, or in one below those of several regions. Beside published errors, which are
+    medians of relative ones, there are such medians of ours.
     """
     rows, largest = [], float(np.abs(result.readings).max())
+    training = ~result.held_out
+    alone = sum(score.part == TRAINING for score in result.scores) == 1
     for score in result.scores:
         row = {
             "region": score.region,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "before, rms": flux_density(score.rms_error_prior_T),
             "after, rms": flux_density(score.rms_error_posterior_T),
-            "of the largest reading": f"{ppm(PPM * score.rms_error_posterior_T / largest)}\u00a0ppm"
+            "of the largest reading": relative(score.rms_error_posterior_T / largest)
             if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
-            "chi²/reading": NOTHING if score.chi2_posterior is None
-            else decimals(score.chi2_posterior),
+            "chi²/reading, before": _chi2(
+                result.prior_conflict if alone and score.part == TRAINING else score.chi2_prior),
+            "chi²/reading, after": _chi2(score.chi2_posterior),
         }
         if published is not None:
             inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
@@ -66,7 +71,18 @@ def score_table(result: InferenceResult,
             row[f"{published.label}: posterior"] = _percent(
                 float(np.median(published.posterior[inside])))
         rows.append(row)
+    if not alone:
+        off = [flux_density(float(np.sqrt(np.mean((result.readings - each.mean)[training] ** 2))))
+               for each in (result.prediction_prior, result.prediction_posterior)]
+        together = {"region": "together", "readings": f"{training.sum()} {TRAINING}".replace(
+            " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],
+            "chi²/reading, before": _chi2(result.prior_conflict)}
+        rows.append({name: together.get(name, NOTHING) for name in rows[0]})
     return rows
+
+
+def _chi2(value: float | None) -> str:
+    return NOTHING if value is None else decimals(value)
 
 
 @own_style

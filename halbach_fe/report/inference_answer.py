@@ -7,7 +7,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.words import flux_density, fraction, place_of, with_error
+from halbach_fe.report.words import decimals, flux_density, fraction, place_of, with_error
 
 
 def answer(result: InferenceResult) -> Answer:
@@ -27,9 +27,9 @@ def answer(result: InferenceResult) -> Answer:
                " The instruments have not come to rest: their error bars may be too small.")
     flat = result.magnet.dimension == 2
     return Answer(
-        question, said, "Yes. Model and readings agree: chi² per reading is "
-        f"{result.prior_conflict:.3g}, where 1 is expected and more than "
-        f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}",
+        question, said, "Yes. Model and readings agree: chi² per reading "
+        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
         f"See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
         f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
         f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
@@ -45,7 +45,7 @@ def _prediction(result: InferenceResult) -> str:
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
         return (f"The updated magnet differs from the readings by {flux_density(after)} rms, "
-                f"{_before(result)} by {flux_density(before)}.")
+                f"before the update {_before(result)} differed by {flux_density(before)}.")
     expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
     bands = [(score.readings, score.coverage95_posterior) for score in result.scores
              if score.part == part and score.coverage95_posterior is not None]
@@ -54,13 +54,14 @@ def _prediction(result: InferenceResult) -> str:
           else "readings that were held out")
     return (f"The updated magnet predicts {chosen.sum()} {of} to "
             f"{flux_density(after)} rms, where its error bars and the noise allow "
-            f"{flux_density(_rms(expected))}; {_before(result)} is {flux_density(before)} off. "
+            f"{flux_density(_rms(expected))}; before the update, {_before(result)} was "
+            f"{flux_density(before)} off. "
             f"The 95 % band holds {fraction(held)} of them.")
 
 
 def _before(result: InferenceResult) -> str:
     """Say which magnet the update starts from."""
-    return ("the magnet before the update" if result.measured_blocks is None
+    return ("the nominal magnet" if result.measured_blocks is None
             else "the magnet of the measured blocks")
 
 

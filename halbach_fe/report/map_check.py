@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import VIOLATED, MapCheck
+from halbach_fe.measurement.map_check import VIOLATED, MapCheck, Reach
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
 from halbach_fe.report.point_maps import draw, panels
-from halbach_fe.report.words import decimals, flux_density
+from halbach_fe.report.words import decimals, flux_density, relative
 from halbach_fe.study.types import COMPONENTS
 
 REMAINS = 0.3
@@ -61,9 +61,16 @@ def answer(check: MapCheck) -> Answer:
             "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
     if check.structure > REMAINS:
-        trust = (f"Nearly: what remains is no noise, as neighbouring residuals have a correlation "
-                 f"of {check.structure:.2f}. Something that this check does not know, such as a "
-                 "probe that moves in its holder, is still in the map.")
+        trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
+                 f"correlation of {check.structure:.2f}. Something that this check does not know, "
+                 "such as a probe that moves in its holder, is still in the map.")
+    if (reach := check.reach) is not None:
+        trust = (f"Only {_where(check, reach)}. " if np.isfinite(reach.limit_m) else
+                 "Only roughly. ") + (
+            f"{'Beyond that,' if np.isfinite(reach.limit_m) else 'Everywhere,'} held-out lines are "
+            f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
+            "either the field is steeper there than the lines show, as near edges of magnets, or "
+            "these readings are wrong. An update of the magnet tells which.")
     used = "DIR/oriented_map.csv" if better else "MAP"
     return Answer(
         question, f"{verdict(check)} {noise}: {keys}.", trust,
@@ -113,7 +120,7 @@ def verdict(check: MapCheck) -> str:
                 "smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
-            f"{_share(share)} of the largest field ({flux_density(check.size_T)})")
+            f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
     if share > VIOLATED:
         return f"The map does not obey div B = 0 and curl B = 0: they leave {size}."
     wrong = _impossible(check)
@@ -121,8 +128,22 @@ def verdict(check: MapCheck) -> str:
         return (f"The map does not obey div B = 0 and curl B = 0 with any likely instrument: it "
                 f"would take an impossible one ({wrong[0]}"
                 f"{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}), which leaves {size}.")
+    if check.reach is not None and np.isfinite(check.reach.limit_m):
+        return (f"The map obeys div B = 0 and curl B = 0 to {flux_density(check.reach.inside_T, 2)}"
+                f" rms on scan lines that were held out {_where(check, check.reach)}, and to "
+                f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
+                f"{flux_density(check.size_T)}.")
     return (f"The map obeys div B = 0 and curl B = 0 to {size}. A model of the magnet can "
             "explain it better only near edges of the magnet.")
+
+
+def _where(check: MapCheck, reach: Reach) -> str:
+    """Describe the region in which held-out lines are predicted."""
+    limit = f"{1e3 * reach.limit_m:.3g}\u00a0mm"
+    if reach.along == "r":
+        return (f"within {limit} of the line through the middle of the map along "
+                f"{check.windows[0]}")
+    return f"at {reach.along} of {limit} and {'less' if reach.below else 'more'}"
 
 
 def _impossible(check: MapCheck) -> list[str]:
@@ -138,11 +159,6 @@ def _violates(check: MapCheck) -> bool:
 def _component(name: str) -> str:
     """Return the name of a component with its sign, -Bz of ``-z``."""
     return f"{name[:-1].replace('-', '−')}B{name[-1]}"
-
-
-def _share(value: float) -> str:
-    """Return a part of 1 in % or ppm."""
-    return f"{100 * value:.2f}\u00a0%" if value >= 1e-3 else f"{value * 1e6:.0f} ppm"
 
 
 def instrument_table(check: MapCheck) -> list[dict[str, str]]:

@@ -8,7 +8,7 @@ import io
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from importlib import metadata
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, Picture, write_record
@@ -91,24 +92,25 @@ def write_page(
     provenance : mapping, optional
         Text by name of the entry.
     answer : Answer, optional
-        What the page says first; every page of a command has one.
+        What the page says first, with the paths that are known; every page of a command has one.
     rows : sequence of mapping of str to str
         The main table of the page, which page.json has too.
     **data
         Variables of the template.
     """
     provenance = {**(provenance or {}), "programs": programs()}
-    text = rendered(template, pictures=pictures, study=study, answer=answer, rows=rows,
-                    provenance=provenance, **data)
+    text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
+                    answer=answer and answer.with_known_paths(), **data)
     write_text(path, text)
     title = re.search("<title>(.*?)</title>", text, re.S)
-    write_record(path, html.unescape(title[1]) if title else "", answer, pictures, rows,
-                 provenance, study)
+    write_record(path, html.unescape(title[1]) if title else "",
+                 answer and answer.with_known_paths(folder=False), pictures, rows, provenance,
+                 study)
 
 
 def programs() -> str:
     """Return the names and versions of the programs that a page is made with."""
-    return ", ".join([*(f"{name} {metadata.version(name)}" for name in PROGRAMS),
+    return ", ".join([*(f"{name} {version(name)}" for name in PROGRAMS),
                       f"Python {platform.python_version()}"])
 
 
@@ -116,11 +118,17 @@ def rendered(template: str, study: Study | None = None, **data: object) -> str:
     """Return the HTML of a template of this folder; all texts in ``data`` are escaped."""
     text = None if study is None else tomlkit.dumps(_without_empty_cells(
         study.model_dump(mode="json", exclude_unset=True, exclude_none=True)))
+    return _templates().get_template(template).render(study=study, study_text=text, **data)
+
+
+@cache
+def _templates() -> jinja2.Environment:
+    """Return the templates of this folder, which are compiled once in a process."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["is_nonlinear"] = is_nonlinear
-    return environment.get_template(template).render(study=study, study_text=text, **data)
+    return environment
 
 
 def _without_empty_cells(value: Any) -> Any:

@@ -90,8 +90,9 @@ def answer(prior: MeasuredPrior) -> Answer:
              if not tested else
              "Yes: the deviations are distributed normally, as the prior assumes, as far as so "
              "many blocks can tell." if not odd else
-             f"Not normal: the deviations of type {', '.join(odd)} are unlikely to be distributed "
-             f"normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's correction)."
+             f"Only as mean and spread: the deviations of type {', '.join(odd)} are unlikely to be "
+             f"distributed normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's "
+             "correction)."
              + ("" if prior.placed else " The prior treats them as normal nevertheless."))
     return Answer(
         "What do the measured blocks say about the magnet?", said, trust,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import singledispatch
-from importlib import metadata
 from operator import attrgetter
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import tomlkit
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.core.result_folder import result_folder
+from halbach_fe.core.versions import version
 from halbach_fe.design.assembly import Assembly
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
@@ -64,7 +64,7 @@ OWNERS: dict[type, tuple[str, str]] = {
 
 def provenance(getdp: str | None = None) -> dict[str, str]:
     """Return the versions of the programs, which are shown at the end of a page."""
-    versions = {"halbach-fe": metadata.version("halbach-fe")}
+    versions = {"halbach-fe": version("halbach-fe")}
     return versions if getdp is None else versions | {"GetDP": getdp}
 
 

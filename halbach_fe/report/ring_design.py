@@ -110,7 +110,8 @@ def front_figure(found: Designed) -> Figure:
     axis.plot(1e3 * found.best.mean_T, found.best.peak_to_peak_ppm, "o", ms=11, color=POSTERIOR,
               label="the best design")
     axis.set(xlabel="mean field in mT", ylabel="deviation in ppm", yscale="log")
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
+    for labels in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+        labels(FuncFormatter(lambda value, _: ppm(value)))
     axis.grid(alpha=0.3)
     axis.legend(frameon=False)
     return figure

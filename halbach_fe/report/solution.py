@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.stray_field import stray_pictures, stray_section
-from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, ppm
+from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, is_fourier, relative
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
 from halbach_fe.study.types import COMPONENTS
@@ -51,6 +51,8 @@ def answer(solution: Solution) -> Answer:
                       f"Yes: it is a closed form, without a mesh. {of_blocks}",
                       *_after_an_exact_field(solution))
     sigma = _smallest_noise(solution)
+    reading = ("a Fourier coefficient of B_r on a circle" if is_fourier(solution.magnet.study)
+               else "a component of B")
     fine = error <= (sigma or ROUGH * high)
     compared = ("" if not sigma else "Yes: the error is below the noise of the readings, "
                 f"{flux_density(sigma)}. " if fine else
@@ -58,9 +60,11 @@ def answer(solution: Solution) -> Answer:
                 f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
         "How strong is the field?",
-        f"{said} Mesh and boundary make a reading wrong by {flux_density(error)} at most "
-        f"({ppm(1e6 * error / high)} ppm), by estimate.", f"{compared}{of_blocks}",
-        "Test that estimate with more meshes." if fine else
+        f"{said} Mesh and boundary make a reading, {reading}, wrong by {flux_density(error)} at "
+        f"most ({relative(error / high)} of the largest |B|), by estimate.",
+        f"{compared}{of_blocks}",
+        "Test that estimate with more meshes, which also say how far B at a point is off."
+        if fine else
         "See how the error falls with the mesh, then refine mesh.block_size_m.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
 
@@ -115,7 +119,10 @@ def write_solution_report(
 
 
 def field_table(solution: Solution) -> list[dict[str, str]]:
-    """Return rows of text: where the field is strongest and weakest, its mean, and its error."""
+    """Return rows of text: where the field is strongest and weakest, and the means of B and |B|.
+
+    That of the vector B is 0 on a circle of a multipole, whose |B| is not.
+    """
     size = np.linalg.norm(solution.flux_density, axis=1)
     nothing = max(float(solution.errors.max()), ROUNDING * float(size.max()))
     components = COMPONENTS[:solution.magnet.dimension]
@@ -133,7 +140,9 @@ def field_table(solution: Solution) -> list[dict[str, str]]:
     ends = {"strongest": int(np.argmax(size)), "weakest": int(np.argmin(size))}
     return [*(row(what, solution.flux_density[number], at(number))
               for what, number in ends.items()),
-            row("mean", solution.flux_density.mean(axis=0))]
+            row("mean of the vector B", solution.flux_density.mean(axis=0)),
+            {"B": "mean of |B|", "|B|": flux_density(float(size.mean()), 5)}
+            | {f"B{name}": "" for name in components} | {"at": ""}]
 
 
 def field_figure(solution: Solution) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -33,6 +34,8 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import counted, in_a_row, ppm
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
+
+T = TypeVar("T")
 
 QUANTILES = (0.01, 0.5, 0.99)
 """Quantiles of the rms of random orders that sort.json states."""
@@ -95,9 +98,18 @@ def table_title(found: SortedBlocks) -> str:
 def order_table(found: SortedBlocks) -> list[dict[str, str]]:
     """Return the rows of the table of multipoles or fields, as text."""
     if found.fields is not None:
-        best, own = found.fields
-        return homogeneity_rows({found.own_order: own, "sorted": best})
-    return text_table(**{found.own_order: found.numbered, "sorted": found.best})
+        return homogeneity_rows(_compared(found, *found.fields))
+    return text_table(**_compared(found, found.best, found.numbered))
+
+
+def _compared(found: SortedBlocks, best: T, own: T) -> dict[str, T]:
+    """Return what is sorted after what is in the table's order; the former alone without choice."""
+    return {found.own_order: own, "sorted": best} if _chose(found) else {"every order": best}
+
+
+def _chose(found: SortedBlocks) -> bool:
+    """Whether there was anything to choose: an order, or turns."""
+    return bool((found.has_choice and found.matters) or found.turned)
 
 
 def answer(found: SortedBlocks) -> Answer:
@@ -117,7 +129,15 @@ def answer(found: SortedBlocks) -> Answer:
             f"{'is' if found.left_over == 1 else 'are'} left over.")
     turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
               f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
-    if not found.has_choice and not found.turned:
+    if found.has_choice and not _chose(found):
+        return Answer(
+            question, f"It does not matter: {what} {text(best)} {unit} in every order that is "
+            f"allowed.{left}", f"Yes: {len(found.random)} random orders are alike. Only blocks "
+            "that are at the same angle may change places, in rings whose fields add up along z.",
+            "Let more slots take the same blocks by prior.types of the study"
+            f"{types_in_words(found.alike)}, and sort again.",
+            "halbach-fe sort STUDY BLOCKS -o DIR")
+    if not _chose(found):
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
             f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, and here "
@@ -168,15 +188,16 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
                                   found.turn_deg[rows].T, strict=True))}, {
                 "content": "blocks that are turned in their slots: rotation vectors along own axes"
             }, temporary)
-    figures = {} if not np.ptp(found.random) else {"sort_orders.png": (
+    figures = {} if not found.matters else {"sort_orders.png": (
         _random_orders_figure(found), f"Histogram of the root mean square of {_axis_text(found)} "
         f"for {len(found.random)} random orders of the blocks; the lines are the order of the "
         "table and the sorted blocks")}
     if not isinstance(found.model, DeviationModel):
         figures = {"sort_multipoles.png": (
-            multipole_figure({found.own_order: found.numbered, "sorted": found.best}, limit),
-            "Unwanted multipoles of the blocks in the order of the table and of the sorted blocks, "
-            "normal (left) and skew (right); bars are two standard deviations")} | figures
+            multipole_figure(_compared(found, found.best, found.numbered), limit),
+            "Unwanted multipoles of the blocks" + (
+                " in the order of the table and of the sorted blocks" if _chose(found) else "")
+            + ", normal (left) and skew (right); bars are two standard deviations")} | figures
     write_page(folder / "sort.html", "sort.html.j2", save(figures, folder), found=found,
                study=found.study, answer=answer(found), rows=order_table(found),
                turned=turn_table(found), title=table_title(found), text=_convention(found))
@@ -187,7 +208,7 @@ def _convention(found: SortedBlocks) -> str:
     if isinstance(found.model, DeviationModel):
         return f"{SIZES} Ranges contain the uncertainty of the measured blocks."
     return (f"{reference_text(found.model)} ± is the standard deviation, including the error of "
-            f"the solver. Main multipole of the sorted blocks: "
+            f"the solver. Main multipole of {'the sorted' if _chose(found) else 'these'} blocks: "
             f"{main_in_words(found.model, found.best)}.")
 
 

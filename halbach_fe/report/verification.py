@@ -31,7 +31,7 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
-from halbach_fe.report.words import ROUNDING, decimals, flux_density, ppm
+from halbach_fe.report.words import ROUNDING, decimals, flux_density, is_fourier, ppm, relative
 from halbach_fe.response.discretization_error import REFINEMENT
 from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, STEPS, Verification
 
@@ -71,9 +71,13 @@ def answer(found: Verification) -> Answer:
                       "needed, it is the exact one of the blocks in vacuum "
                       f"({flux_density(main, 4)} at most).",
                       "Yes, to the rounding of the computer: it is a closed form.", *measure)
-    said = (f"At the study's positions B is off by {flux_density(error)} at most, by estimate. "
-            f"That is {ppm(1e6 * found.error_pointwise)} ppm of the largest field there "
+    said = (f"At the study's positions the vector B is off by {flux_density(error)} at most, by "
+            f"estimate. That is {relative(found.error_pointwise)} of the largest field there "
             f"({flux_density(main, 4)}).")
+    if is_fourier(found.magnet.study) and found.error_fourier is not None:
+        said += (" A reading, which is a Fourier coefficient of B_r on a circle, is off by "
+                 f"{flux_density(found.error_fourier * main)} at most: over a circle the errors "
+                 "of the elements average out.")
     rough = found.order <= FLATTEST
     noisy, noise = _beside_the_noise(found)
     trust = ("No: the last refinement does not change the field less than the one before. The "
@@ -90,7 +94,7 @@ def answer(found: Verification) -> Answer:
 def _beside_the_noise(found: Verification) -> tuple[bool, str]:
     """Tell whether the error is above the noise of the readings, and say how they compare."""
     study = found.magnet.study
-    fourier = study.observation.quantity == "fourier_coefficients"
+    fourier = is_fourier(study)
     own = found.error_fourier if fourier else found.error_pointwise
     if study.noise is None or not study.noise.regions or own is None:
         return False, ""
@@ -114,9 +118,15 @@ def error_basis(found: Verification) -> str:
             f"(order {found.order:.1f}{limit} in the element size).")
     if len(found.differences) > STEPS + 1:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
-                 "concerned. The difference between the two formulations is the solver's error bar "
-                 "of the readings, and not part of the estimate.")
-    return text
+                 "concerned. The difference between the two formulations is no part of the "
+                 "estimate.")
+    return (f"{text} The error bars of readings, which halbach-fe solve states, are an estimate "
+            f"apart from this one: the change of {_reading(found)} by one other discretization.")
+
+
+def _reading(found: Verification) -> str:
+    """Say what a reading of the study is."""
+    return "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
 
 
 @own_style

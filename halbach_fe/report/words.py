@@ -9,6 +9,7 @@ import numpy as np
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.diagnosis.summary import EMPTY_CELL, block_in_words
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.study.model import Study
 
 SMALL_T, LARGE_T = 1e-4, 1.0
 """Flux density below which texts and tables give it in µT, and from which they give it in T."""
@@ -19,6 +20,9 @@ ROUNDING = 1e-11
 
 CERTAIN = 100
 """Power of ten beyond which a Bayes factor is not told in detail."""
+
+PERCENT_FROM = 0.01
+"""Part of 1 from which it is told in per cent, not in ppm."""
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -49,6 +53,12 @@ def ppm(value: float) -> str:
     """Return a number of ppm as text, without an exponent."""
     return (f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000
             else "0" if abs(value) < 1e-3 else f"{value:.3g}")
+
+
+def relative(share: float) -> str:
+    """Return a part of 1 in ppm, or in per cent from 10 000 ppm on."""
+    return (f"{decimals(100 * share)}\u00a0%" if abs(share) >= PERCENT_FROM
+            else f"{ppm(1e6 * share)}\u00a0ppm")
 
 
 def probability(share: float) -> str:
@@ -86,6 +96,11 @@ def in_a_row(names: Sequence[str]) -> str:
     """Return names in words: one, two and three."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
+
+
+def is_fourier(study: Study) -> bool:
+    """Whether a reading of the study is a Fourier coefficient of B_r, not a component of B."""
+    return study.observation.quantity == "fourier_coefficients"
 
 
 def place_of(block: MagnetBlock) -> str:

@@ -17,7 +17,6 @@ import json
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from importlib import metadata
 from itertools import chain
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from halbach_fe.core.code_digest import code_digest
 from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
 from halbach_fe.core.hdf5 import read_hdf5, with_checksum, write_hdf5
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import Variations
@@ -303,7 +303,7 @@ def _key(magnet: Magnet, observation: Observation, session: Session) -> str:
     curve = magnet.curve  # the study may only name the steel, whose data may change
     if curve is not None:
         digest.update(np.array([curve.H, curve.B]).tobytes())
-    versions = [metadata.version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]
+    versions = [version(name) for name in ("halbach-fe", "gmsh", "meshio", "scipy")]
     digest.update(f"{versions} {session.getdp.version} {session.getdp.petsc}".encode())
     digest.update(code_digest(__name__))
     digest.update(np.ascontiguousarray(observation.points).tobytes())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.tables import csv_text
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import Observation, observe
@@ -67,7 +67,7 @@ class Solution(ShownInNotebook):
     def field_map(self) -> xr.Dataset:
         """B at the study's positions as a labelled map, see `halbach_fe.measurement.field_map`."""
         return field_map(self.points, self.flux_density, attributes={
-            "study": self.magnet.name, "halbach_fe": metadata.version("halbach-fe"),
+            "study": self.magnet.name, "halbach_fe": version("halbach-fe"),
             "getdp": self.getdp, "method": self.magnet.study.solver.method})
 
     def summary(self) -> dict[str, object]:

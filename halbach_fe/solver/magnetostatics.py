@@ -16,7 +16,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import metadata, resources
+from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from halbach_fe import pro
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.files import make_folder
+from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns, read_matrix, read_saved, read_solutions, read_unknowns
@@ -322,7 +323,7 @@ def render(template: str, *, magnet: Magnet, **data: object) -> str:
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
         autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
     return environment.from_string(source).render(
-        study=magnet.study, version=metadata.version("halbach-fe"), mu_0=MU_0, blocks=magnet.blocks,
+        study=magnet.study, version=version("halbach-fe"), mu_0=MU_0, blocks=magnet.blocks,
         iron_permeability=magnet.iron_permeability,
         **data)
 

@@ -32,9 +32,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.noise import NoiseCovariance
 
-READINGS_AT_ONCE = 8192
+READINGS_AT_ONCE = 2048
 """Largest number of rows that are whitened at a time, so that memory does not grow with the number
-of readings."""
+of readings. Larger parts would be allocated anew by the system each time, which takes as long as
+their products."""
 
 NUMBERS_AT_ONCE = 2**24
 """Largest number of entries of one block of rows (128 MB). With many parameters a block therefore

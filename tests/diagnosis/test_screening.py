@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from halbach_fe.diagnosis import screening
+from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.model_selection import Candidate
-from halbach_fe.diagnosis.screening import FEW_PLACES, most_likely
+from halbach_fe.diagnosis.model_selection import Candidate, prior_log_odds
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.diagnosis.screening import FEW_PLACES, NOTICEABLE_CHI2, is_noticeable, most_likely
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.solver.exact_block_field import unit_fields
+from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.mesh import with_rough_mesh
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+from tests.conftest import DIPOLE, changed, circle
+
+NOISE_T = 5e-5
 
 
 def test_the_most_likely_are_compared(generator, monkeypatch):
@@ -25,7 +37,7 @@ def test_the_most_likely_are_compared(generator, monkeypatch):
     marginal = Marginal.of(generator.standard_normal((rows, 5)))
 
     def chosen(of, in_model=()):
-        return most_likely(candidates, columns, marginal, of, in_model)
+        return most_likely(candidates, columns, marginal, of, in_model)[0]
 
     assert chosen(residual) == list(range(2 * count + 1))  # few enough for all
     monkeypatch.setattr(screening, "MOST_COLUMNS", 60)
@@ -34,6 +46,58 @@ def test_the_most_likely_are_compared(generator, monkeypatch):
     assert {5, displaced, 2 * count} <= set(found)
     assert sum(columns[number].shape[1] for number in found) <= 60
     # the missing block is found by what is left once the displaced one is in the model
-    assert missing in chosen(residual - 8 * columns[displaced] @ np.ones(3))
+    assert missing in chosen(residual, {displaced})
     # negative control: without its effect a candidate is among the many that are left out
     assert displaced not in chosen(columns[missing][:, 0])
+
+
+def test_what_is_left_out_still_shares_the_prior_probability():
+    few = [Candidate("missing", str(number), (number,), places=200) for number in range(2)]
+    assert prior_log_odds(few) == pytest.approx(np.log(1 / 50 / 200))
+
+
+def test_a_signature_is_noticed_beside_the_model(generator):
+    rows = 400
+    model, signature = generator.standard_normal((2, rows, 1))
+    marginal = Marginal.of(generator.standard_normal((rows, 3)))
+    noise = generator.standard_normal(rows)
+    size = 4 * np.sqrt(NOTICEABLE_CHI2) / np.linalg.norm(signature)
+    assert is_noticeable(signature, model, marginal, noise + size * signature[:, 0] + model[:, 0])
+    # negative controls: noise alone, and what the model explains
+    assert not is_noticeable(signature, np.zeros((rows, 0)), marginal, noise)
+    assert not is_noticeable(model, signature, marginal, noise)
+    assert not is_noticeable(model + 1e-2 * signature, model, marginal, noise + model[:, 0])
+
+
+@pytest.mark.parametrize("name", ["iron_ring", "neighbour_magnet"])
+def test_places_resemble_their_representatives(name, tmp_path):
+    """So closely that a ring or magnet which a map shows at all is noticed at another place."""
+    study = parse_study(changed(
+        DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.083,
+        array__recoil_permeability=1.0))
+    points = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.2, 0.2, 7)])
+    magnet = build_magnet(study)
+    session = Session.open(tmp_path)
+
+    def solve(other):
+        return solve_nominal(build_magnet(with_rough_mesh(other)), points, session)
+
+    nominal = NominalFields(study, points, np.linspace(0, 1, len(points)), solve)
+    (effect,) = [one for one in catalogue() if one.name == name]
+    places = effect.places(study)
+    chosen = effect.representatives(places)
+    assert 0 < len(chosen) < len(places)
+    # blocks of 1 % take from all signatures what they can explain
+    response = np.hstack([unit.reshape(-1, 3) * 0.01 * block.remanence / NOISE_T
+                          for block, unit in zip(magnet.blocks, unit_fields(magnet.blocks, points),
+                                                 strict=True)])
+    marginal = Marginal.of(response)
+    rest = {place: effect.signature(nominal, place)[0].ravel() / NOISE_T for place in places}
+    information = marginal.evidence(np.column_stack(list(rest.values())), np.zeros(3 * len(points))
+                                    ).information
+    seen = np.abs(information) / np.sqrt(np.diag(information))  # [i, j]: i as j sees it, in sd
+    for number, place in enumerate(places):
+        most = max(seen[number, places.index(one)] for one in chosen)
+        # twice what is noticed at the least, also if chance takes three standard deviations
+        assert most > 2 * np.sqrt(NOTICEABLE_CHI2) + 3, place
+        assert most > 0.5 * seen[number, number], place

@@ -538,7 +538,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     slots, _, truth = blocks_and_truth(study, generator, copies=8)
     healthy = prior_from_blocks(build_magnet(study), table_of(study, slots, truth))
     write_prior(build_magnet(study), healthy, tmp_path)
-    assert "Not normal" not in (tmp_path / "prior.html").read_text()
+    assert "Only as mean and spread" not in (tmp_path / "prior.html").read_text()
     with xr.open_dataset(tmp_path / "prior.h5", engine="h5netcdf") as stored:
         np.testing.assert_allclose(stored["prior_covariance"], healthy.gaussian.covariance)
         assert stored["parameter"].values[0] == "r01s01.Mx"
@@ -546,7 +546,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     table = table_of(study, slots, truth)
     with pytest.warns(HalbachWarning, match="type 4 do not look normally"):
         write_prior(build_magnet(study), prior_from_blocks(build_magnet(study), table), tmp_path)
-    assert "Not normal" in (tmp_path / "prior.html").read_text()
+    assert "Only as mean and spread" in (tmp_path / "prior.html").read_text()
     summary = json.loads((tmp_path / "prior.json").read_text())
     assert summary["not_normal"] == ["4"]
     assert summary["types"][3]["anderson_darling_p"][0] < 0.05

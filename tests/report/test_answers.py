@@ -6,6 +6,7 @@ import ast
 import json
 import re
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.report import (
     campaign,
     demagnetization,
+    diagnosis_figures,
     forces,
     homogeneity,
     inference_answer,
@@ -31,13 +33,13 @@ from halbach_fe.report import (
     tolerance,
     verification,
 )
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, known_paths
 from halbach_fe.report.words import bayes_factor, decimals, flux_density, ppm, with_error
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
-from tests.conftest import ROOT
-from tests.support.pages import answer_of
+from tests.conftest import DIPOLE, ROOT, changed
+from tests.support.pages import answer_of, command_of
 
 MAGNET = {
     "name": "answers", "dimension": 3,
@@ -84,6 +86,48 @@ def of_verify(given):
     return verification.answer(found), [flux_density(found.main_field_T, 4), "exact"]
 
 
+def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
+    """A Fourier coefficient is off by less than B at a point: each answer says what is meant."""
+    for quantity, settings in (("flux_density", {}), (
+            "fourier_coefficients", {"observation__harmonics": 5})):
+        magnet = build_magnet(dipole(observation__quantity=quantity, **settings))
+        solved, verified = hf.solve(magnet, session), hf.verify(magnet, session)
+        coefficient = quantity == "fourier_coefficients"
+        said = solution.answer(solved).said
+        assert ("a Fourier coefficient of B_r" in said) == coefficient
+        assert ("a component of B" in said) != coefficient
+        assert flux_density(solved.errors.max()) in said
+        said = verification.answer(verified).said
+        off = flux_density(verified.error_pointwise * verified.main_field_T)
+        assert f"the vector B is off by {off}" in said
+        own = flux_density(verified.error_fourier * verified.main_field_T)
+        assert (f"is off by {own} at most: over a circle" in said) == coefficient
+
+
+def test_the_mean_of_a_multipole_is_zero_and_that_of_its_size_is_not(session):
+    """A quadrupole of twelve sectors: on its circle B turns twice."""
+    study = parse_study(changed(DIPOLE, array__multipole_order=2, array__recoil_permeability=1.0,
+                                array__blocks_per_ring=12))
+    rows = {row["B"]: row for row in solution.field_table(hf.solve(build_magnet(study), session))}
+    assert rows["mean of the vector B"]["|B|"] == "0\u00a0mT"
+    assert float(rows["mean of |B|"]["|B|"].split()[0]) > 100
+    assert rows["mean of |B|"]["Bx"] == ""
+
+
+def test_a_field_that_cancels_has_no_direction(given):
+    """Sixteen cubes as a quadrupole: |B| has a mean, the vector B has none."""
+    four = parse_study(changed(MAGNET, array__multipole_order=2))
+    for study, cancels in ((four, True), (given.study, False)):
+        found = hf.homogeneity(build_magnet(study), given.session, degrees=2)
+        row, = homogeneity.homogeneity_rows(found.by_name)
+        assert (row["direction of the mean B"] == "none: it cancels") == cancels
+        assert float(row["mean of |B|"].split("\u00a0")[0]) > 1
+        said = homogeneity.answer(found)
+        assert said.trust.startswith("Only" if cancels else "Yes")
+        assert ("multipoles" in said.command) == cancels
+        assert bool(homogeneity.harmonic_rows(found)) != cancels
+
+
 def of_multipoles(given):
     tables = hf.multipoles(given.magnet, given.session).tables
     known = [magnets["prior"] for _, magnets in tables]
@@ -120,6 +164,31 @@ def of_sort(given):
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     size = np.sqrt(np.mean(found.best.sizes**2))
     return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv"]
+
+
+@pytest.mark.filterwarnings("ignore:Every block of study")
+@pytest.mark.parametrize(("rings", "types", "said"), [
+    (2, {"a": list(range(1, 9))}, "random orders"), (2, None, "It does not matter"),
+    (1, None, "there is no choice")])
+def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings, types, said):
+    """A slot's own type lets a block change its ring alone, which the field along z does not see.
+
+    Random orders are in the units of the sorted one: where all are alike they are equal to it.
+    """
+    study = parse_study(changed(MAGNET, array__rings=rings, prior={
+        "magnitude_sd": 0.05, "direction_sd_deg": 1.0} | ({"types": types} if types else {})))
+    found = hf.sort(build_magnet(study), simulate_campaign(study, 3).blocks, given.session)
+    sorting.write_sorted(found, None, tmp_path)
+    text = (tmp_path / "sort.html").read_text()
+    assert said in text
+    assert ("as placed in the table" in text) == (said == "random orders")
+    assert ("every order" in str(sorting.order_table(found))) != (said == "random orders")
+    if said == "random orders":
+        assert found.best.rms_of_mean < found.random.min()
+    else:
+        # 4e-7 were measured: the integral along z ends somewhere; a main multipole that is that
+        # of blocks of median strength was 2e-3 off
+        np.testing.assert_allclose(found.random, found.best.rms_of_mean, rtol=1e-5)
 
 
 def of_shim(given):
@@ -194,7 +263,7 @@ def answers_in(code):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "write_page"]
 
 
-def test_page_and_terminal_say_the_same(tmp_path, capsys):
+def test_page_and_terminal_say_the_same(tmp_path, capsys, monkeypatch):
     """With the paths of the files in the command."""
     study = ROOT / "studies" / "quadrupole" / "study.toml"
     blocks = study.parent / "campaign" / "blocks.csv"
@@ -204,6 +273,15 @@ def test_page_and_terminal_say_the_same(tmp_path, capsys):
         assert shown[part] in said
     assert f"infer {study} --measurements MAP --blocks {blocks}" in said
     assert "12 measured blocks" in shown["said"]
+    # the page names them from the current folder, and without one that is running, none
+    monkeypatch.chdir(ROOT)
+    assert main(["prior", str(study), str(blocks), "-o", str(tmp_path)]) == 0
+    named = command_of(tmp_path / "prior.html")
+    assert named == (f"halbach-fe infer {study.relative_to(ROOT)} --measurements MAP --blocks "
+                     f"{blocks.relative_to(ROOT)} -o DIR")
+    assert json.loads((tmp_path / "page.json").read_text())["answer"]["command"] == named
+    assert Answer("?", "", "", "", "halbach-fe solve STUDY -o DIR").with_known_paths().command == (
+        "halbach-fe solve STUDY -o DIR")
     assert json.loads((tmp_path / "prior.json").read_text())["blocks"] == 12
 
 
@@ -236,6 +314,17 @@ def test_the_command_has_the_files_of_the_user(tmp_path):
     found = answer.with_paths({"STUDY": tmp_path / "my study.toml", "DIR": "a b", "POSTERIOR": "p"})
     assert shlex.split(found.command)[2:] == [
         str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
+
+
+def test_paths_that_are_known_are_those_of_the_command_that_runs():
+    """A page names its own folder, and its record for machines leaves it open."""
+    answer = Answer("?", "", "", "", "halbach-fe shim STUDY --posterior DIR/p.h5 -o DIR")
+    with known_paths({"STUDY": "a.toml", "MAP": None, "DIR": "out"}):
+        assert answer.with_known_paths().command == (
+            "halbach-fe shim a.toml --posterior out/p.h5 -o DIR")
+        assert answer.with_known_paths(folder=False).command == (
+            "halbach-fe shim a.toml --posterior DIR/p.h5 -o DIR")
+    assert answer.with_known_paths() == answer  # the control: the command has ended
 
 
 def test_commands_name_the_posterior_that_was_read(given):
@@ -284,8 +373,44 @@ def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     assert "plan.points" not in plan.answer(hf.plan(given.magnet, given.session, points=6)).step
 
 
+def test_blocks_that_share_the_largest_force_are_named(given):
+    """By symmetry; a force that is 1 % less is no tie."""
+    found = hf.forces(given.magnet, given.session)
+    size = found.in_place.magnitude
+    equal = np.flatnonzero(size >= 0.999 * size.max())
+    assert 1 < len(equal) < len(size)
+    said = forces.answer(found).said
+    assert f"as large on {len(equal) - 1} other" in said
+    for number in equal[equal != np.argmax(size)]:
+        block = found.blocks[number]
+        row, = re.findall(rf"ring {block.ring}, slots? ([\d, and]+)",
+                          said.split("as large")[1].split(" While ")[0])
+        assert str(block.slot) in re.findall(r"\d+", row)
+    vectors = found.in_place.force_N.copy()
+    vectors[np.argmax(size)] *= 1.01
+    alone = replace(found, in_place=replace(found.in_place, force_N=vectors))
+    assert "as large on" not in forces.answer(alone).said
+    figure = forces.forces_figure(found)
+    numbers = {text.get_text() for text in figure.axes[0].texts}
+    assert numbers == {str(slot) for slot in range(1, 9)}
+
+
 def test_means_that_are_zero_but_for_the_mesh_are_zero(given):
     found = hf.tolerance(given.magnet, given.session, draws=50)
     rows = {row["n"]: row["|c_n| of the mean"] for row in tolerance.quantile_table(found)}
     assert rows["2"] == "0"  # forbidden by the symmetry
     assert float(rows["9"]) > 1  # which eight cubes do make
+
+
+@pytest.mark.parametrize("scattered", [True, False])
+def test_scattered_points_have_maps_and_no_profile(given, scattered):
+    """40 points on a sphere; the control: 12 circles of 8 points, which are lines along z too."""
+    turn = np.pi * (1 + 5**0.5) * (np.arange(40) + 0.5)
+    height = 1 - 2 * (np.arange(40) + 0.5) / 40
+    across = np.sqrt(1 - height**2)
+    points = 0.03 * np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    positions = {"kind": "points", "points_m": points.tolist()} if scattered else {
+        **MAGNET["observation"]["positions"], "count": 12}
+    study = parse_study(changed(MAGNET, observation__positions=positions))
+    update = hf.infer(build_magnet(study), simulate_campaign(study, 3).readings, given.session)
+    assert diagnosis_figures.is_scattered(update) == scattered

@@ -377,6 +377,18 @@ def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
     last = found_in(home, "field", "shimmed", "diagnosis").answer
     assert last.step.startswith("Repeat shimmed with diagnosis/study.diagnosed.toml")
     assert not last.sound
+    assert last.trust.startswith(("No", "Only"))
+
+
+def test_a_diagnosis_that_is_not_sound_says_itself_what_to_do(home):
+    """Of an unknown cause: its study is not one to repeat anything with."""
+    results(home / "shimmed", "shim", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.shimmed.toml"], answer=Answer(
+                "Which?", "Some.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False))
+    results(home / "diagnosis", "diagnose", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.diagnosed.toml"], answer=Answer(
+                "What?", "Unknown.", "No.", "Measure elsewhere.", "halbach-fe plan STUDY", False))
+    assert found_in(home, "field", "shimmed", "diagnosis").answer.step == "Measure elsewhere."
 
 
 def test_commands_name_the_folder_that_holds_their_file(home):

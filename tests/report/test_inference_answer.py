@@ -9,6 +9,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.report.inference import score_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -59,3 +60,20 @@ def test_another_magnet_is_to_be_diagnosed(campaign, session):
     assert "halbach-fe diagnose" in said.command
     assert not said.sound
     assert "agree:" not in said.trust
+
+
+def test_the_table_has_the_chi2_of_the_answer(campaign, session):
+    """In the row of all training readings, whether there are several noise regions or one."""
+    regions = [{"name": name, "sigma_T": cuboids.NOISE_T} | limits for name, limits in (
+        ("end", {"z_max_m": -0.05}), ("rest", {"z_min_m": -0.05}))]
+    for noise, count in (({}, 1), ({"noise__regions": regions}, 3)):
+        result, said = answered(campaign, session, **noise)
+        *others, last = score_table(result)
+        assert len(others) == count - 1
+        value = last["chi²/reading, before"]
+        assert f"before the update is {value}," in said.trust
+        # the control: the mean square of the residuals after the update is less
+        left = result.standardized(result.prediction_posterior)[~result.held_out]
+        assert f"{np.mean(left**2):.3g}" != value
+        assert last["readings"] == f"{len(left)}\u00a0training"
+        assert last["chi²/reading, after"] == "–"

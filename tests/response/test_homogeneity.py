@@ -231,7 +231,7 @@ def test_command(tmp_path, capsys):
     path.write_text(TEXT)
     assert main(["homogeneity", str(path), "-o", str(tmp_path / "out"), "--sphere-m", "0.006",
                  "--degrees", "3"]) == 0
-    assert "The mean field is" in capsys.readouterr().err
+    assert "The mean of |B| is" in capsys.readouterr().err
     summary = json.loads((tmp_path / "out" / "homogeneity.json").read_text())
     assert len(summary["prior"]["harmonics"]) == 15
     assert summary["prior"]["rms_ppm"] < summary["prior"]["peak_to_peak_ppm"]

@@ -12,7 +12,7 @@ from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.verification import answer, write_verification
-from halbach_fe.report.words import decimals, flux_density, ppm
+from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.mesh_convergence import observed_order, refined, verify
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
@@ -115,7 +115,7 @@ def test_verify_from_the_command_line(tmp_path, capsys):
     error, main_field = stored["error_pointwise"], stored["main_field_T"]
     said = f"{flux_density(error * main_field)} at most"
     assert said in text
-    assert f"That is {ppm(1e6 * error)} ppm of the largest field" in text
+    assert f"That is {relative(error)} of the largest field" in text
     assert f"{decimals(error * main_field / 1e-4, 2)} times the smallest noise" in text
     assert said in shown.err
     # the largest change of each column is the table's

@@ -56,3 +56,9 @@ def answer_of(path):
     found = {name: html.unescape(part) for name, part in parts.groupdict().items()}
     assert all(len(part) > 10 for part in found.values())
     return found
+
+
+def command_of(path):
+    """The command of a page's next step, as it is copied from there."""
+    code = re.search(r"<code>(.*?)</code>", path.read_text(encoding="utf-8"), re.DOTALL)
+    return " ".join(html.unescape(re.sub("<.*?>", "", code[1])).split())

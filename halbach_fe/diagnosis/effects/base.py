@@ -163,6 +163,14 @@ class Effect(ABC):
         """
         return self.places(study)
 
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        """Return the places whose signatures are computed first, by default all of ``places``.
+
+        Signatures at the other places must resemble these, after the blocks have absorbed their
+        part, and take long to compute: they are computed only if one of these is noticed.
+        """
+        return places
+
     @abstractmethod
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters."""

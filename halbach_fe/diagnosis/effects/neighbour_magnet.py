@@ -43,6 +43,15 @@ class NeighbourMagnetEffect(Effect):
         length = 2 * build_magnet(study).array_half_length
         return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
 
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        """See `Effect.representatives`.
+
+        Near the ends of the magnet all neighbours on one side have similar fields: the middle one
+        has a correlation of 0.7 or more with every other one.
+        """
+        sides = ([place for place in places if side * place.at_m[0] > 0] for side in (-1, 1))
+        return [side[len(side) // 2] for side in sides if side]
+
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         return neighbour_field(nominal.magnet, Neighbour(z_m=place.at_m[0]), nominal.points)[None]
