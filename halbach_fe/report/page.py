@@ -17,9 +17,11 @@ import numpy as np
 import tomlkit
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
@@ -36,6 +38,9 @@ IRON = "#56B4E9"
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
+
+UNITS = "%|ppm|[mµ]?T|[mµ]?m|mrad|kA/m|N|k?g|°C|kelvin"
+"""Regular expression of what stays beside the number before it."""
 
 SMALL = SMALLEST_PT
 """Size of the small texts of figures in points; a figure has no smaller ones."""
@@ -128,7 +133,13 @@ def _templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["is_nonlinear"] = is_nonlinear
+    environment.filters["units_kept"] = units_kept
     return environment
+
+
+def units_kept(text: str) -> str:
+    """Return a text in which no line ends between a number and its unit."""
+    return re.sub(rf"(?<=\d) (?=(?:{UNITS})(?!\w))", "\u00a0", text)
 
 
 def _without_empty_cells(value: Any) -> Any:
@@ -153,6 +164,12 @@ def stacked_axes(
     for axis in axes[:, 0]:
         axis.grid(alpha=0.3)
     return figure, list(axes[:, 0])
+
+
+def label_logarithmic(axis: Axis) -> None:
+    """Label a logarithmic axis with numbers, such as 300, in place of powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(LogFormatter())
 
 
 def begin_at_zero(axis: Axes) -> None:

@@ -236,6 +236,8 @@ def test_command(tmp_path, capsys):
     assert len(summary["prior"]["harmonics"]) == 15
     assert summary["prior"]["rms_ppm"] < summary["prior"]["peak_to_peak_ppm"]
     page = (tmp_path / "out" / "homogeneity.html").read_text()
-    assert "ppm rms" in page
+    assert "ppm\u00a0rms" in page or "ppm rms" in page
+    assert "<thead><tr><th>magnet</th><th>prior</th></tr></thead>" in page  # a column per magnet
+    assert "<tr><th>direction of the mean B</th><td" in page
     assert "in a sphere of 12 mm diameter?" in page
     assert (tmp_path / "out" / "harmonics.csv").read_text().count("prior") == 15
