@@ -138,8 +138,8 @@ def _templates() -> jinja2.Environment:
 
 
 def units_kept(text: str) -> str:
-    """Return a text in which no line ends between a number and its unit."""
-    return re.sub(rf"(?<=\d) (?=(?:{UNITS})(?!\w))", "\u00a0", text)
+    """Return a text in which no line ends between a number and its unit or error."""
+    return re.sub(rf"(?<=\d) (?=(?:{UNITS})(?!\w))|(?<=\d) (?=± \d)|(?<=±) (?=\d)", "\u00a0", text)
 
 
 def _without_empty_cells(value: Any) -> Any:
@@ -193,8 +193,11 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
-def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
-    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm."""
+def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
+    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
+
+    ``colour`` is that of the blocks.
+    """
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     for block in magnet.blocks:
@@ -203,12 +206,12 @@ def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
             continue
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
         outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
-        axis.plot(*outline.T, color="#777777", lw=0.6)
+        axis.plot(*outline.T, color=colour, lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
         length = 0.3 * float(np.ptp(outline, axis=0).min())
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
-                      arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})
+                      arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
     for body in magnet.iron:
         if body.outline is not None:
             axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])

@@ -222,7 +222,8 @@ def _pattern_figure(plan: MeasurementPlan) -> Figure:
               label="positions of the study")
     axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":")
     axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
-             ylim=(0, None))
+             yscale="log")
+    label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
     axis.legend()
     return figure

@@ -137,7 +137,7 @@ def plan_rows(plans: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
         "where": name, "positions": str(plan["points"]),
         f"positions that tell as much as the {plan['study_points']} of the circle":
             str(plan["points_with_the_study_information"] or f"more than {plan['points']}"),
-        "uncertainty, of that of as many on the circle":
+        "uncertainty beside as many on the circle":
             fraction(float(plan["mean_sd_over_study_with_as_many_points"]))}
         for name, plan in plans.items()]
 
@@ -150,9 +150,9 @@ def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
     change_mT = 1e3 * 0.01 * float(np.linalg.norm(block.magnetization)) * found.size
     largest = float(np.nanmax(change_mT))
     shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, change_mT, shading="nearest",
-                            norm=LogNorm(largest * SMALLEST_SHOWN, largest), cmap="YlGnBu",
+                            norm=LogNorm(largest * SMALLEST_SHOWN, largest), cmap="cividis",
                             rasterized=True)
-    draw_cross_section(axis, magnet)
+    draw_cross_section(axis, magnet, "black")
     outline = np.vstack([edge.at(np.linspace(0, 1, 9))[0] for edge in block.outline])
     axis.plot(*1e3 * block.from_frame(np.column_stack([outline, 0 * outline[:, 0]])).T[:2],
               color=THIRD, lw=2)
@@ -187,7 +187,8 @@ def _uncertainty_of_plans_figure(found: Sensitivity) -> Figure:
         axis.plot(counts, 100 * np.exp(-gain / found.unknowns), color=colour, label=name,
                   ls="--" if colour == PRIOR else "-", zorder=3 if colour == PRIOR else 2)
     axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
-             ylim=(0, None))
+             yscale="log")
+    label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
     axis.legend()
     return figure

@@ -80,8 +80,10 @@ def test_numbers_stay_on_one_line(opened, tmp_path, width_px):
 
 
 @pytest.mark.parametrize(("text", "kept"), [
-    ("38 774 ppm rms", "38 774\u00a0ppm rms"), ("by 0.2 %, at 20 °C", "by 0.2\u00a0%, at 20\u00a0°C"),
-    ("5 mm, 3 mrad", "5\u00a0mm, 3\u00a0mrad"), ("of 3 maps", "of 3 maps"),
+    ("38 774 ppm rms", "38 774\u00a0ppm rms"),
+    ("by 0.2 %, at 20 °C", "by 0.2\u00a0%, at 20\u00a0°C"),
+    ("200.03 ± 0.16 %", "200.03\u00a0±\u00a00.16\u00a0%"), ("of 3 maps", "of 3 maps"),
+    ("5 mm, 3 mrad", "5\u00a0mm, 3\u00a0mrad"),
     ("8 Tables", "8 Tables"), ("ring 1, slot 2", "ring 1, slot 2")])
 def test_units_stay_beside_their_number(text, kept):
     assert units_kept(text) == kept
