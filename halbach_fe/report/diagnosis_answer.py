@@ -39,8 +39,10 @@ def answer(diagnosis: Diagnosis) -> Answer:
     sound = not (diagnosis.unknown or diagnosis.suspected or diagnosis.solver_error or _fails(
         diagnosis))
     if diagnosis.identified and doubts:
-        verdict = ("Yes" if sound and len(doubts) == 1  # only how well the model fits now
-                   else "No" if diagnosis.unknown or _fails(diagnosis) else "Only in part")
+        # besides how well the model fits now, and error bars that are too wide
+        doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
+        wrong = diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
+        verdict = "No" if wrong else "Only in part" if doubtful or not sound else "Yes"
         doubts[0] = f"{verdict}. {doubts[0]}"
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
