@@ -8,6 +8,7 @@ wrong. Every case is kept in ``results/campaign-kinds``; an interrupted run goes
     python -m benchmarks.campaign_kinds --part 1 2 &
     python -m benchmarks.campaign_kinds --part 2 2
     python -m benchmarks.run campaign_kinds
+    python -m benchmarks.run campaign_knee
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -174,13 +175,24 @@ def two_maps(generator: Generator, session: Session) -> Outcome:
 
 
 def knee(generator: Generator, session: Session) -> Outcome:
-    """Name the knee of blocks whose corners are demagnetized, with the whole catalogue."""
-    study = parse_study(DOCUMENT)
+    """Name the knee of blocks whose corners are demagnetized, with the whole catalogue, and find
+    its coercivity and squareness.
+    """
+    study = parse_study(DOCUMENT).with_(array__rings=1)
     campaign = simulate_campaign(study, int(generator.integers(2**31)),
                                  hide=[(EFFECTS["knee"], None)])
     found = diagnose(study, campaign.readings, session, campaign.blocks)
     named = [one.hypothesis.effect.name for one in found.identified]
-    return {"right": named == ["knee"], "named": named, "truth": campaign.truth["effects"],
+    effects: Any = campaign.truth["effects"]
+    true = {each["name"]: each["value"] for each in effects[0]["parameters"]}
+    errors: dict[str, float] = {}
+    for one in found.identified:
+        if one.hypothesis.effect.name == "knee":
+            for name, value, sd in zip(("coercivity", "squareness"), one.reported[0][1:],
+                                       one.reported[1][1:], strict=True):
+                errors[name] = (value - true[name]) / sd
+    return {"right": named == ["knee"] and max(map(abs, errors.values())) < WITHIN,
+            "named": named, "truth": true, "errors_in_sd": errors,
             "unknown": found.unknown and found.unknown.kind,
             "found": [[list(row) for row in one.reported] for one in found.identified]}
 
@@ -201,9 +213,10 @@ KINDS: dict[str, tuple[Callable[[Generator, Session], Outcome], int]] = {
 """Each kind and its number of cases."""
 
 
-def run_cases(part: int = 1, parts: int = 1, folder: Path = FOLDER) -> None:
+def run_cases(part: int = 1, parts: int = 1, folder: Path = FOLDER,
+              kinds: Sequence[str] = tuple(KINDS)) -> None:
     """Run the cases of a part that are not there yet."""
-    chosen = [(kind, number) for kind, (_, count) in KINDS.items() for number in range(count)]
+    chosen = [(kind, number) for kind in kinds for number in range(KINDS[kind][1])]
     for kind, number in chosen[part - 1::parts]:
         path = folder / f"{kind}-{number:02d}.json"
         if path.exists():
@@ -215,14 +228,24 @@ def run_cases(part: int = 1, parts: int = 1, folder: Path = FOLDER) -> None:
         common.say(f"{kind} {number}: {found}")
 
 
-def run(note: Note, folder: Path = FOLDER) -> None:
-    """Note the rate of each kind."""
-    run_cases(folder=folder)
-    for kind, (_, count) in KINDS.items():
+def run(note: Note, folder: Path = FOLDER, kinds: Sequence[str] = tuple(KINDS)) -> None:
+    """Note the rate of each kind, and how far the parameters of a knee are from the truth."""
+    run_cases(folder=folder, kinds=kinds)
+    for kind in kinds:
+        count = KINDS[kind][1]
         found = [json.loads((folder / f"{kind}-{number:02d}.json").read_text(encoding="utf-8"))
                  for number in range(count)]
         note(f"diagnosis.kind_{kind}_rate", float(np.mean([one["right"] for one in found])),
              "ratio", f"{count} sealed campaigns of this kind")
+        if kind == "knee":
+            errors = [each for one in found for each in one["errors_in_sd"].values()]
+            note("diagnosis.kind_knee_z_rms", float(np.sqrt(np.mean(np.square(errors)))), "sd",
+                 f"{len(errors)} errors of coercivities and squarenesses; 1 if the bars are right")
+
+
+def run_knee(note: Note) -> None:
+    """Note the figures of the knee alone."""
+    run(note, kinds=("knee",))
 
 
 def main() -> None:

@@ -40,10 +40,11 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
          "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
-         "campaign_kinds": campaign_kinds.run, "real": real.emphatic, "real_mri": real.mri,
-         "faser": real.faser, "design": design.run, "mri": mri.run, "speed": speed.run}
+         "campaign_kinds": campaign_kinds.run, "campaign_knee": campaign_kinds.run_knee,
+         "real": real.emphatic, "real_mri": real.mri, "faser": real.faser,
+         "design": design.run, "mri": mri.run, "speed": speed.run}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
-         "campaign_kinds", "real", "real_mri", "faser",
+         "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
          "design", "mri", "speed")
 """Parts that are measured only when they are named: they take long."""
 

@@ -37,6 +37,9 @@ SAME_TURN = 0.1
 """Angle in rad up to which a map is turned like another on its stage: more than the error of the
 search, and far less than between poses that a symmetric magnet makes equal."""
 
+EQUAL_LOG_EVIDENCE = 0.1
+"""Difference in log evidence up to which poses are equally probable: their odds are 1.1 : 1."""
+
 
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
@@ -116,7 +119,20 @@ def register(
         own.sort(key=lambda each: -each.log_evidence)
         found += [each for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]
-    return sorted(found, key=lambda each: -each.log_evidence)
+    return least_turned_first(found)
+
+
+def least_turned_first(found: Sequence[Registration]) -> list[Registration]:
+    """Return poses by their evidence, the likeliest first.
+
+    Of the likeliest ones, which a symmetric magnet makes equal, the one whose axes are turned least
+    from those of the map is first: most people lay a map as they draw it.
+    """
+    ordered = sorted(found, key=lambda each: -each.log_evidence)
+    equal = [each for each in ordered
+             if each.log_evidence > ordered[0].log_evidence - EQUAL_LOG_EVIDENCE]
+    return sorted(equal, key=lambda each: float(np.linalg.norm(
+        each.instrument.rotation_rad))) + ordered[len(equal):]
 
 
 def _on_stage(starts: Sequence[Floats], stage: StagePose) -> list[Floats]:

@@ -62,6 +62,11 @@ def homogeneity_quantiles(found: HomogeneityTolerance) -> list[dict[str, str]]:
             [f"{1e3 * value:.5g}" for value in quantiles(found.mean_T)])]
 
 
+OF_THE_DESIGN = 0.9
+"""Share of the deviation from which on it is the design's, and tolerances hardly add to it. (They
+add by squares: a tenth of it is half of the deviation.)"""
+
+
 def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     """Say how homogeneous the magnets are, how many meet the limit, and what next."""
     (half, most), (wide, widest) = (np.quantile(values, (0.5, 0.95)) for values in (
@@ -79,6 +84,9 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     enough = share is not None and share >= ENOUGH
     step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
+            ("That is nearly all of the design, whose blocks cannot be sorted away: look for a "
+             "better one first.", "halbach-fe design STUDY -o DIR")
+            if found.ordered.rms_ppm > OF_THE_DESIGN * half else
             ("Sort measured blocks into their slots before assembly: that is better than chance.",
              "halbach-fe sort STUDY BLOCKS -o DIR"))
     text, small = solver_error_text(found.model, half)

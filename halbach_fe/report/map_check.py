@@ -47,9 +47,11 @@ def answer(check: MapCheck) -> Answer:
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
     noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
+    keys = "that belongs into the study as sigma_T"
     if check.position_noise_m * 1e6 >= 1:
         noise += (", and where the field is steep, readings scatter like positions that are "
                   f"{check.position_noise_m * 1e6:.0f} µm off")
+        keys = "these belong into the study as sigma_T and position_sd_m"
     trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. A map "
              "cannot show everything, though: see below.")
     if _violates(check):
@@ -71,7 +73,7 @@ def answer(check: MapCheck) -> Answer:
             "these readings are wrong. An update of the magnet tells which.")
     used = "DIR/oriented_map.csv" if better else "MAP"
     return Answer(
-        question, f"{verdict(check)} {noise}: that belongs into the study as sigma_T.", trust,
+        question, f"{verdict(check)} {noise}: {keys}.", trust,
         "Update the magnet with " + ("oriented_map.csv, which has the right axes and no broken "
                                      "rows." if better else "this map."),
         f"halbach-fe infer STUDY --measurements {used} -o DIR")

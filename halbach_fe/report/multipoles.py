@@ -169,8 +169,9 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     sd = float(spread[worst])
     where = "" if alone else (
         "Of the field integrated along z, " if model.integrated else f"On {place_of(model)}, ")
-    start = f"{where}the largest unwanted multipole is "
-    text = (f"{start[0].upper()}{start[1:]}of order {known.orders[worst]} with "
+    start = f"{where}the largest unwanted multipole " + (
+        "is that" if known.sizes[worst] > sd else "is not known: it may be that")
+    text = (f"{start[0].upper()}{start[1:]} of order {known.orders[worst]} with "
             f"{with_error(float(known.sizes[worst]), sd)} units of 1e-4; the main one is "
             f"{main_in_words(model, known)}.")
     if limit is not None:

@@ -86,9 +86,9 @@ def answer(plan: MeasurementPlan) -> Answer:
         said += (f"They leave {fraction(left)} of the blocks' prior uncertainty, as many of the "
                  f"study's positions {fraction(of_study)}. ")
     else:
-        said += (f"The deviation of |B| in {plan.deviation.region.text} is then known to "
-                 f"{ppm(plan.deviation.planned[-1])} ppm rms, after as many of the study's "
-                 f"positions to {ppm(_of_study(plan))}, and before to "
+        said += (f"At a point of {plan.deviation.region.text}, the deviation of |B| from its mean "
+                 f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms, after as many of "
+                 f"the study's positions to {ppm(_of_study(plan))}, and before to "
                  f"{ppm(plan.deviation.prior)}. ")
     everything = points == len(plan.candidates)
     if everything:

@@ -6,6 +6,11 @@ the knee, where 0.9 is left, at ``squareness`` times the coercivity h_c. The los
 that the other cells are in, so that a damped iteration repeats both until nothing changes. magpylib
 computes the fields, which are those of blocks in vacuum: losses of permeable blocks are not
 simulated.
+
+What is lost in layers thinner than a cell is missed, and the error falls with the square of the
+size of the cells. Losses in cells of two sizes are therefore extrapolated to none (Richardson), as
+the sum of those in the smaller cells, times more than 1, and in the larger ones, times a negative
+number.
 """
 
 from __future__ import annotations
@@ -21,9 +26,13 @@ from halbach_fe.synthetic.magpylib_field import WHOLE, piece_field, vacuum_field
 from halbach_fe.synthetic.shapes import CylinderBody, Fractions, PrismBody, SectorBody, Shape
 from halbach_fe.synthetic.true_magnet import Body, LostCell, TrueMagnet, vector
 
-ALONG_SIDE, FEW_BLOCKS, ALONG_SIDE_OF_MANY = 4, 24, 3
-"""Number of cells along each side of a block, for magnets of few and of more blocks. The time grows
-with the square of all cells."""
+ALONG_SIDE, FEW_BLOCKS, ALONG_SIDE_OF_MANY = (4, 6), 24, (3, 4)
+"""Numbers of cells along each side of a block from which losses are extrapolated, for magnets of
+few and of more blocks. The time grows with the square of all cells.
+
+In a ring of 12 cuboids the field of such losses differs by 1.5 % from that by 6 and 8 cells, and
+that of 6 cells alone by 14 %.
+"""
 
 TOLERANCE, MAX_STEPS = 1e-7, 5000
 """Largest change of the part that a cell keeps, which ends the iteration, and the largest number of
@@ -51,7 +60,7 @@ class _Cell:
 
 
 def with_knee_losses(magnet: TrueMagnet, coercivity_T: float, squareness: float) -> TrueMagnet:
-    """Return the magnet with the losses of its blocks.
+    """Return the magnet with the losses of its blocks, extrapolated from cells of two sizes.
 
     ``coercivity_T`` is mu_0 H_cJ in T.
 
@@ -60,9 +69,28 @@ def with_knee_losses(magnet: TrueMagnet, coercivity_T: float, squareness: float)
     CheckFailedError
         If the iteration does not come to rest.
     """
+    count = sum(bool(np.any(body.remanence)) for body in magnet.bodies)
+    fewer, more = ALONG_SIDE if count <= FEW_BLOCKS else ALONG_SIDE_OF_MANY
+    beyond = 1 / ((more / fewer)**2 - 1)
+    return replace(magnet, losses=(*magnet.losses, *(
+        cell.lost(factor * part)
+        for along_side, factor in ((more, 1 + beyond), (fewer, -beyond))
+        for cell, part in losses_in_cells(magnet, coercivity_T, squareness, along_side)
+        if part > NEGLIGIBLE)))
+
+
+def losses_in_cells(
+    magnet: TrueMagnet, coercivity_T: float, squareness: float, along_side: int
+) -> list[tuple[_Cell, float]]:
+    """Return all cells, ``along_side`` on each side of a block, and the part that each has lost.
+
+    Raises
+    ------
+    CheckFailedError
+        If the iteration does not come to rest.
+    """
     bodies = [body for body in magnet.bodies if np.any(body.remanence)]
-    count = ALONG_SIDE if len(bodies) <= FEW_BLOCKS else ALONG_SIDE_OF_MANY
-    cells = [cell for body in bodies for cell in _cells(body, count)]
+    cells = [cell for body in bodies for cell in _cells(body, along_side)]
     middles = np.array([cell.middle for cell in cells])
     easy = np.array([cell.body.orientation.apply(cell.body.remanence) for cell in cells])
     strength = np.linalg.norm(easy, axis=1)
@@ -79,9 +107,7 @@ def with_knee_losses(magnet: TrueMagnet, coercivity_T: float, squareness: float)
         change = damping * (now - lost)
         lost = lost + change
         if np.abs(change).max() < TOLERANCE:
-            return replace(magnet, losses=(*magnet.losses, *(
-                cell.lost(float(part)) for cell, part in zip(cells, lost, strict=True)
-                if part > NEGLIGIBLE)))
+            return list(zip(cells, lost.tolist(), strict=True))
     raise CheckFailedError("The losses of the blocks do not come to rest.")
 
 

@@ -259,8 +259,8 @@ def _step_or_length(answers: list[Answer]) -> list[str]:
     array = by_length.study.array
     assert array.ring_length_m is not None
     apart = (by_step.log_evidence - by_length.log_evidence) / np.log(10)
-    return [f"The edges of the field fix the ratio of the magnet's length to the step. Either a "
-            f"step is {1e3 * step:.2f} mm, or the magnet is "
+    return [f"The edges of the field fix the ratio of the magnet's length to the step. If only one "
+            f"of them is not as assumed, either a step is {1e3 * step:.2f} mm, or the magnet is "
             f"{1e3 * array.rings * array.ring_length_m:.0f} mm long; by the stated noise and "
             f"errors of blocks the {'step' if apart > 0 else 'length'} is the likelier by a "
             f"factor of 10^{abs(apart):.0f}."]
@@ -334,7 +334,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_registration(read_study(STUDY), text, data, poses, folder / "registration", {})
         write_inference(best.update, folder / "inferred")
         write_inference_report(best.update, folder / "inferred", published)
-        left = ["A line beside the axis and its step leave chi² of "
+        left = [f"The best answer ({best.hypothesis.name}) leaves chi² of "
                 f"{best.registration.chi2:.2g} per reading that was fitted and "
                 f"{best.registration.held_out_chi2:.2g} per reading that was held out, if a "
                 "position is uncertain by 1 mm."]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import OpenKey
 from halbach_fe.inference.pose_search import coarse_poses, right_angles
-from halbach_fe.inference.registration import axes_of_map, odds, register, turn_from_axes
+from halbach_fe.inference.registration import (
+    EQUAL_LOG_EVIDENCE,
+    axes_of_map,
+    least_turned_first,
+    odds,
+    register,
+    turn_from_axes,
+)
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.report.registration import place_table
 from halbach_fe.solver.session import Session
@@ -210,3 +218,14 @@ def test_turn_from_axes_is_what_remains_beside_right_angles():
     half = Rotation.from_rotvec(small) * Rotation.from_rotvec([np.pi, 0, 0])
     np.testing.assert_allclose(turn_from_axes(Instrument(
         rotation_rad=tuple(half.as_rotvec()))), small, atol=1e-12)
+
+
+def test_of_equal_poses_the_least_turned_one_is_first():
+    def pose(log_evidence, turn):
+        return SimpleNamespace(log_evidence=log_evidence, instrument=Instrument(
+            rotation_rad=tuple(Rotation.from_euler("x", turn, degrees=True).as_rotvec())))
+
+    half, straight, worse = pose(-7.0, 180), pose(-7.0 - EQUAL_LOG_EVIDENCE / 2, 1), pose(-9.0, 0)
+    assert least_turned_first([worse, half, straight]) == [straight, half, worse]
+    # negative control: what the readings tell apart stays in the order of its probability
+    assert least_turned_first([half, worse]) == [half, worse]

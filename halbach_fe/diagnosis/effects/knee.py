@@ -28,7 +28,7 @@ down to that of NdFeB which is 80 K hotter."""
 SQUARENESS, LEAST_SQUARE = 0.85, 0.3
 """Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
 
-SIGNATURE_CELLS, FEWEST_CELLS = 3, 4
+SIGNATURE_CELLS, FEWEST_CELLS = 2, 3
 """Smallest number of cells along the side of a block for the losses of a signature, and of the
 model."""
 

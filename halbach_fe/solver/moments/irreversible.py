@@ -11,10 +11,24 @@ nothing has driven them back since.
 The equations are those of `halbach_fe.solver.moments.solve` with that J in place of a constant
 remanence. Newton's method solves them, each step by GMRES. The operator ``J - p(H(J))`` is
 monotone, since p grows with H and the field of polarized cells opposes them.
+
+Losses lie along the edges of blocks, in layers that are thinner than a cell, and p is steep there.
+That of the mean of h over a cell is too small a loss, and the mean of p at nodes of the cell is too
+large a one if the cell is polarized uniformly: what is lost at one node raises h there. Therefore J
+about a node may differ by d from the mean of its cell, and h is less by `TUBE` times d. The means
+of J make the field that the nodes are in.
+
+In one ring of 12 cuboids with coercivities of 0.63 to 0.73 T and squarenesses of 0.8 and 0.9,
+relative to the field of the losses extrapolated from 6 and 8 cells a side: 3 cells a side leave a
+difference of 0.03 to 0.10 of it, rms, and 4 cells as much. The law of the mean leaves 0.17 to 1.01
+with 3 cells, 0.10 to 0.72 with 4 and 0.03 to 0.22 with 8. What is left is mostly too large a loss,
+which finer cells do not cure: by up to 0.12 of the field near one or two cubes, and by a third of
+the mean loss where that is less than a hundredth of the remanence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +59,14 @@ INNER_DEGREE = 3
 OWN_FIELD = 1 / 3
 """Field of a cell in itself relative to its polarization, for the preconditioner: that of a
 cube."""
+
+
+TUBE = 1 / 2
+"""Field within a long tube that is polarized across, relative to its polarization: such tubes are
+what is lost along the edges."""
+
+BISECTIONS = 40
+"""Steps of the bisection for the part of the remanence at a node, to 1e-12."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +105,24 @@ class KneeLaw:
         """Return the derivative of `kept` in 1/T."""
         return (1 - self.kept(field)**2) / (2 * self.width_T)
 
+    def kept_in_tubes(self, field: Floats, strength: Floats, mean: Floats) -> tuple[Floats, Floats]:
+        """Return the part p that is left where a loss raises the field, and dp / dfield in 1/T.
+
+        They fulfil ``p = kept(field - TUBE (strength p - mean))`` for a remanence ``strength`` and
+        a mean polarization ``mean`` of the surroundings along the easy axis, both in T. Arrays of
+        all arguments are broadcast.
+        """
+        least, most = -np.ones(field.shape), np.ones(field.shape)
+        for _ in range(BISECTIONS):
+            part = (least + most) / 2
+            is_above = part > self.kept(field - TUBE * (strength * part - mean))
+            least, most = np.where(is_above, least, part), np.where(is_above, part, most)
+        slope = self.slope(field - TUBE * (strength * part - mean))
+        return part, slope / (1 + TUBE * strength * slope)
+
 
 def solve_irreversible(
-    system: System, law: KneeLaw, applied: Applied | None = None
+    system: System, law: KneeLaw, applied: Applied | None = None, *, by_mean: bool = False
 ) -> tuple[Moments, Floats]:
     """Return the polarization of blocks that have lost remanence, and the loss.
 
@@ -96,6 +133,8 @@ def solve_irreversible(
     law : KneeLaw
     applied : callable, optional
         mu_0 H of other sources, such as iron.
+    by_mean : bool
+        Whether the loss of a cell is that of the mean field in it, which is too small.
 
     Returns
     -------
@@ -115,43 +154,62 @@ def solve_irreversible(
     outer = np.zeros_like(cells.nodes)
     if applied is not None:
         outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
-    polarization, along, steps = _uniform(system, strength, easy, law, cells.mean(outer))
+
+    def kept(polarization: Floats) -> tuple[Floats, Floats]:
+        """Return p at the nodes (cells, q) and the mean of dp/dh (cells,) in 1/T."""
+        along = np.einsum("nqi,ni->nq", interaction.node_field(polarization) + outer, easy)
+        part, slope = law.kept_in_tubes(
+            along, strength[:, None], np.einsum("ni,ni->n", polarization, easy)[:, None])
+        return part, np.einsum("nq,nq->n", cells.weights, slope)
+
+    def mean_kept(field: Floats, polarization: Floats) -> tuple[Floats, Floats]:
+        """Return the mean of p (cells,) and of dp/dh in the mean field (cells, 3)."""
+        if by_mean:
+            along = np.einsum("ni,ni->n", field, easy)
+            return law.kept(along), law.slope(along)
+        part, slope = kept(polarization)
+        return np.einsum("nq,nq->n", cells.weights, part), slope
+
+    polarization, part, steps = _uniform(system, strength, easy, mean_kept, cells.mean(outer))
     # the polarization about the nodes differs as the field there does; its means stay
     field = interaction.node_field(polarization) + outer
+    at_nodes = law.kept(np.einsum("nqi,ni->nq", field, easy)) if by_mean else kept(polarization)[0]
     by_node = np.einsum("nij,nqj->nqi", chi, field) + (
-        strength[:, None] * law.kept(np.einsum("nqi,ni->nq", field, easy)))[..., None] * (
-        easy[:, None])
+        strength[:, None] * at_nodes)[..., None] * easy[:, None]
     by_node += (polarization - cells.mean(by_node))[:, None]
     return (Moments(interaction, by_node - system.remanence[:, None], system.blocks, steps),
-            np.asarray(strength * (1 - law.kept(along))))
+            np.asarray(strength * (1 - part)))
 
 
 def _uniform(
-    system: System, strength: Floats, easy: Floats, law: KneeLaw, outer: Floats
+    system: System, strength: Floats, easy: Floats,
+    mean_kept: Callable[[Floats, Floats], tuple[Floats, Floats]], outer: Floats
 ) -> tuple[Floats, Floats, int]:
-    """Return polarizations (cells, 3) in T that are uniform in every cell, the mean mu_0 H along
-    the easy axis (cells,) in T, and the number of Newton's steps.
+    """Return the mean polarizations (cells, 3) in T, the mean part (cells,) of the remanence that
+    is left, and the number of Newton's steps.
 
     ``strength`` (cells,) in T and ``easy`` (cells, 3) are amount and direction of the remanence;
-    ``outer`` (cells, 3) in T is the mean of mu_0 H of other sources.
+    ``outer`` (cells, 3) in T is the mean of mu_0 H of other sources. ``mean_kept`` takes the mean
+    field and the polarization, both (cells, 3) in T, and returns that part and its derivative by
+    the field in 1/T.
     """
     interaction, chi = system.interaction, system.susceptibility
     scale = float(strength.max(initial=0.0))
 
-    def residual(polarization: Floats) -> tuple[Floats, Floats]:
-        """Return the residual (cells, 3) in T, and h (cells,) in T."""
+    def residual(polarization: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the residual (cells, 3) in T, the part that is left, and its derivative."""
         field = interaction.mean_field(polarization) + outer
-        along = np.einsum("ni,ni->n", field, easy)
-        return (polarization - (strength * law.kept(along))[:, None] * easy
-                - np.einsum("nij,nj->ni", chi, field)), along
+        part, slope = mean_kept(field, polarization)
+        return (polarization - (strength * part)[:, None] * easy
+                - np.einsum("nij,nj->ni", chi, field)), part, slope
 
     polarization = system.remanence
-    left, along = residual(polarization)
+    left, part, slope = residual(polarization)
     for count in range(MAX_STEPS):
         size = float(np.linalg.norm(left))
         if np.abs(left).max(initial=0.0) <= TOLERANCE * scale:
-            return polarization, along, count
-        tangent = chi + (strength * law.slope(along))[:, None, None] * (
+            return polarization, part, count
+        tangent = chi + (strength * slope)[:, None, None] * (
             easy[:, :, None] * easy[:, None])
 
         def times(vector: Floats, tangent: Floats = tangent) -> Floats:
@@ -171,7 +229,7 @@ def _uniform(
         step = step.reshape(-1, 3)
         for halving in range(MAX_HALVINGS):
             tried = polarization + step / 2**halving
-            left, along = residual(tried)
+            left, part, slope = residual(tried)
             if np.linalg.norm(left) < size:
                 break
         polarization = tried

@@ -53,16 +53,6 @@ nearer than 0.9 radii and 1.0 in 95 %; 0.18 and 0.63 up to 1.2 radii, 0.11 and 0
 0.05 and 0.24 beyond.
 """
 
-SLOW_SHARE = 1.0
-"""The same for irreversible losses, where the coarser cells are one fewer along a side.
-
-The field at the edges of neighbouring blocks has no limit. In one magnet of rings of 12 cuboids,
-relative to losses that magpylib found in 4 cells a side: where these made 3 mT, the changes from 2
-to 3, 4 and 5 cells were 0.58, 0.29 and 0.15 of the losses' field, so that as much is left as the
-last one. Where they made 0.5 mT, the changes up to 6 cells were 0.28, 0.54, 0.41 and 0.28: of
-losses as small as that the bar is too short.
-"""
-
 NEAREST_CELLS = 8
 """Number of nearest centres among which the nearest cell is looked for."""
 
@@ -244,29 +234,21 @@ def solve_moments(
     return System.of(blocks, cells_per_side, divisions).solve(applied)
 
 
-def refinement(blocks: Sequence[MagnetBlock], cells_per_side: int | None = None,
-               slow: bool = False) -> tuple[System, System]:
-    """Return blocks in cells, and in half as many along each side; a single cell, also in two.
-
-    Where convergence is ``slow``, the others are one fewer along each side.
-    """
+def refinement(blocks: Sequence[MagnetBlock],
+               cells_per_side: int | None = None) -> tuple[System, System]:
+    """Return blocks in cells, and in half as many along each side; a single cell, also in two."""
     cells = cells_per_side or CELLS_PER_SIDE
-    fewer = cells - 1 if slow else cells // 2
-    return System.of(blocks, cells), System.of(blocks, fewer if cells > 1 else 2)
+    return System.of(blocks, cells), System.of(blocks, cells // 2 if cells > 1 else 2)
 
 
-def field_with_errors(fine: Moments, coarse: Moments, points: Floats,
-                      slow: bool = False) -> tuple[Floats, Floats]:
+def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:
     """Return the reaction and its error bar, both (n, 3) in T, at points (n, 3) in m.
 
     ``fine`` and ``coarse`` are the solutions of both systems of `refinement`. The bar is
-    share of the length of their difference, see `ERROR_SHARE`, for every component; where
-    convergence is ``slow``, the share is `SLOW_SHARE`.
+    share of the length of their difference, see `ERROR_SHARE`, for every component.
     """
     field, other = fine.reaction(points), coarse.reaction(points)
     change, size = (np.linalg.norm(value, axis=1) for value in (field - other, field))
-    if slow:
-        return field, np.repeat((SLOW_SHARE * change + FLOOR * size)[:, None], 3, axis=1)
     larger = min((fine.cells, coarse.cells), key=len)
     share = np.interp(_distances(larger, points), list(ERROR_SHARE), list(ERROR_SHARE.values()))
     return field, np.repeat((share * change + FLOOR * size)[:, None], 3, axis=1)
