@@ -75,7 +75,7 @@ def test_numbers_stay_on_one_line(opened, tmp_path, width_px):
     lines = dict(zip(names, numbers.evaluate_all(LINES), strict=True))
     assert {name for name, count in lines.items() if count > 1} <= {"direction of the mean B"}
     assert page.evaluate("document.documentElement.scrollWidth") <= width_px
-    page.add_style_tag(content="td.short { white-space: normal; } table { width: 9em; }")
+    page.add_style_tag(content=".short { white-space: normal; } table { width: 9em; }")
     assert max(numbers.evaluate_all(LINES)) > 1  # the control
 
 
