@@ -163,9 +163,10 @@ def _run_campaign(
 def _print(arguments: argparse.Namespace, found: Sequence[Registration], page: Path,
            *of_map: str) -> None:
     """Print what was found about one map, see `halbach_fe.report.registration.answer`."""
-    from halbach_fe.report.registration import answer, pose_table, sentences
+    from halbach_fe.report.registration import answer, place_table, pose_table, sentences
 
     for sentence in sentences(found):
         common.say(sentence)
-    common.print_table(pose_table(found, *of_map[:1]), "Where the map lies in the magnet")
+    common.print_table(pose_table(found, *of_map[:1]), "Poses of the map")
+    common.print_table(place_table(found), "Where the map lies in the magnet")
     common.say_answer(arguments, answer(found, *of_map), page)

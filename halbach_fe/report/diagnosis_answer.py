@@ -38,8 +38,12 @@ def answer(diagnosis: Diagnosis) -> Answer:
     found, doubts = _found(diagnosis), _doubts(diagnosis)
     sound = not (diagnosis.unknown or diagnosis.suspected or diagnosis.solver_error or _fails(
         diagnosis))
-    if sound and diagnosis.identified and len(doubts) == 1:  # only how well the model fits now
-        doubts = [f"Yes. {doubts[0]}"]
+    if diagnosis.identified and doubts:
+        # besides how well the model fits now, and error bars that are too wide
+        doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
+        wrong = diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
+        verdict = "No" if wrong else "Only in part" if doubtful or not sound else "Yes"
+        doubts[0] = f"{verdict}. {doubts[0]}"
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(

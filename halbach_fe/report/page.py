@@ -17,9 +17,11 @@ import numpy as np
 import tomlkit
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
@@ -36,6 +38,9 @@ IRON = "#56B4E9"
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
+
+UNITS = "%|ppm|[mµ]?T|[mµ]?m|mrad|kA/m|N|k?g|°C|kelvin"
+"""Regular expression of what stays beside the number before it."""
 
 SMALL = SMALLEST_PT
 """Size of the small texts of figures in points; a figure has no smaller ones."""
@@ -128,7 +133,13 @@ def _templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["is_nonlinear"] = is_nonlinear
+    environment.filters["units_kept"] = units_kept
     return environment
+
+
+def units_kept(text: str) -> str:
+    """Return a text in which no line ends between a number and its unit or error."""
+    return re.sub(rf"(?<=\d) (?=(?:{UNITS})(?!\w))|(?<=\d) (?=± \d)|(?<=±) (?=\d)", "\u00a0", text)
 
 
 def _without_empty_cells(value: Any) -> Any:
@@ -155,6 +166,12 @@ def stacked_axes(
     return figure, list(axes[:, 0])
 
 
+def label_logarithmic(axis: Axis) -> None:
+    """Label a logarithmic axis with numbers, such as 300, in place of powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(LogFormatter())
+
+
 def begin_at_zero(axis: Axes) -> None:
     """Let the x axis of what is drawn begin at 0, unless that would hide how the values differ."""
     low, high = axis.get_xlim()
@@ -176,8 +193,11 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
-def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
-    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm."""
+def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
+    """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
+
+    ``colour`` is that of the blocks.
+    """
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     for block in magnet.blocks:
@@ -186,12 +206,12 @@ def draw_cross_section(axis: Axes, magnet: Magnet) -> None:
             continue
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
         outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
-        axis.plot(*outline.T, color="#777777", lw=0.6)
+        axis.plot(*outline.T, color=colour, lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
         length = 0.3 * float(np.ptp(outline, axis=0).min())
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
-                      arrowprops={"arrowstyle": "->", "color": "#777777", "lw": 0.8})
+                      arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
     for body in magnet.iron:
         if body.outline is not None:
             axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])

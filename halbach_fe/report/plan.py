@@ -24,6 +24,7 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     draw_cross_section,
+    label_logarithmic,
     own_style,
     save,
     write_page,
@@ -126,8 +127,9 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
             _positions_figure(magnet, plan), "Candidate positions, chosen positions coloured by "
             "the order of choice, and the study's own positions as rings"),
         "plan_information.png": (
-            _expected_information_figure(plan), "Expected information against the number of "
-            "points, for the plan and for evenly spread positions of the study")
+            _pattern_figure(plan), "Uncertainty of all patterns of blocks that remains, in the "
+            "geometric mean, against the number of points, for the plan and for evenly spread "
+            "positions of the study")
         if plan.deviation is None else (
             _deviation_figure(plan), "Uncertainty of the deviation of |B| in the study's region "
             "against the number of points, for the plan and for evenly spread positions of the "
@@ -207,15 +209,21 @@ def _draw_points(
     return shown
 
 
-def _expected_information_figure(plan: MeasurementPlan) -> Figure:
-    """Draw the expected information against the number of points."""
+def _pattern_figure(plan: MeasurementPlan) -> Figure:
+    """Draw the geometric mean over all patterns of blocks of the uncertainty that remains."""
+    def left(gain: Floats) -> Floats:
+        """Return that mean in per cent of the prior's, of information in nats."""
+        return np.asarray(100 * np.exp(-gain / len(plan.parameters)))
+
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
-    axis.plot(range(1, len(plan.gain) + 1), plan.gain, color=POSTERIOR, label="plan")
-    axis.plot(plan.baseline_counts, plan.baseline_gain, color=PRIOR,
+    axis.plot(range(1, len(plan.gain) + 1), left(plan.gain), color=POSTERIOR, label="plan")
+    axis.plot(plan.baseline_counts, left(plan.baseline_gain), color=PRIOR,
               label="positions of the study")
-    axis.axhline(plan.baseline_gain[-1], color=PUBLISHED, lw=0.8, ls=":")
-    axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
+    axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":")
+    axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
+             yscale="log")
+    label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
     axis.legend()
     return figure
@@ -232,6 +240,7 @@ def _deviation_figure(plan: MeasurementPlan) -> Figure:
     axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":")
     axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
              yscale="log")
+    label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
     axis.legend()
     return figure

@@ -129,19 +129,25 @@ def pose_table(
 ) -> list[dict[str, str]]:
     """Return rows of text, one per pose."""
     rows = []
-    for each, probability in zip(found, odds(found), strict=True):
+    for number, (each, probability) in enumerate(zip(found, odds(found), strict=True), 1):
         rows.append({
-            "odds": f"{100 * probability:.3g} %",
+            "pose": str(number), "odds": f"{100 * probability:.3g} %",
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
-            "middle in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.middle_m),
-            "sd in mm": ", ".join(f"{1e3 * value:.3f}" for value in each.translation_sd_m),
-            "rotation from these in mrad": ", ".join(
-                f"{1e3 * value:.2f}" for value in turn_from_axes(each.instrument)),
-            "sd in mrad": ", ".join(f"{1e3 * value:.2f}" for value in each.rotation_sd_rad),
             "nominal" if before == NOMINAL else "before": _rms_in_words(each.nominal_rms_T),
             "updated": _rms_in_words(each.rms_T), "chi²/reading": decimals(each.chi2)})
     return rows
+
+
+def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
+    """Return rows of text, one per pose and axis of the magnet."""
+    return [{"pose": str(number), "axis of the magnet": axis,
+             "middle of the map in mm": with_error(1e3 * middle, 1e3 * middle_sd),
+             "turned about the axis by mrad": with_error(1e3 * turn, 1e3 * turn_sd)}
+            for number, each in enumerate(found, 1)
+            for axis, middle, middle_sd, turn, turn_sd in zip(
+                "xyz", each.middle_m, each.translation_sd_m, turn_from_axes(each.instrument),
+                each.rotation_sd_rad, strict=True)]
 
 
 def probe_table(instrument: Instrument) -> list[dict[str, str]]:
@@ -227,6 +233,7 @@ def _write_page(
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
                provenance, answer=answer(found, before, name),
                found=sentences(found), rows=pose_table(found, before),
+               places=place_table(found),
                name=study.name, probe=probe_table(best.instrument), map=name)
 
 

@@ -23,12 +23,17 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    THIRD,
     draw_cross_section,
+    label_logarithmic,
     own_style,
     save,
     write_page,
 )
 from halbach_fe.report.words import flux_density, fraction
+
+SMALLEST_SHOWN = 1e-4
+"""Smallest change that has a colour of its own, relative to the largest."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class Sensitivity:
         as printed in the paper, which takes the iron's reluctivity at the field of the derivative.
     information : mapping
         Numbers of points, and expected information in nats for each, by name of the plan.
+    unknowns : int
+        Number of components of the magnetizations.
     """
 
     block: int
@@ -65,6 +72,7 @@ class Sensitivity:
     across: Floats
     printed_form: float
     information: Mapping[str, tuple[Ints, Floats]]
+    unknowns: int
 
 
 def answer(found: Sensitivity, plans: Mapping[str, Mapping[str, Any]]) -> Answer:
@@ -109,30 +117,48 @@ def write_sensitivity(
     write_text(folder / "sensitivity.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     pictures = save({
         "derivative.png": (
-            _derivative_figure(magnet, found), "Magnitude of the derivative of B with respect to "
-            f"the magnetization of block {found.block} along its nominal direction, in T per A/m, "
-            "logarithmic scale"),
+            _derivative_figure(magnet, found), f"Change of B if block {found.block} (outlined) has "
+            "1 % more magnetization, on a logarithmic scale: the derivative of B with respect to "
+            "its magnetization, times 1 % of that"),
         "readings.png": (
             _sensitivity_of_readings_figure(found), "Change of B at every reading of the circle "
             "for every block: for 1 % more magnetization, and for a turn by 1 degree"),
         "information.png": (
-            _information_of_plans_figure(found), "Expected information about all magnetizations "
-            "against the number of points"),
+            _uncertainty_of_plans_figure(found), "Uncertainty of all patterns of blocks that "
+            "remains, in the geometric mean, against the number of points"),
     }, folder)
     write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=magnet.study,
-               found=found, plans=plans, answer=answer(found, plans))
+               found=found, rows=plan_rows(plans), answer=answer(found, plans))
+
+
+def plan_rows(plans: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return a row of text per plan."""
+    return [{
+        "where": name, "positions": str(plan["points"]),
+        f"positions that tell as much as the {plan['study_points']} of the circle":
+            str(plan["points_with_the_study_information"] or f"more than {plan['points']}"),
+        "uncertainty beside as many on the circle":
+            fraction(float(plan["mean_sd_over_study_with_as_many_points"]))}
+        for name, plan in plans.items()]
 
 
 def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
-    """Draw the map of the derivative's magnitude, with the blocks."""
+    """Draw by how much 1 % more magnetization of the block changes B, with all blocks."""
     figure = Figure(figsize=(7.4, 6), layout="constrained")
     axis = figure.subplots()
-    largest = float(np.nanmax(found.size))
-    shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, found.size, shading="nearest",
-                            norm=LogNorm(largest * 1e-5, largest), cmap="cividis", rasterized=True)
-    draw_cross_section(axis, magnet)
+    block = next(each for each in magnet.blocks if each.slot == found.block)
+    change_mT = 1e3 * 0.01 * float(np.linalg.norm(block.magnetization)) * found.size
+    largest = float(np.nanmax(change_mT))
+    shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, change_mT, shading="nearest",
+                            norm=LogNorm(largest * SMALLEST_SHOWN, largest), cmap="cividis",
+                            rasterized=True)
+    draw_cross_section(axis, magnet, "black")
+    outline = np.vstack([edge.at(np.linspace(0, 1, 9))[0] for edge in block.outline])
+    axis.plot(*1e3 * block.from_frame(np.column_stack([outline, 0 * outline[:, 0]])).T[:2],
+              color=THIRD, lw=2)
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")
-    figure.colorbar(shown, label="|B'| in T m/A", extend="min")
+    bar = figure.colorbar(shown, label="|change of B| in mT", extend="min")
+    label_logarithmic(bar.ax.yaxis)
     return figure
 
 
@@ -151,16 +177,18 @@ def _sensitivity_of_readings_figure(found: Sensitivity) -> Figure:
     return figure
 
 
-def _information_of_plans_figure(found: Sensitivity) -> Figure:
-    """Draw the expected information of all plans against the number of points."""
+def _uncertainty_of_plans_figure(found: Sensitivity) -> Figure:
+    """Draw the uncertainty that all plans leave against the number of points."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axis = figure.subplots()
     colours = (PRIOR, POSTERIOR, PUBLISHED, IRON)
     for (name, (counts, gain)), colour in zip(found.information.items(), colours, strict=False):
         # dashed and in front, because curves of other plans may lie almost on the first
-        axis.plot(counts, gain, color=colour, label=name,
+        axis.plot(counts, 100 * np.exp(-gain / found.unknowns), color=colour, label=name,
                   ls="--" if colour == PRIOR else "-", zorder=3 if colour == PRIOR else 2)
-    axis.set(xlabel="points", ylabel="expected information in nats", xlim=(0, None), ylim=(0, None))
+    axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
+             yscale="log")
+    label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
     axis.legend()
     return figure

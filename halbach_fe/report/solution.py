@@ -19,6 +19,7 @@ from halbach_fe.report.page import (
     PRIOR,
     SECOND,
     geometry_figure,
+    label_logarithmic,
     own_style,
     save,
     stacked_axes,
@@ -170,6 +171,7 @@ def field_figure(solution: Solution) -> Figure:
     if below:
         others[0].semilogy(below[0], 1e6 * solution.errors, ".", ms=3, color=MEASURED)
         others[0].set(ylabel="error bar in µT", xlabel=below[1])
+        label_logarithmic(others[0].yaxis)
     if not below or fourier:
         top.set_xlabel(label)
     return figure

@@ -200,7 +200,8 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
             + ", normal (left) and skew (right); bars are two standard deviations")} | figures
     write_page(folder / "sort.html", "sort.html.j2", save(figures, folder), found=found,
                study=found.study, answer=answer(found), rows=order_table(found),
-               turned=turn_table(found), title=table_title(found), text=_convention(found))
+               in_a_region=bool(found.fields), turned=turn_table(found), title=table_title(found),
+               text=_convention(found))
 
 
 def _convention(found: SortedBlocks) -> str:

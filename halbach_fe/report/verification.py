@@ -26,6 +26,7 @@ from halbach_fe.report.page import (
     THIRD,
     axis_of_points,
     geometry_figure,
+    label_logarithmic,
     own_style,
     save,
     stacked_axes,
@@ -185,7 +186,7 @@ def _convergence_figure(found: Verification) -> Figure:
                          label=difference.what.replace("_", " "))
     axis.set(xscale="log", yscale="log", xlabel="element size at the magnet in mm",
              ylabel="change of B in ppm of the largest field")
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    label_logarithmic(axis.yaxis)
     axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT, REFINEMENT**2]))
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
@@ -204,6 +205,6 @@ def _change_figure(found: Verification) -> Figure:
         axis.semilogy(place[seen], 1e6 * change[seen], marker, ms=4, color=colour,
                       label=difference.what.replace("_", " "))
     axis.set(xlabel=label, ylabel="|change of B| in µT")
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    label_logarithmic(axis.yaxis)
     figure.legend(loc="outside upper center", ncols=2, fontsize=SMALL)
     return figure

@@ -50,7 +50,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.prediction import PublishedErrors
-from halbach_fe.report.registration import pose_table, write_registration
+from halbach_fe.report.registration import place_table, pose_table, write_registration
 from halbach_fe.report.result_files import write_diagnosis
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import read_study
@@ -361,8 +361,8 @@ def run(arguments: argparse.Namespace) -> int:
               "paper defines them: in its fringe field (index 1-35 and 121-156) and in its "
               "homogeneous field. Odds are by the evidence of the readings that were fitted, with "
               "all blocks integrated out.",
-        columns=column_table(fitted, best.update), poses=pose_table(poses), left=left,
-        further=further, files="profile.json, measured.csv")
+        columns=column_table(fitted, best.update), poses=pose_table(poses),
+        places=place_table(poses), left=left, further=further, files="profile.json, measured.csv")
     for sentence in found + left:
         common.say(sentence)
     common.say(f"Report: {folder / 'profile.html'}")

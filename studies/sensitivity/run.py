@@ -22,7 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.plan import plan_summary, write_plan
-from halbach_fe.report.sensitivity import Sensitivity, write_sensitivity
+from halbach_fe.report.sensitivity import Sensitivity, plan_rows, write_sensitivity
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.gateaux import gateaux_derivative
 from halbach_fe.solver.session import Session
@@ -105,12 +105,8 @@ def run(options: argparse.Namespace) -> int:
     summaries = {name: plan_summary(found) for name, found in plans.items()}
     write_sensitivity(build_magnet(study), Sensitivity(
         BLOCK, axis, axis, size, np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), along,
-        across, error, information), options.output, summaries)
-    first, second = summaries.values()
-    common.print_table([{"what": key} | {name: f"{value:.4g}" if isinstance(value, float)
-                                         else str(value) for name, value in zip(
-                                             summaries, (first[key], second[key]), strict=True)}
-                        for key in first], "Where to measure: plans for the same number of points")
+        across, error, information, model.matrix.shape[1]), options.output, summaries)
+    common.print_table(plan_rows(summaries), "Where to measure")
     common.say(f"Report: {options.output / 'sensitivity.html'}")
     return 0
 

@@ -223,7 +223,7 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert "It would have shown the loss of" in page
     loss = found["limits"]["loss"]  # noise of 3e-5 T, 1 % and 1 deg of the blocks
     assert 0.01 < loss["median"] <= loss["worst"] < 0.5
-    assert "before" not in page.split("<h2>Pictures")[0]
+    assert "before" not in page.split("<body>")[1].split("<h2>Pictures")[0]
 
 
 def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):

@@ -24,6 +24,7 @@ from halbach_fe.inference.registration import (
     turn_from_axes,
 )
 from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.report.registration import place_table
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
@@ -75,6 +76,13 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     probabilities = odds(found)
     assert probabilities.sum() == pytest.approx(1.0)
     assert np.sort(probabilities)[-2] > 0.02
+    rows = place_table(found)
+    assert [(row["pose"], row["axis of the magnet"]) for row in rows] == [
+        (str(number + 1), axis) for number in range(len(found)) for axis in "xyz"]
+    # the middle of the grid along z, and its standard deviation
+    value, sd = rows[2]["middle of the map in mm"].split("\u00a0±\u00a0")
+    assert float(value) == pytest.approx(1e3 * found[0].middle_m[2], abs=float(sd))
+    assert float(sd) == pytest.approx(1e3 * found[0].translation_sd_m[2], rel=0.06)  # 2 digits
 
 
 def test_a_mirrored_magnet_is_refused(magnet, generator, tmp_path):
@@ -180,6 +188,8 @@ def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):
     assert "middle of the map lies at" in capsys.readouterr().err
     page = (tmp_path / "out" / "registration.html").read_text()
     assert "Where does the map lie" in page
+    for column in ("middle of the map in mm", "turned about the axis by mrad"):
+        assert f"<th>{column}</th>" in page
     summary = json.loads((tmp_path / "out" / "registration.json").read_text())
     assert sum(pose["odds"] for pose in summary["poses"]) == pytest.approx(1.0)
     registered = read_study(tmp_path / "out" / "study.registered.toml")

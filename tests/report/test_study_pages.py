@@ -81,7 +81,7 @@ def test_magnetizations_whose_error_bars_are_too_small_are_a_warning(tmp_path, w
     magnetizations.write_magnetizations(magnet, known, truth, tmp_path, "test", "none.json")
     found = answer_of(tmp_path / "magnetizations.html")
     assert found["trust"].startswith("Yes: " if sound else "No: ")
-    assert f"{0.5 * wrong_by:.2g} kA/m" in found["said"]
+    assert f"{0.5 * wrong_by:.2g}\u00a0kA/m" in found["said"]
     # independent errors spread by 1 / sqrt(2 n); common ones, which the mean of few has, by more
     assert magnetizations.expected_spread(after) == pytest.approx((2 * len(nominal)) ** -0.5)
     common = Gaussian(nominal, np.ones((len(nominal), 1)))
@@ -89,16 +89,21 @@ def test_magnetizations_whose_error_bars_are_too_small_are_a_warning(tmp_path, w
 
 
 def test_sensitivity_says_what_a_block_changes_and_where_to_measure(tmp_path):
-    plan = {"points": 12, "information": 80.0, "study_information": 80.0,
-            "points_with_the_study_information": 12}
-    plans = {"on the circle": plan | {"mean_sd_over_study_with_as_many_points": 0.98},
+    plan = {"points": 12, "study_points": 15, "points_with_the_study_information": 9}
+    plans = {"on the circle": plan | {"mean_sd_over_study_with_as_many_points": 0.98,
+                                      "points_with_the_study_information": None},
              "anywhere": plan | {"mean_sd_over_study_with_as_many_points": 0.41}}
     axis, angle = np.linspace(-0.1, 0.1, 5), np.linspace(0, 6, 8)
     gain = np.arange(1, 4), np.arange(3.0)
     sensitivity.write_sensitivity(build_magnet(STUDY), Sensitivity(
         1, axis, axis, np.full((5, 5), 1e-9), angle, np.full((8, 4), 2e-3), np.full((8, 4), 3e-3),
-        0.1, {"anywhere": gain}), tmp_path, plans)
-    page(tmp_path / "sensitivity.html")
+        0.1, {"anywhere": gain}, 8), tmp_path, plans)
+    text = page(tmp_path / "sensitivity.html")
+    assert "nats" not in text
+    first, second = sensitivity.plan_rows(plans)
+    assert list(first.values()) == ["on the circle", "12", "more than 12", "98.0\u00a0%"]
+    assert list(second.values()) == ["anywhere", "12", "9", "41.0\u00a0%"]
+    assert any("the 15 of the circle" in name for name in first)
     said = answer_of(tmp_path / "sensitivity.html")["said"]
     for number in ("2\u00a0mT", "3\u00a0mT", "anywhere", "41.0\u00a0%"):
         assert number in said

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from halbach_fe.report.magnet_view_3d import (
 )
 from halbach_fe.study.reader import read_study
 from tests.conftest import ROOT
+from tests.report.conftest import PATIENCE_MS
 
 STUDIES = ("quadrupole", "cubes", "faser")
 
@@ -34,24 +34,6 @@ def known_of(study):
     magnetization = np.array([block.magnetization[:study.dimension] for block in blocks])
     return BlockValues(magnetization, Colours(
         percent, "in %", [f"{one:+.2f} ± 0.40 %" for one in percent]))
-
-
-PATIENCE_MS = 300_000
-"""Time for a page to be shown, on a machine that has other work too."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium")
-    if path is None:
-        pytest.skip("no chromium here")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=[
-            "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -222,7 +222,7 @@ def test_a_page_of_a_distribution_of_any_name(generator, tmp_path):
     named = replace(found, by_name={"guess": found.by_name["posterior"]},
                     distributions={"guess": found.distributions["posterior"]})
     page = write_report(named, tmp_path / "page").read_text()
-    assert "with a probability of 95 %" in page
+    assert "with a probability of 95\u00a0%" in page
     assert "as ordered" not in page
 
 
@@ -237,5 +237,7 @@ def test_command(tmp_path, capsys):
     assert summary["prior"]["rms_ppm"] < summary["prior"]["peak_to_peak_ppm"]
     page = (tmp_path / "out" / "homogeneity.html").read_text()
     assert "ppm rms" in page
+    assert "<thead><tr><th>magnet</th><th>prior</th></tr></thead>" in page  # a column per magnet
+    assert "<tr><th>direction of the mean B</th><td" in page
     assert "in a sphere of 12 mm diameter?" in page
     assert (tmp_path / "out" / "harmonics.csv").read_text().count("prior") == 15

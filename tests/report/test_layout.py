@@ -1,0 +1,106 @@
+"""How pages are laid out on paper and on a narrow screen, in Chromium."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+
+from halbach_fe.cli import main
+from halbach_fe.report.page import SMALL, label_logarithmic, save, units_kept, write_page
+from tests.report.conftest import PATIENCE_MS
+from tests.report.test_page import ANSWER, SEEN
+from tests.support.results import STUDY
+from tests.support.short_dipole import TEXT
+
+FOLDED = "<details><summary>More</summary><p id=folded>folded</p></details>"
+
+LINES = """cells => cells.map(cell => {
+    const range = document.createRange(); range.selectNodeContents(cell);
+    return new Set([...range.getClientRects()].map(one => Math.round(one.top))).size; })"""
+"""How many lines the texts of cells have."""
+
+
+@pytest.fixture
+def opened(browser):
+    """Open a page of a width in px."""
+    contexts = []
+
+    def opened(path, width_px=700):
+        context = browser.new_context(offline=True, viewport={"width": width_px, "height": 800})
+        contexts.append(context)
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        page.goto(path.as_uri())
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+
+
+def test_paper_shows_what_is_folded_and_two_pictures_on_a_page(opened, tmp_path):
+    path = tmp_path / "page.html"
+    figure = Figure(figsize=(6, 9))
+    figure.text(0.5, 0.5, "tall", fontsize=SMALL)
+    write_page(path, "calibration.html.j2", save({"one.png": (figure, SEEN)}, tmp_path), STUDY,
+               answer=ANSWER, results={})
+    text = path.read_text()
+    path.write_text(text.replace("<h2>Provenance", f"{FOLDED}<h2>Provenance"))
+    page = opened(path)
+
+    def shown(selector):
+        return page.locator(selector).evaluate("one => one.checkVisibility()")
+
+    tall_px = page.locator("img").bounding_box()["height"]
+    assert not shown("#folded")
+    assert shown("text=The study as it was read")
+    page.emulate_media(media="print")
+    assert shown("#folded")
+    assert not shown("text=The study as it was read")  # the study file has it
+    page_px = (279 - 2 * 15) / 25.4 * 96  # of US letter without margins, the shorter paper
+    height_px = page.locator("img").bounding_box()["height"]
+    assert height_px < page_px / 2 < tall_px
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    assert shown("text=The study as it was read")  # whoever unfolds it has it
+
+
+@pytest.mark.parametrize("width_px", [1400, 500])
+def test_numbers_stay_on_one_line(opened, tmp_path, width_px):
+    (tmp_path / "study.toml").write_text(TEXT)
+    assert main(["homogeneity", str(tmp_path / "study.toml"), "-o", str(tmp_path / "out"),
+                 "--sphere-m", "0.006", "--degrees", "3", "--json"]) == 0
+    page = opened(tmp_path / "out" / "homogeneity.html", width_px)
+    numbers = page.locator("table.numbers").first.locator("td")
+    names = page.locator("table.numbers").first.locator("tbody th").all_inner_texts()
+    lines = dict(zip(names, numbers.evaluate_all(LINES), strict=True))
+    assert {name for name, count in lines.items() if count > 1} <= {"direction of the mean B"}
+    assert page.evaluate("document.documentElement.scrollWidth") <= width_px
+    page.add_style_tag(content=".short { white-space: normal; } table { width: 9em; }")
+    assert max(numbers.evaluate_all(LINES)) > 1  # the control
+
+
+@pytest.mark.parametrize(("text", "kept"), [
+    ("38 774 ppm rms", "38 774\u00a0ppm rms"),
+    ("by 0.2 %, at 20 °C", "by 0.2\u00a0%, at 20\u00a0°C"),
+    ("200.03 ± 0.16 %", "200.03\u00a0±\u00a00.16\u00a0%"), ("of 3 maps", "of 3 maps"),
+    ("5 mm, 3 mrad", "5\u00a0mm, 3\u00a0mrad"),
+    ("8 Tables", "8 Tables"), ("ring 1, slot 2", "ring 1, slot 2")])
+def test_units_stay_beside_their_number(text, kept):
+    assert units_kept(text) == kept
+
+
+def test_logarithmic_axes_have_numbers():
+    """Within a decade too, where others have 3 × 10²."""
+    for limits in ((150, 400), (1, 1e4)):
+        axis = Figure().subplots()
+        axis.set(yscale="log", ylim=limits)
+
+        def labels(axis=axis):
+            axis.figure.draw_without_rendering()
+            return [label.get_text() for label in (*axis.yaxis.get_majorticklabels(),
+                                                   *axis.yaxis.get_minorticklabels())]
+
+        assert any("10^" in label for label in labels())
+        label_logarithmic(axis.yaxis)
+        found = [float(label) for label in labels() if label]
+        assert any(limits[0] <= value <= limits[1] for value in found)
