@@ -52,12 +52,12 @@ DIPOLE: dict[str, Any] = {
 StudyMaker = Callable[..., Study]
 
 LONGEST = [
-    "docs/test_docs.py", "cli/test_all_keys.py", "diagnosis/test_sealed_cases.py",
-    "synthetic/test_fields.py", "solver/test_oracles.py", "cli/test_killed.py",
-    "response/test_nonlinear.py", "solver/test_azimuthal_modes.py",
-    "synthetic/test_hidden_effects.py", "inference/test_mcmc.py",
-    "diagnosis/test_unlisted_causes.py", "response/test_homogeneity.py",
-    "geometry/test_symmetry.py", "inference/test_infer.py",
+    "cli/test_all_keys.py", "synthetic/test_fields.py", "solver/test_oracles.py",
+    "response/test_nonlinear.py", "docs/test_docs.py", "diagnosis/test_sealed_cases.py",
+    "solver/test_azimuthal_modes.py", "diagnosis/test_knee.py", "inference/test_mcmc.py",
+    "synthetic/test_hidden_effects.py", "geometry/test_symmetry.py", "inference/test_infer.py",
+    "diagnosis/test_unlisted_causes.py", "design/test_homogeneity_objective.py",
+    "cli/test_cli.py", "response/test_homogeneity.py", "cli/test_killed.py",
 ]
 """Files that take a minute or more of processor time, the longest first."""
 
