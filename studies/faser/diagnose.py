@@ -31,7 +31,7 @@ from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, Registration
-from halbach_fe.inference.registration import odds, register
+from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import read_map
@@ -130,11 +130,16 @@ def answers_of(pose: PosePrior, data: xr.Dataset, session: Session) -> list[Answ
     answers = []
     for each in own:
         registration = by_keys[frozenset(key.key for key in each.open_keys)]
-        update = infer(build_magnet(registration.study), data, session)
-        left = update.prediction_posterior.mean - update.readings  # offset and all
-        answers.append(Answer(each, registration, update,
-                              np.abs(left) / data["B_T"].values[:, 0]))
+        answers.append(answer_of(each, registration, data, session))
     return answers
+
+
+def answer_of(hypothesis: Hypothesis, registration: Registration, data: xr.Dataset,
+              session: Session) -> Answer:
+    """Update the registered magnet with the profile."""
+    update = infer(build_magnet(registration.study), data, session)
+    left = update.prediction_posterior.mean - update.readings  # offset and all
+    return Answer(hypothesis, registration, update, np.abs(left) / data["B_T"].values[:, 0])
 
 
 def hypothesis_table(answers: list[Answer], published: PublishedErrors) -> list[dict[str, str]]:
@@ -324,12 +329,16 @@ def run(arguments: argparse.Namespace) -> int:
                    for each in answers_of(pose, data, session)]
         answers.sort(key=lambda each: -each.registration.log_evidence)
         best = answers[0]
+        poses = register(build_magnet(read_study(STUDY)), data, session, say=common.say,
+                         open_keys=best.hypothesis.open_keys, pose=best.hypothesis.pose)
+        if best.registration.log_evidence > poses[0].log_evidence + EQUAL_LOG_EVIDENCE:
+            poses.insert(0, best.registration)
+        else:  # of equal poses, all pages show the same one
+            best = answers[0] = answer_of(best.hypothesis, poses[0], data, session)
         common.say("comparing what the column may hold")
         fitted = columns_of(best, data)
         rows = hypothesis_table(answers, published)
         common.print_table(rows, "What the profile may be a profile of")
-        poses = register(build_magnet(read_study(STUDY)), data, session, say=common.say,
-                         open_keys=best.hypothesis.open_keys, pose=best.hypothesis.pose)
         found = sentences(best, poses, answers, fitted, published)
         write_registration(read_study(STUDY), text, data, poses, folder / "registration", {})
         write_inference(best.update, folder / "inferred")
