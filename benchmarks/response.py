@@ -88,15 +88,12 @@ def process_per_column_seconds(folder: Path) -> float:
     for column in range(COLUMNS_BY_PROCESS):
         started = time.monotonic()
         for run in sorted(folder.glob("getdp-*-mode*")):
-            first = 0 if run.name.endswith("mode0") else 1
-            log = (run / "getdp.log").read_text().split("\n", 1)[0].split()
-            last = int(float(log[log.index("LAST_MODE") + 1]))
+            modes = int((run / "case.pro").read_text().split("N_MODES = ")[1].split(";")[0])
             source = 2 + 7 * column
             runner.run(find_getdp(), runner.Job(
                 problem="azimuthal_modes.pro", mesh="meridian.msh", resolution="Modes",
-                outputs=("gradients.txt",), solutions="solutions.bin", solves=last - first + 1,
-                numbers={"VACUUM": "vacuum" in run.name, "FIRST_MODE": first, "LAST_MODE": last,
-                         "FIRST_SOURCE": source, "LAST_SOURCE": source,
+                outputs=("gradients.txt",), solutions="solutions.bin", solves=modes,
+                numbers={"VACUUM": "vacuum" in run.name, "FIRST_SOURCE": source, "LAST_SOURCE": source,
                          "PRINTED_SOURCE": source}), run)
         seconds.append((time.monotonic() - started) / 2)
     return float(np.mean(seconds))

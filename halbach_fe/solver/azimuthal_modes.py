@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +68,10 @@ below 1e-5 of that field."""
 SOLVED_NUMBERS = 2**28
 """Largest number of values in the solutions of one run. They take 2 GB on the disk until they are
 read."""
+
+SHARED_UNKNOWNS = 100_000
+"""Unknowns of all modes that the nominal array shares a run for. GetDP takes 0.2 s to start, as long
+as a mode of 10 000 unknowns; larger modes are runs of their own, side by side."""
 
 MAX_MODES = 64
 """Highest mode up to which this route applies; points close to the blocks need more modes."""
@@ -242,25 +245,24 @@ def solve_modes(
     solved = tuple(sorted({magnet.blocks[number].ring - 1 for number in blocks}))
     weights = nominal_waves(magnet, highest)
     case = _Case(magnet, mesh, weights, solved, meridian)
-    spans = spans_of(weights, bool(blocks),
-                     case.last_source * unknowns_of(mesh.inner, mesh.axis, 1))
+    runs = runs_of(weights, bool(blocks), unknowns_of(mesh.inner, mesh.axis, 1), case.last_source)
     variants = [False] if magnet.study.solver.method == "direct" else [False, True]
-    tasks = [_task(case, span, vacuum, session)
-             for span in reversed(spans) for vacuum in variants]
+    tasks = [_task(case, run, vacuum, session)
+             for run in reversed(runs) for vacuum in variants]
     results = run_tasks(tasks, session)
     if session.counter is not None:
         return np.zeros((1 + 3 * len(blocks), len(points), 3))
     if len(variants) == 2:
         results = [real - vacuum for real, vacuum in zip(results[::2], results[1::2], strict=True)]
-    modes = dict(zip([m for span in reversed(spans) for m in range(span[0], span[1] + 1)],
+    modes = dict(zip([m for run in reversed(runs) for m in run],
                      np.concatenate(results), strict=True))
     for m, gradient in modes.items():
         _limit_on_axis(m, gradient, meridian[:, 0] == 0)
     return _superpose(case, modes, points, where, blocks)
 
 
-def spans_of(weights: Floats, all_modes: bool, each: int) -> list[tuple[int, int]]:
-    """Return the first and the last mode of every run of GetDP.
+def runs_of(weights: Floats, all_modes: bool, unknowns: int, sources: int) -> list[list[int]]:
+    """Return the modes of every run of GetDP, in order.
 
     Parameters
     ----------
@@ -269,25 +271,18 @@ def spans_of(weights: Floats, all_modes: bool, each: int) -> list[tuple[int, int
     all_modes : bool
         Whether to solve for all modes, as single blocks need, or only for those that the nominal
         array has.
-    each : int
-        Values in the solutions of one mode. It limits the modes per run, see `SOLVED_NUMBERS`.
+    unknowns, sources : int
+        Of one mode. They limit the modes per run, see `SOLVED_NUMBERS` and `SHARED_UNKNOWNS`.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
     wanted = [m for m in range(len(weights)) if all_modes or size[m] > NO_REMANENCE * size.max()]
+    most = max(1, SOLVED_NUMBERS // (sources * unknowns))
+    if not all_modes:
+        most = max(1, min(most, SHARED_UNKNOWNS // unknowns))
     # mode 0 has no boundary condition on the axis, unlike all others, so it is a run of its own
-    return [span for first in (True, False)
-            for span in _runs([m for m in wanted if (m == 0) == first],
-                              max(1, SOLVED_NUMBERS // each))]
-
-
-def _runs(modes: Sequence[int], most: int) -> list[tuple[int, int]]:
-    """Split modes into spans (first, last) of at most ``most`` consecutive modes."""
-    spans = []
-    for _, group in groupby(enumerate(modes), lambda pair: pair[1] - pair[0]):
-        span = [mode for _, mode in group]
-        spans += [(part[0], part[-1]) for part in (
-            span[first:first + most] for first in range(0, len(span), most))]
-    return spans
+    others = [m for m in wanted if m > 0]
+    return [[m] for m in wanted if m == 0] + [
+        others[first:first + most] for first in range(0, len(others), most)]
 
 
 def nominal_waves(magnet: Magnet, highest: int) -> Floats:
@@ -340,31 +335,32 @@ def _rings(case: _Case) -> list[_Ring]:
             for ring, block in enumerate(blocks)]
 
 
-def _task(case: _Case, span: tuple[int, int], vacuum: bool, session: Session) -> Task:
-    """Return the run of GetDP for all sources in the modes from ``span[0]`` to ``span[1]``."""
-    modes, sources = span[1] - span[0] + 1, case.last_source + 1
+def _task(case: _Case, modes: list[int], vacuum: bool, session: Session) -> Task:
+    """Return the run of GetDP for all sources in some modes."""
+    first, sources = modes[0], case.last_source + 1
 
     # print a source whose field does not vanish, or the check of our evaluation would be empty: a
     # single block if any is solved for, else the larger part of the nominal array
     printed = case.last_source if case.solved else int(
-        np.argmax(np.abs(case.weights[span[0]]).max(axis=(1, 2))))
+        np.argmax(np.abs(case.weights[first]).max(axis=(1, 2))))
 
     def stage_run(folder: Path) -> Job:
-        return fill_run_folder(case, folder, span, (0, case.last_source), printed, vacuum,
-                     session.time_limit_s)
+        return fill_run_folder(case, folder, modes, (0, case.last_source), printed, vacuum,
+                               session.time_limit_s)
 
     def read(folder: Path) -> Floats:
-        return read_run(case, folder, modes, sources, printed)
+        return read_run(case, folder, len(modes), sources, printed)
 
-    return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{span[0]}", stage=stage_run,
-                read=read, shape=(modes, sources, len(case.meridian), 3), solves=modes * sources,
+    return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{first}", stage=stage_run,
+                read=read, shape=(len(modes), sources, len(case.meridian), 3),
+                solves=len(modes) * sources,
                 size=RunSize("azimuthal_modes", case.mesh.elements,
-                             unknowns_of(case.mesh.inner, case.mesh.axis, span[0]),
-                             modes * sources, matrices=modes))
+                             unknowns_of(case.mesh.inner, case.mesh.axis, first),
+                             len(modes) * sources, matrices=len(modes)))
 
 
 def fill_run_folder(
-    case: _Case, folder: Path, span: tuple[int, int], sources: tuple[int, int], printed: int,
+    case: _Case, folder: Path, modes: list[int], sources: tuple[int, int], printed: int,
     vacuum: bool, time_limit_s: float,
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there.
@@ -374,9 +370,10 @@ def fill_run_folder(
     case : _Case
     folder : Path
         An existing folder.
-    span, sources : tuple of int
-        First and last mode, and first and last source, both included; azimuthal_modes.pro numbers
-        the sources.
+    modes : list of int
+        The modes to solve for, in order; mode 0 only alone.
+    sources : tuple of int
+        First and last source, both included; azimuthal_modes.pro numbers them.
     printed : int
         The source whose gradients GetDP prints, in the first mode.
     vacuum : bool
@@ -387,17 +384,16 @@ def fill_run_folder(
     (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.real_mesh.regions,
                   points=case.probes[1].tolist(), rings=_rings(case),
-                  solved=max(1, len(case.solved)))
+                  modes=modes, solved=max(1, len(case.solved)))
     (folder / "case.pro").write_text(text, encoding="utf-8")
     (folder / case.real_mesh.path.name).write_bytes(case.real_mesh.path.read_bytes())
     return Job(
         problem=PROBLEM, mesh=case.real_mesh.path.name, resolution="Modes", outputs=(OUTPUT,),
         solutions=SOLUTIONS_FILE,
-        numbers={"VACUUM": vacuum, "FIRST_MODE": span[0], "LAST_MODE": span[1],
-                 "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
+        numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
                  "PRINTED_SOURCE": printed},
-        unknowns=unknowns_of(case.mesh.inner, case.mesh.axis, span[0]),
-        solves=(span[1] - span[0] + 1) * (sources[1] - sources[0] + 1), time_limit_s=time_limit_s)
+        unknowns=unknowns_of(case.mesh.inner, case.mesh.axis, modes[0]),
+        solves=len(modes) * (sources[1] - sources[0] + 1), time_limit_s=time_limit_s)
 
 
 def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:

@@ -59,13 +59,27 @@ def test_runs_of_few_modes_do_the_same(modes, session, monkeypatch):
         return azimuthal_modes.solve_modes(build_magnet(study), POINTS, [0], session)
 
     weights = azimuthal_modes.nominal_waves(build_magnet(study), 4)
-    assert azimuthal_modes.spans_of(weights, True, 1) == [(0, 0), (1, 4)]
+    assert azimuthal_modes.runs_of(weights, True, 1, 1) == [[0], [1, 2, 3, 4]]
     together = columns()
     monkeypatch.setattr(azimuthal_modes, "SOLVED_NUMBERS", 2)
-    assert azimuthal_modes.spans_of(weights, True, 1) == [(0, 0), (1, 2), (3, 4)]
-    assert azimuthal_modes.spans_of(weights, True, 5) == [(m, m) for m in range(5)]
+    assert azimuthal_modes.runs_of(weights, True, 1, 1) == [[0], [1, 2], [3, 4]]
+    assert azimuthal_modes.runs_of(weights, True, 1, 5) == [[m] for m in range(5)]
     # the same matrices, factorized again
     np.testing.assert_allclose(columns(), together, atol=1e-12 * np.abs(together).max())
+
+
+def test_the_modes_of_the_nominal_array_share_a_run(modes, session, monkeypatch):
+    """Of 16 blocks modes 1, 15 and 17 have a remanence; large modes are runs of their own."""
+    study = modes(array__recoil_permeability=1.1, mesh__meridian_size_m=0.03)
+    points = circle(0.08)
+    weights = azimuthal_modes.nominal_waves(build_magnet(study), 20)
+    assert azimuthal_modes.runs_of(weights, False, 1, 1) == [[1, 15, 17]]
+    together = solve_nominal(build_magnet(study), points, session)
+    monkeypatch.setattr(azimuthal_modes, "SHARED_UNKNOWNS", 2)
+    assert azimuthal_modes.runs_of(weights, False, 1, 1) == [[1, 15], [17]]
+    assert azimuthal_modes.runs_of(weights, False, 3, 1) == [[1], [15], [17]]
+    apart = solve_nominal(build_magnet(study), points, session)
+    np.testing.assert_allclose(apart, together, atol=1e-12 * np.abs(together).max())
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
