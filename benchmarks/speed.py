@@ -14,13 +14,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import tomlkit
+
 from benchmarks.note import Note
+from benchmarks.speed_tasks import SECTORS, changed
 
 ROOT = Path(__file__).parent.parent
 BEFORE = "5c3aed3"
 """The last commit before the compiled field."""
 
-REPEATS = {"exact": 3, "help": 7, "diagnose-small": 1}
+REPEATS = {"exact": 3, "help": 7, "diagnose-small": 1, "diagnose-map": 1}
+
+HIDDEN = "block_displaced=6,5,3e-3,0,0"
+"""A block that is displaced in the simulated maps: ring, slot, displacement in m."""
 
 
 def old_code() -> Path:
@@ -37,8 +43,24 @@ def old_code() -> Path:
     return site
 
 
-def run_task(name: str, site: Path | None) -> tuple[float, dict[str, float]]:
-    """Run a task with the code at ``site`` (None: this checkout).
+def simulated(name: str, study: str) -> Path:
+    """Return a folder with a study and a map of it, which magpylib and NGSolve simulate."""
+    folder = ROOT / "build" / "speed" / name
+    if not (folder / "map.csv").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "study.toml").write_text(study)
+        subprocess.run(
+            [sys.executable, "-m", "halbach_fe", "simulate-measurement", folder / "study.toml",
+             "--seed", "1", "--hide", HIDDEN, "-o", folder / "campaign"], check=True,
+            stdout=subprocess.DEVNULL)
+        (folder / "campaign" / "map.csv").replace(folder / "map.csv")
+    return folder
+
+
+def run_task(
+    name: str, site: Path | None, folder: Path | None = None
+) -> tuple[float, dict[str, float]]:
+    """Run a task with the code at ``site`` (None: this checkout), on the files of a folder.
 
     Returns
     -------
@@ -53,19 +75,20 @@ def run_task(name: str, site: Path | None) -> tuple[float, dict[str, float]]:
     if site is not None:
         known["PYTHONPATH"] = str(site)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, str(Path(__file__).parent / "speed_tasks.py"), name],
+    done = subprocess.run([sys.executable, str(Path(__file__).parent / "speed_tasks.py"), name,
+                           *([] if folder is None else [str(folder)])],
                           env=known, check=True, capture_output=True, text=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime)
     return seconds, json.loads(done.stdout.splitlines()[-1])
 
 
-def both(name: str) -> tuple[dict[str, float], dict[str, float]]:
+def both(name: str, folder: Path | None = None) -> tuple[dict[str, float], dict[str, float]]:
     """Return the smallest figures of a task by the old code and by the new, run in turn."""
     runs: tuple[list[dict[str, float]], list[dict[str, float]]] = [], []
     for _ in range(REPEATS[name]):
         for site, found in zip((old_code(), None), runs, strict=True):
-            seconds, figures = run_task(name, site)
+            seconds, figures = run_task(name, site, folder)
             found.append({"processor_s": seconds, **figures})
     old, new = ({key: min(one[key] for one in found) for key in found[0]} for found in runs)
     return old, new
@@ -93,11 +116,31 @@ def command_line(note: Note) -> None:
 
 def diagnosis(note: Note) -> None:
     """Note how much faster a diagnosis is: 192 blocks in vacuum, 3840 readings, one displaced."""
-    old, new = both("diagnose-small")
-    note("diagnosis.speedup_small", old["processor_s"] / new["processor_s"], "ratio",
+    _note_diagnosis(note, "small", *both("diagnose-small"))
+
+
+def full(note: Note) -> None:
+    """Note the same of 192 blocks with permeability in an iron tube, and 28 080 readings."""
+    study = (ROOT / "studies" / "faser" / "campaign.toml").read_text()
+    _note_diagnosis(note, "full", *both("diagnose-map", simulated("full", study)))
+
+
+def permeability(note: Note) -> None:
+    """Note the same of the small magnet with permeability, and 3840 readings."""
+    study = tomlkit.dumps(changed(SECTORS, array__recoil_permeability=1.05))
+    _note_diagnosis(note, "permeability",
+                    *both("diagnose-map", simulated("permeability", study)))
+
+
+def _note_diagnosis(
+    note: Note, name: str, old: dict[str, float], new: dict[str, float]
+) -> None:
+    """Note the ratio of both times, and the new one."""
+    note(f"diagnosis.speedup_{name}", old["processor_s"] / new["processor_s"], "ratio",
          f"processor time of the code before, commit {BEFORE}: {old['processor_s']:.3g} s; now "
          f"{new['processor_s']:.3g} s; displaced block named: {old['named']:g}, {new['named']:g}")
-    note("diagnosis.seconds_small", new["wall_s"], "s", f"wall time; before {old['wall_s']:.3g} s")
+    note(f"diagnosis.seconds_{name}", new["wall_s"], "s",
+         f"wall time; before {old['wall_s']:.3g} s")
 
 
 def run(note: Note) -> None:

@@ -147,22 +147,30 @@ def start() -> dict[str, float]:
 
 
 def diagnose(document: dict[str, Any]) -> dict[str, float]:
-    """Run the command; say whether it named the displaced block alone."""
-    from halbach_fe.cli import main
+    """Diagnose a map of a magnet in vacuum; see `diagnose_map`."""
     from halbach_fe.measurement.field_map import field_map, write_map
     from halbach_fe.measurement.positions import points_from
     from halbach_fe.study.reader import parse_study
 
     points = points_from(parse_study(document).observation.positions)
-    begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "study.toml").write_text(tomlkit.dumps(document))
         write_map(field_map(points, truth(document, points)), folder / "map.csv")
-        with contextlib.redirect_stdout(io.StringIO()) as shown:
-            code = main(["diagnose", str(folder / "study.toml"), "--measurements",
-                         str(folder / "map.csv"), "-o", str(folder / "out"), "--json",
-                         "--no-cache"])
+        return diagnose_map(folder)
+
+
+def diagnose_map(folder: Path) -> dict[str, float]:
+    """Run the command on ``study.toml`` and ``map.csv`` of a folder; say whether it named the
+    displaced block alone.
+    """
+    from halbach_fe.cli import main
+
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()) as shown:
+        code = main(["diagnose", str(folder / "study.toml"), "--measurements",
+                     str(folder / "map.csv"), "-o", str(Path(name) / "out"), "--json",
+                     "--no-cache"])
     if code:
         raise SystemExit(code)
     found = json.loads(shown.getvalue())
@@ -170,9 +178,10 @@ def diagnose(document: dict[str, Any]) -> dict[str, float]:
     return {"named": float(names == ["block_displaced"]), "wall_s": time.perf_counter() - begin}
 
 
-TASKS: dict[str, Callable[[], dict[str, float]]] = {
-    "exact": exact, "help": start, "diagnose-small": partial(diagnose, SECTORS)}
+TASKS: dict[str, Callable[..., dict[str, float]]] = {
+    "exact": exact, "help": start, "diagnose-small": partial(diagnose, SECTORS),
+    "diagnose-map": diagnose_map}
 
 
 if __name__ == "__main__":
-    print(json.dumps(TASKS[sys.argv[1]]()))  # noqa: T201
+    print(json.dumps(TASKS[sys.argv[1]](*map(Path, sys.argv[2:]))))  # noqa: T201

@@ -90,6 +90,8 @@ class Plate:
         Thickness below the lowest block; 0 if pockets go through.
     wall_m : float
         Thickness of the thinnest wall.
+    inner_radius_m, outer_radius_m : float
+        Of the plate; the inner one is 0 without a bore.
     """
 
     number: int
@@ -99,6 +101,8 @@ class Plate:
     blocks: tuple[tuple[int, ...], ...]
     floor_m: float
     wall_m: float
+    inner_radius_m: float
+    outer_radius_m: float
 
     @property
     def thickness_m(self) -> float:
@@ -317,7 +321,8 @@ def _plate(
         openings.append(("bore", through(Prism(circle(frame.inner), 0.0, 0.0))))
     return Plate(0, Prism(_rim(frame.outer, holder.mark_m), 0.0, thickness),
                  tuple(prism for _, prism in openings), (low,),
-                 (tuple(block.number for block in group),), frame.floor, wall)
+                 (tuple(block.number for block in group),), frame.floor, wall,
+                 frame.inner, frame.outer)
 
 
 def _checked_walls(

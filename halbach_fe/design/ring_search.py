@@ -18,7 +18,6 @@ search goes on from there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -139,7 +138,7 @@ def _descend(task: Task, start: Ints, best: float) -> Found:
         new = {int(place): int(option)}
         least = float(single[place, option])
         if least >= value * (1 - LEAST_GAIN) and value < PROMISING * best:
-            least, new = _best_pair(task, rest, chosen, total, single)
+            least, new = _best_pair(task, rest, total, single)
         if least >= value * (1 - LEAST_GAIN):
             return Found(chosen, value)
         chosen[list(new)] = list(new.values())
@@ -147,21 +146,17 @@ def _descend(task: Task, start: Ints, best: float) -> Found:
 
 
 def _best_pair(
-    task: Task, rest: Floats, chosen: Ints, total: Floats, single: Floats
+    task: Task, rest: Floats, total: Floats, single: Floats
 ) -> tuple[float, dict[int, int]]:
     """Return the least value by changes of two places, and the changes.
 
     ``rest`` (p, n + 2) are the sums without each place, ``single`` (p, o) the values of designs
     with one change.
     """
+    from halbach_fe.design.ring_pairs import best_pair  # imports numba
+
     options = np.argsort(single, axis=1)[:, :PAIRED]
-    best: tuple[float, dict[int, int]] = (np.inf, {})
-    for first, second in combinations(range(len(chosen)), 2):
-        both = rest[first] + rest[second] - total
-        values = task.value((both + task.table[first, options[first]])[:, None]
-                            + task.table[second, options[second]])
-        one, other = np.unravel_index(int(np.argmin(values)), values.shape)
-        if values[one, other] < best[0]:
-            best = float(values[one, other]), {first: int(options[first, one]),
-                                               second: int(options[second, other])}
-    return best
+    value, first, one, second, other = best_pair(
+        rest, total, task.table, options, task.weights, task.objective == "rms",
+        task.least_field_T, task.most_mass_kg, MISSES, TINY_T, PPM)
+    return value, {first: one, second: other} if first >= 0 else {}

@@ -105,6 +105,7 @@ def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
     return inside
 
 
+@lru_cache(maxsize=4096)  # the same magnet is built with many instruments and effects
 def outline_area(outline: Outline) -> float:
     """Return the area in m^2 inside an outline.
 

@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -132,6 +133,8 @@ class PoseFit:
         Derivatives of B by the open keys at the places of the present fit, see `_by_open_keys`.
     solved : dict
         The last fields that were solved for, by the values of the open keys.
+    built : dict
+        The last magnets that were built, by the values of the open keys.
     """
 
     magnet: Magnet
@@ -151,6 +154,7 @@ class PoseFit:
     prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
+    built: dict[bytes, Magnet] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior,
@@ -389,19 +393,26 @@ class PoseFit:
 
     def _magnet(self, values: Floats) -> Magnet:
         """Return the magnet with the values of the open keys."""
-        magnet = self.magnet
-        for each, value in zip(self.open, each_value(self, values), strict=True):
-            if not each.of_instrument:
-                magnet = magnet.with_study(each.apply(magnet.study, value))
-        return magnet
+        key = self._key(values)
+        if key not in self.built:
+            _make_room(self.built, len(self.open) + 2)
+            magnet = self.magnet
+            for each, value in zip(self.open, each_value(self, values), strict=True):
+                if not each.of_instrument:
+                    magnet = magnet.with_study(each.apply(magnet.study, value))
+            self.built[key] = magnet
+        return self.built[key]
+
+    def _key(self, values: Floats) -> bytes:
+        """Return what distinguishes the magnets of different values of the open keys."""
+        return np.array([value for each, value in zip(self.open, values[PROBE:], strict=True)
+                         if not each.of_instrument]).tobytes()
 
     def _field(self, values: Floats) -> Field:
         """Return the field of the nominal magnet with the values of the open keys."""
-        key = np.array([value for each, value in zip(self.open, values[PROBE:], strict=True)
-                        if not each.of_instrument]).tobytes()
+        key = self._key(values)
         if key not in self.solved:
-            while len(self.solved) > len(self.open) + 1:
-                del self.solved[next(iter(self.solved))]
+            _make_room(self.solved, len(self.open) + 2)
             self.solved[key] = field_function(self._magnet(values), self.session)
         return self.solved[key]
 
@@ -559,6 +570,12 @@ class _State:
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
             np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
                 factor, np.eye(len(inner)))[:count, :count]
+
+
+def _make_room(known: dict[bytes, Any], most: int) -> None:
+    """Delete the oldest entries until fewer than ``most`` are left."""
+    while len(known) >= most:
+        del known[next(iter(known))]
 
 
 def _check_open_keys(magnet: Magnet, open_keys: Sequence[OpenKey]) -> None:

@@ -107,21 +107,18 @@ def register(
             "points inside blocks in every likely pose", "Check its unit of length."))
     found: list[Registration] = []
     by_fit: list[list[Registration]] = []
-    closed = dataclasses.replace(fit, open=()) if fit.on_a_line else None
+    closed = dataclasses.replace(fit, open=(), solved={}, built={}, derivatives={})
     without: dict[int, Registration] = {}
     for fit in fits:
         by_fit.append([])
         for number, start in enumerate(starts):
             say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
                 + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
-            reached = [fit.refined(start)]
-            if closed is not None and fit.open:
+            if fit.open and fit.on_a_line:
                 if number not in without:
                     without[number] = closed.refined(start)
-                reached.append(fit.refined(_pose(without[number])))
-            elif closed is not None:
-                without[number] = reached[0]
-            by_fit[-1].append(max(reached, key=lambda each: each.log_evidence))
+                start = _pose(without[number])
+            by_fit[-1].append(fit.refined(start))
     best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
     for fit, own in zip(fits, by_fit, strict=True):
         # no hypothesis shall lose because it came to rest somewhere else

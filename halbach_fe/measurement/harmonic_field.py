@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.threads import in_threads, share_out
 
 MOST_CHARGES = 3300
 """Largest number of charges, which limits memory and time."""
@@ -82,20 +84,15 @@ class Charges:
     def fields_along(self, points: Floats, directions: Floats) -> Floats:
         """Return B . u (n, amplitudes) per amplitude at points (n, 3) in m, for u (n, 3)."""
         result = np.empty((len(points), len(self)))
-        for part in _parts(len(points), len(self.places)):
-            away = points[part, None] - self.places
-            along = np.einsum("nki,ni->nk", away, directions[part])
-            result[part, :-3] = self.scale * along / np.einsum("nki,nki->nk", away, away)**1.5
+        self._compute("fields_along", points, np.ascontiguousarray(directions, float), self.places,
+                      self.scale, out=result)
         result[:, -3:] = UNIFORM * directions
         return result
 
     def field(self, points: Floats, amplitudes: Floats) -> Floats:
         """Return B (n, 3) in T at points (n, 3) in m for amplitudes (k,) in T."""
         result = np.empty((len(points), 3))
-        for part in _parts(len(points), len(self.places)):
-            away = points[part, None] - self.places
-            weights = amplitudes[:-3] / np.einsum("nki,nki->nk", away, away)**1.5
-            result[part] = self.scale * np.einsum("nk,nki->ni", weights, away)
+        self._compute("field", points, self.places, self.scale * amplitudes[:-3], out=result)
         return result + UNIFORM * amplitudes[-3:]
 
     def gradient(self, points: Floats, amplitudes: Floats) -> Floats:
@@ -104,13 +101,16 @@ class Charges:
         ``[i, c, j]`` is the derivative of component c along direction j.
         """
         result = np.empty((len(points), 3, 3))
-        for part in _parts(len(points), len(self.places)):
-            away = points[part, None] - self.places
-            square = np.einsum("nki,nki->nk", away, away)
-            weights = self.scale * amplitudes[:-3] / square**1.5
-            result[part] = np.sum(weights, axis=1)[:, None, None] * np.eye(3) - 3 * np.matmul(
-                (away * (weights / square)[..., None]).transpose(0, 2, 1), away)
+        self._compute("gradient", points, self.places, self.scale * amplitudes[:-3], out=result)
         return result
+
+    def _compute(self, name: str, points: Floats, *values: Any, out: Floats) -> None:
+        """Call a function of `halbach_fe.measurement.charge_kernel` in threads."""
+        from halbach_fe.measurement import charge_kernel  # imports numba
+
+        points = np.ascontiguousarray(points, float)
+        in_threads(lambda first, last: getattr(charge_kernel, name)(
+            points, *values, first, last, out), share_out(len(points)))
 
 
 def spacing_of(points: Floats, gap: float) -> float:
@@ -121,12 +121,6 @@ def spacing_of(points: Floats, gap: float) -> float:
     sides = np.ptp(points, axis=0) + 2 * gap
     area = 2 * float(np.sum(sides * np.roll(sides, 1)))
     return float(max(CLOSENESS * gap, np.sqrt(area / MOST_CHARGES)))
-
-
-def _parts(points: int, charges: int) -> list[slice]:
-    """Return slices of points whose distances to all charges fit into a processor's cache."""
-    step = max(1, 100_000 // charges)
-    return [slice(first, first + step) for first in range(0, points, step)]
 
 
 def _fields(points: Floats, places: Floats) -> Floats:

@@ -62,6 +62,9 @@ def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
     """Return a row of text for every plate."""
     return [{"holder": str(plate.number), "files": f"{holder_name(plate)}.step, .stl",
              "to make": str(len(plate.heights_m)), "pockets": str(len(plate.blocks[0])),
+             "outer diameter": f"{2e3 * plate.outer_radius_m:.5g}\u00a0mm",
+             "bore": (f"{2e3 * plate.inner_radius_m:.5g}\u00a0mm" if plate.inner_radius_m
+                      else "none"),
              "thickness": f"{1e3 * plate.thickness_m:.4g}\u00a0mm",
              "floor": f"{1e3 * plate.floor_m:.3g}\u00a0mm" if plate.floor_m else "none",
              "thinnest wall": f"{1e3 * plate.wall_m:.3g}\u00a0mm",
@@ -80,6 +83,8 @@ def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str,
         "holder": assembly.holder.model_dump(mode="json"),
         "plates": [{"holder": plate.number, "file": f"{holder_name(plate)}.step",
                     "lower_faces_z_m": list(plate.heights_m), "pockets": len(plate.blocks[0]),
+                    "inner_radius_m": plate.inner_radius_m,
+                    "outer_radius_m": plate.outer_radius_m,
                     "thickness_m": plate.thickness_m, "floor_m": plate.floor_m,
                     "thinnest_wall_m": plate.wall_m}
                    for plate in assembly.plates],

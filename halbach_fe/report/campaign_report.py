@@ -87,7 +87,7 @@ class Campaign:
 
     @property
     def answer(self) -> Answer:
-        """What may be used as it stands, and what is left to do."""
+        """What is known of the magnet, what may be used as it stands, and what is left to do."""
         unsound = list(dict.fromkeys(each for each, _, answer in self.answered if not answer.sound))
         left = [each.label for each in unsound if self.replaced(each) is None]
         instead = [f"{better.label} instead of {each.label}" for each in unsound
@@ -97,6 +97,7 @@ class Campaign:
             "The answers may be used as they stand.")
         if instead:
             said += f" Use {', '.join(instead)}."
+        said = " ".join([*self._newest(), said])
         trust = (
             "No: the results do not all fit together, as is said below." if self.doubts else
             f"{'Only those that are not named here' if left else 'Yes'}: they are of " + (
@@ -106,6 +107,16 @@ class Campaign:
         return Answer("What is known of this magnet?", said, trust,
                       last.step if last else "Nothing that the results name is left to do.",
                       last.command if last else "", sound=not (self.doubts or left))
+
+    def _newest(self) -> list[str]:
+        """Return the last answer about the measured magnet that may be used, and before it that of
+        its diagnosis.
+        """
+        sound = [(chapter.verb, answer.said) for chapter, _, answer in self.answered
+                 if answer.sound]
+        found = [said for verb, said in sound if verb == "diagnose"]
+        measured = [said for verb, said in sound if verb in OF_MEASURED]
+        return [*found[-1:], *measured[-1:]]
 
     def _next(self) -> Answer | None:
         """Return the answer whose next step is the one to take.

@@ -236,8 +236,11 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
     longest = float(np.linalg.norm(flat, axis=1).max())
     if longest > NEGLIGIBLE:
         arrows = 0.35 * float(np.abs(middles).max() or 1.0) * flat / longest
-        axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=PRIOR,
-                    width=0.005, edgecolor=MEASURED, lw=0.3)
+        drawn = axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1,
+                            color=PRIOR, width=0.005, edgecolor=MEASURED, lw=0.3)
+        axis.quiverkey(drawn, 0.2, 0.04, float(np.linalg.norm(arrows, axis=1).max()),
+                       _newton(longest), labelpos="E", coordinates="axes",
+                       fontproperties={"size": SMALL})
     axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N",
                          location="bottom", shrink=0.6)
     reach = 1.3 * float(np.abs(np.vstack(corners)).max())

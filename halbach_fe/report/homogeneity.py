@@ -11,7 +11,9 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Floats
@@ -195,17 +197,28 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
         "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 
-def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
+def _deviations(slices: list[Slice], mean_T: float) -> tuple[list[Floats], NDArray[np.bool_]]:
+    """Return deviations of |B| in ppm in every slice, and which pixels are in the ellipse in it."""
+    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, len(slices[0].first_m))])
+    return [PPM * (each.size_T / mean_T - 1) for each in slices], x**2 + y**2 <= 1
+
+
+def largest_shown(slices: list[Slice], mean_T: float) -> float:
+    """Return the deviation in ppm at which the colours of `slices_figure` end."""
+    deviations, within = _deviations(slices, mean_T)
+    return max(float(np.nanquantile(np.abs(each[within]), 0.98)) for each in deviations) or 1.0
+
+
+def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = None) -> Figure:
     """Draw the deviation of |B| in three planes through the centre, in ppm.
 
-    Colours and lines are of what lies in the ellipse within each slice: beyond it, in the corners,
-    the field of a homogeneous magnet deviates many times more.
+    Colours and lines are of what lies in the ellipse within each slice, which is drawn: beyond it,
+    in the corners, the field of a homogeneous magnet deviates many times more. Colours end at
+    ``largest`` in ppm, by default at `largest_shown`.
     """
     figure = Figure(figsize=(8.4, 3.0), layout="constrained")
-    deviations = [PPM * (each.size_T / mean_T - 1) for each in slices]
-    x, y = np.meshgrid(*2 * [np.linspace(-1, 1, len(slices[0].first_m))])
-    within = x**2 + y**2 <= 1
-    largest = max(float(np.nanquantile(np.abs(each[within]), 0.98)) for each in deviations) or 1.0
+    deviations, within = _deviations(slices, mean_T)
+    largest = largest or largest_shown(slices, mean_T)
     levels = np.linspace(-largest, largest, 21)
     round_levels = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(-largest, largest)
     axes = figure.subplots(1, 3)
@@ -217,6 +230,10 @@ def slices_figure(slices: list[Slice], mean_T: float) -> Figure:
                              np.where(within, deviation, np.nan), round_levels,
                              colors="black", linewidths=0.5)
         axis.clabel(lines, fmt=ppm, fontsize=SMALL)
+        middle = [float(np.mean(1e3 * own[[0, -1]])) for own in (each.first_m, each.second_m)]
+        axis.add_patch(Ellipse(
+            (middle[0], middle[1]), *(1e3 * float(np.ptp(own)) for own in (
+                each.first_m, each.second_m)), fill=False, ec="black", lw=0.8, ls="--"))
         axis.set_aspect("equal")
         axis.set_xlabel(f"{names[0]} in mm")
         axis.set_ylabel(f"{names[1]} in mm")
@@ -255,8 +272,8 @@ def write_homogeneity(
                json.dumps(homogeneity_summary(found), indent=1, allow_nan=False) + "\n")
     figures = {"homogeneity.png": (
         slices_figure(found.model.slices(found.distributions[name].mean), best.mean_T),
-        "Deviation of |B| from its mean over the region, in planes through its centre, "
-        f"{_known_as(name)}")}
+        "Deviation of |B| from its mean over the region (dashed), in planes through its "
+        f"centre, {_known_as(name)}")}
     every = {**found.by_name, **found.of_map}
     if best.harmonics and not _cancels(best):
         figures["harmonics.png"] = (

@@ -219,8 +219,9 @@ def _pattern_figure(plan: MeasurementPlan) -> Figure:
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), left(plan.gain), color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, left(plan.baseline_gain), color=PRIOR,
-              label="positions of the study")
-    axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":")
+              label="as many positions of the study, evenly spread")
+    axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":",
+                 label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)
@@ -236,8 +237,9 @@ def _deviation_figure(plan: MeasurementPlan) -> Figure:
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), plan.deviation.planned, color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, plan.deviation.baseline, color=PRIOR,
-              label="positions of the study")
-    axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":")
+              label="as many positions of the study, evenly spread")
+    axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":",
+                 label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)

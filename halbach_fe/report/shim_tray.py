@@ -15,7 +15,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, of_a_conflict
-from halbach_fe.report.homogeneity import plain_homogeneity, slices_figure
+from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
 from halbach_fe.report.page import PUBLISHED, own_style, save, write_page
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
@@ -159,12 +159,16 @@ def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, st
         write_csv(columns(found), {"study": found.magnet.name}, temporary)
     before, after = (model.slices(known.mean) for model, known in (
         (found.model, found.before_known), (found.shimmed, found.after_known)))
-    text = "Deviation of |B| from its mean over the region, in planes through its centre, with {}"
+    text = ("Deviation of |B| from its mean over the region (dashed), in planes through its "
+            "centre, with {}")
+    largest = largest_shown(before, found.before.mean_T)  # the same colours in both
     pictures = save({
         "shim_tray.png": (tray_figure(found), "The tray unrolled, seen from outside. Arrows are "
                           "polarizations: up is away from the axis, right is counter-clockwise"),
-        "before.png": (slices_figure(before, found.before.mean_T), text.format("an empty tray")),
-        "after.png": (slices_figure(after, found.after.mean_T), text.format("the filled tray"))},
+        "before.png": (slices_figure(before, found.before.mean_T, largest),
+                       text.format("an empty tray")),
+        "after.png": (slices_figure(after, found.after.mean_T, largest),
+                      text.format("the filled tray"))},
         folder)
     write_page(folder / "shim_tray.html", "shim_tray.html.j2", pictures, study=found.magnet.study,
                provenance=provenance, answer=answer(found), rows=rows(found),

@@ -38,6 +38,9 @@ from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
 
+LITTLE = 0.05
+"""Part of the rms below which the gain of all moves together is called hardly worth the work."""
+
 
 def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
     """Return the content of shim.json."""
@@ -158,6 +161,10 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
     if shim.steps:
         said = (f"{counted(len(shim.steps), 'move')}: {what} expected to fall from {before} to "
                 f"{after} {unit}, including the uncertainty.")
+        gained = 1 - shim.after.rms / shim.before.rms
+        if gained < LITTLE:
+            said += (f" That is {100 * gained:.2g} % for {counted(len(shim.steps), 'move')}: "
+                     "hardly worth the work.")
     else:
         said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
                 "uncertainty.")

@@ -45,7 +45,8 @@ def stray_section(stray: StrayField | None) -> StraySection | None:
             "text": stray.unknown or (
                 f"The largest distances at which |B| reaches {size}, the usual limit of access to "
                 "rooms of MRI magnets. The field is that of the magnet alone, without shields or "
-                "external fields."), "rows": stray_rows(stray)}
+                "external fields. Without ± the standard deviation is below 0.5 mm."),
+            "rows": stray_rows(stray)}
 
 
 def stray_rows(stray: StrayField | None) -> list[dict[str, str]]:

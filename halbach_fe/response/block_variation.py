@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,9 +83,6 @@ class Variations:
         prior = magnet.study.prior
         if not prior.variation_sd or prior.variation_length_m is None:
             return None
-        from halbach_fe.solver.moments.cells import cells_of  # imports numba
-        from halbach_fe.solver.moments.interaction import Interaction
-
         side = float(np.cbrt(np.median([block.volume for block in magnet.blocks])))
         per_side = max(1, int(np.ceil(PARTS_PER_LENGTH * side / prior.variation_length_m / 2)))
         if per_side > MOST_CELLS:
@@ -93,10 +91,22 @@ class Variations:
                 "`prior.variation_length_m`", f"study {magnet.name}",
                 f"at least {least:.2g} m for blocks of {side:.2g} m",
                 f"{prior.variation_length_m:g}", "Shorter variations have no field in the bore."))
-        cells = cells_of(magnet.blocks, per_side)
-        starts = np.searchsorted(cells.block, np.arange(len(magnet.blocks) + 1))
+        return cls._of_blocks(tuple(magnet.blocks), prior.variation_sd, prior.variation_length_m,
+                              per_side)
+
+    @classmethod
+    @lru_cache(maxsize=2)  # every map of a campaign asks for those of the same blocks
+    def _of_blocks(
+        cls, blocks: tuple[MagnetBlock, ...], sd: float, length_m: float, per_side: int
+    ) -> Variations:
+        """Return the variations of blocks with ``per_side`` cells along a side."""
+        from halbach_fe.solver.moments.cells import cells_of  # imports numba
+        from halbach_fe.solver.moments.interaction import Interaction
+
+        cells = cells_of(blocks, per_side)
+        starts = np.searchsorted(cells.block, np.arange(len(blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
-        for number, block in enumerate(magnet.blocks):
+        for number, block in enumerate(blocks):
             mine = slice(starts[number], starts[number + 1])
             places = cells.nodes[mine]
             flat = places.reshape(-1, 3)
@@ -104,9 +114,9 @@ class Variations:
             own = Interaction(_some(cells, mine))
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
-            correlation = np.exp(-distance / (2 * prior.variation_length_m**2))
+            correlation = np.exp(-distance / (2 * length_m**2))
             correlation[np.diag_indices(len(flat))] += JITTER
-            root = prior.variation_sd * np.linalg.cholesky(correlation)
+            root = sd * np.linalg.cholesky(correlation)
             _, sizes, modes = np.linalg.svd(effect @ root, full_matrices=False)
             kept = sizes / np.sqrt(len(effect) / 3) > NOTICEABLE_T
             shapes = (root @ modes[kept].T).reshape(*places.shape[:2], 1, -1)

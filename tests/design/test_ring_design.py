@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from itertools import product
+from itertools import combinations, product
 
 import magpylib
 import numpy as np
@@ -15,7 +15,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design import ring_catalogue
 from halbach_fe.design.ring_catalogue import Catalogue, largest_number
 from halbach_fe.design.ring_design import design_rings, task_of
-from halbach_fe.design.ring_search import search
+from halbach_fe.design.ring_search import Task, _best_pair, search
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.notebook import html_of
 from halbach_fe.report.result_files import write_report
@@ -245,3 +245,26 @@ def test_one_type_of_blocks_remains_one():
     two = parse_study(DOCUMENT | {"prior": {"types": {"a": [1], "b": list(range(2, 17))}}})
     with pytest.raises(StudyError, match=r"prior\.types must name every slot from 1 to 20"):
         ring_catalogue.designed(two, rings)
+
+
+@pytest.mark.parametrize("objective", ["peak_to_peak", "rms"])
+@pytest.mark.parametrize("least_field", [0.0, 5.0, 50.0])
+def test_best_pair_is_the_best_of_all(generator, objective, least_field):
+    """Random tables, with designs that have all, some, or none of the field that is asked."""
+    table = generator.normal(1.0, 0.1, (5, 4, 9))
+    task = Task(table, np.zeros(9), np.full(7, 1 / 7), objective, least_field, 5.5)
+    chosen = generator.integers(4, size=5)
+    total = task.total(chosen)
+    rest = total - table[np.arange(5), chosen]
+    values = {}
+    for a, b in combinations(range(5), 2):
+        for i, j in product(range(4), repeat=2):
+            changed = chosen.copy()
+            changed[[a, b]] = i, j
+            values[a, i, b, j] = float(task.value(task.total(changed)))
+    # all options of every place are tried, as there are fewer than `PAIRED`
+    least, new = _best_pair(task, rest, total, task.value(rest[:, None] + table))
+    (a, i), (b, j) = new.items()
+    assert least == pytest.approx(min(values.values()), rel=1e-9)
+    assert values[a, i, b, j] == pytest.approx(least, rel=1e-9)
+    assert least < (1 - 1e-5) * sorted(values.values())[1]  # the second best is another value

@@ -172,7 +172,10 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     scale = np.abs(local).max(axis=(1, 2))
     cuboid = (np.abs(sides[:, 0] + sides[:, 2]).max(axis=1) < 1e-9 * scale) & (
         np.abs(np.sum(sides[:, 0] * sides[:, 1], axis=1)) < 1e-9 * scale**2)
-    angle = np.where(cuboid, np.arctan2(sides[:, 0, 1], sides[:, 0, 0]), 0.0)
+    # along a side of a cuboid; along a diagonal of others, which no triangle lacks: so the cells of
+    # congruent sectors are equal in their frames
+    first = np.where(cuboid[:, None], sides[:, 0], local[:, 2] - local[:, 0])
+    angle = np.arctan2(first[:, 1], first[:, 0])
     turn = np.zeros((len(quads), 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
     turn[:, 1, 0], turn[:, 0, 1] = np.sin(angle), -np.sin(angle)

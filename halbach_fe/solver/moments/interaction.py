@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.threads import in_threads, share_out
@@ -28,7 +30,18 @@ cubes the error was 3e-4 of the reaction, and 6e-4 with degree 8."""
 
 TOUCHING, CLOSE = 1.0, 1.4
 """Distances of two cells, in units of the sum of their radii, below which they count as touching or
-close: 4 and 3 Gauss nodes per direction take the mean of the field, and 2 farther away."""
+close."""
+
+QUADRATURES = ((8, True), (4, False), (3, False), (3, False), (2, False))
+"""Gauss nodes per direction for the mean of the field of a near cell, and whether they are graded
+towards the faces: touching cells of one block, of two blocks, close ones of two blocks, other ones
+of one block, of two blocks. A block's own permeability makes its own cells matter most."""
+
+ALIKE = 1e-8
+"""Largest difference of congruent pairs of cells, relative to the largest cell."""
+
+MOST_KEPT = 10_000_000
+"""Largest number of near pairs whose matrices at 8 nodes are kept: 1 GB."""
 
 
 @dataclass(frozen=True)
@@ -124,21 +137,64 @@ class Interaction:
                 Neighbours.of(*items, len(targets.order)))
 
     @cached_property
+    def _kinds(self) -> tuple[Ints, Ints, Ints]:
+        """Congruent near pairs, which have equal matrices along the axes of their targets.
+
+        They are the first pair (k,) of every kind, the kind (n,) of every pair, and which of
+        `QUADRATURES` takes the mean for every kind, (k,).
+        """
+        cells, close = self.cells, self._pairs[1]
+        targets, sources = close.targets, close.sources
+        is_near = [near.touching(targets, sources, cells.centre, cells.radius, ratio)
+                   for ratio in (TOUCHING, TOUCHING + 1e-6, CLOSE)]
+        quadrature = np.where(
+            cells.block[targets] == cells.block[sources], np.where(is_near[1], 0, 3),
+            np.where(is_near[0], 1, np.where(is_near[2], 2, 4)))
+        scale = ALIKE * float(cells.radius.max())
+        shapes = np.unique(np.round(np.hstack([
+            cells.vertices.reshape(len(cells), -1) / scale, cells.half[:, None] / scale,
+            cells.cuboid[:, None]])), axis=0, return_inverse=True)[1].ravel()
+        keys = np.zeros(len(targets), np.uint64)
+        multipliers = iter(np.random.default_rng(0).integers(
+            1, 2**63, 15, dtype=np.uint64) * np.uint64(2) + np.uint64(1))
+
+        def distinguish(values: Floats | Ints) -> None:
+            """Add whole numbers (n,) to the keys, which are equal for equal numbers."""
+            mixed = (keys ^ np.round(values).astype(np.int64).astype(np.uint64)) * next(multipliers)
+            np.bitwise_xor(mixed, mixed >> np.uint64(31), out=keys)
+
+        for values in (shapes[targets], shapes[sources], quadrature):
+            distinguish(values)
+        offset = cells.centre[sources] - cells.centre[targets]
+        for i in range(3):
+            distinguish(np.einsum("nj,nj->n", cells.axes[targets, :, i], offset) / scale)
+            for j in range(3):
+                distinguish(np.einsum("nk,nk->n", cells.axes[targets, :, i],
+                                      cells.axes[sources, :, j]) / ALIKE)
+        _, first, kinds = np.unique(keys, return_index=True, return_inverse=True)
+        return first, kinds.ravel(), quadrature[first]
+
+    @cached_property
     def _matrices(self) -> Floats:
         """Means (n, 6) over the targets of the field matrices of all near pairs."""
-        close = self._pairs[1]
+        close, (first, kinds, quadrature) = self._pairs[1], self._kinds
         targets, sources = close.targets, close.sources
-        found = np.empty((len(sources), 6))
-        block = self.cells.block
-        within = block[targets] == block[sources]
-        found[within] = self._within_blocks(targets[within], sources[within])
-        touching, nearer = (
-            near.touching(targets, sources, self.cells.centre, self.cells.radius, ratio)
-            for ratio in (TOUCHING, CLOSE))
-        for which, nodes in ((touching, 4), (nearer & ~touching, 3), (~nearer, 2)):
-            chosen = np.flatnonzero(which & ~within)
-            found[chosen] = self._means(targets[chosen], sources[chosen], nodes)
+        of_kinds = np.empty((len(first), 6))
+        for number, (nodes, is_graded) in enumerate(QUADRATURES):
+            chosen = np.flatnonzero(quadrature == number)
+            pairs = first[chosen]
+            of_kinds[chosen] = self._means(targets[pairs], sources[pairs], nodes, is_graded)
+        turned = self._in_frames(targets[first], of_kinds)
+        found = np.empty((len(targets), 6))
+        in_threads(lambda first, last: near.turn_to_magnet(
+            targets, kinds, first, last, self.cells.axes, turned, found), share_out(len(targets)))
         return found
+
+    def _in_frames(self, targets: Ints, matrices: Floats) -> Floats:
+        """Return matrices (n, ..., 6) along the axes of cells (n,) instead of the magnet's."""
+        axes = self.cells.axes[targets].reshape(len(targets), *[1] * (matrices.ndim - 2), 3, 3)
+        inside = np.swapaxes(axes, -1, -2) @ matrix_of(matrices) @ axes
+        return np.ascontiguousarray(six_of(inside).reshape(matrices.shape))
 
     def _means(self, targets: Ints, sources: Ints, divisions: int, graded: bool = False) -> Floats:
         """Return means (n, 6) of field matrices by ``divisions`` Gauss nodes per direction."""
@@ -150,49 +206,6 @@ class Interaction:
             place, sources, first, last, *self.arrays, nodes, weights, found),
             share_out(len(targets)))
         return found
-
-    def _within_blocks(self, targets: Ints, sources: Ints) -> Floats:
-        """Return the means for pairs of cells of the same block; congruent blocks share them."""
-        block = self.cells.block
-        numbers, first, count = np.unique(block, return_index=True, return_counts=True)
-        known: dict[bytes, int] = {}
-        offset = np.empty(numbers[-1] + 1, np.int64)
-        start, size = np.zeros_like(offset), np.ones_like(offset)
-        start[numbers], size[numbers] = first, count
-        total, samples = 0, []
-        for number, begin, many in zip(numbers, first, count, strict=True):
-            key = self._signature(slice(begin, begin + many))
-            if key not in known:
-                known[key] = total
-                total += many * many
-                samples.append((begin, many))
-            offset[number] = known[key]
-        pairs = [np.stack(np.meshgrid(np.arange(a, a + n), np.arange(a, a + n), indexing="ij"),
-                          -1).reshape(-1, 2) for a, n in samples]
-        one, other = np.concatenate(pairs).T
-        table = self._means(one, other, 3)
-        touch = near.touching(one, other, self.cells.centre, self.cells.radius, TOUCHING + 1e-6)
-        table[touch] = self._means(one[touch], other[touch], 8, graded=True)
-        # along the axes of the first cell of the block
-        turns = self.cells.axes[start[block[one]]]
-        table = six_of(np.swapaxes(turns, 1, 2) @ matrix_of(table) @ turns)
-        found = np.empty((len(targets), 6))
-        for a in range(0, len(targets), 200_000):
-            part = slice(a, a + 200_000)
-            b = block[targets[part]]
-            index = offset[b] + (targets[part] - start[b]) * size[b] + sources[part] - start[b]
-            turn = self.cells.axes[start[b]]
-            found[part] = six_of(turn @ matrix_of(table[index]) @ np.swapaxes(turn, 1, 2))
-        return found
-
-    def _signature(self, part: slice) -> bytes:
-        """Return a key that is equal for congruent blocks whose cells have the same order."""
-        cells = self.cells
-        axes, centre = cells.axes[part], cells.centre[part]
-        scale = 1e-8 * cells.radius[part][0]
-        local = ((centre - centre[0]) @ axes[0] / scale, axes[0].T @ axes / 1e-8,
-                 cells.vertices[part] / scale, cells.half[part] / scale)
-        return np.concatenate([np.round(array.ravel()) + 0.0 for array in local]).tobytes()
 
     def _moments(self, dipoles: Floats, degree: int) -> tuple[Floats, Floats]:
         """Return the real and the imaginary parts of the moments of all clusters."""
@@ -273,6 +286,45 @@ class Interaction:
             found), close.shares(32))
         return found
 
+    def field_along(self, along: Floats) -> Callable[[Floats], tuple[Floats, Floats]]:
+        """Return a function for a polarization (n, 3) in T that changes from call to call.
+
+        It returns the component of mu_0 H along the unit vectors ``along`` (n, 3) at the nodes,
+        (n, q), and the mean of mu_0 H (n, 3), both in T. Matrices of near pairs are kept in single
+        precision, which leaves 1e-7 of the field, unless there are more than `MOST_KEPT`.
+        """
+        cells = self.cells
+        far, close = self._pairs
+        kept: NDArray[np.float32] | None = None
+        if len(close.sources) <= MOST_KEPT:
+            targets, (first, kinds, _) = close.targets, self._kinds
+            inside = self._in_frames(
+                targets[first], self._node_matrices(targets[first], close.sources[first]))
+            kept = np.empty((len(targets), cells.weights.shape[1], 3), np.float32)
+            in_threads(lambda first, last: near.rows_along(
+                targets, kinds, first, last, cells.axes, inside, along, kept),
+                share_out(len(targets)))
+
+        def field(polarization: Floats) -> tuple[Floats, Floats]:
+            at_nodes = self._far(
+                far, self.clusters, cells.nodes, self.dipoles(polarization), self.degree)
+            mean = cells.mean(at_nodes)
+            in_threads(lambda first, last: near.add_means(
+                close.starts, close.sources, self._matrices, polarization, first, last, mean),
+                close.shares(16))
+            if kept is None:
+                in_threads(lambda first, last: near.add_at_nodes(
+                    close.starts, close.sources, first, last, *self.arrays, cells.nodes,
+                    polarization, at_nodes), close.shares(32))
+                return np.einsum("nqi,ni->nq", at_nodes, along), mean
+            component = np.einsum("nqi,ni->nq", at_nodes, along)
+            in_threads(lambda first, last: near.add_along(
+                close.starts, close.sources, kept, polarization, first, last, component),
+                close.shares(16))
+            return component, mean
+
+        return field
+
     def panel(self, first: int, last: int) -> Floats:
         """Return the mean field of cells ``first`` to ``last`` in all cells, (3 n, 3 m)."""
         cells = self.cells
@@ -303,12 +355,15 @@ class Interaction:
         targets = close.targets
         chosen = near.touching(targets, close.sources, self.cells.centre, self.cells.radius, reach)
         close = Neighbours.of(targets[chosen], close.sources[chosen], len(self.cells))
-        targets = close.targets
+        return close, matrix_of(self._node_matrices(close.targets, close.sources))
+
+    def _node_matrices(self, targets: Ints, sources: Ints) -> Floats:
+        """Return the field matrices (n, q, 6) of source cells at the nodes of target cells."""
         found = np.empty((len(targets), self.cells.weights.shape[1], 6))
         in_threads(lambda first, last: near.node_matrices(
-            targets, close.sources, first, last, *self.arrays, self.cells.nodes, found),
+            targets, sources, first, last, *self.arrays, self.cells.nodes, found),
             share_out(len(targets)))
-        return close, matrix_of(found.reshape(-1, 6)).reshape(*found.shape[:2], 3, 3)
+        return found
 
     def readings(self, points: Floats) -> Floats:
         """Return the field at points (k, 3) in m per polarization of nodes, (k, 3, n, q, 3)."""

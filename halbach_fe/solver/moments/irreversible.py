@@ -155,25 +155,31 @@ def solve_irreversible(
     if applied is not None:
         outer = applied(cells.nodes.reshape(-1, 3)).reshape(cells.nodes.shape)
 
-    def kept(polarization: Floats) -> tuple[Floats, Floats]:
-        """Return p at the nodes (cells, q) and the mean of dp/dh (cells,) in 1/T."""
-        along = np.einsum("nqi,ni->nq", interaction.node_field(polarization) + outer, easy)
-        part, slope = law.kept_in_tubes(
+    outer_along, outer_mean = np.einsum("nqi,ni->nq", outer, easy), cells.mean(outer)
+
+    def kept(along: Floats, polarization: Floats) -> tuple[Floats, Floats]:
+        """Return p and dp/dh in 1/T at the nodes (cells, q) in the field along the easy axis."""
+        return law.kept_in_tubes(
             along, strength[:, None], np.einsum("ni,ni->n", polarization, easy)[:, None])
-        return part, np.einsum("nq,nq->n", cells.weights, slope)
 
-    def mean_kept(field: Floats, polarization: Floats) -> tuple[Floats, Floats]:
-        """Return the mean of p (cells,) and of dp/dh in the mean field (cells, 3)."""
-        if by_mean:
+    field_of = None if by_mean else interaction.field_along(easy)
+
+    def state(polarization: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the mean field (cells, 3) in T, and the means of p and of dp/dh (cells,)."""
+        if field_of is None:
+            field = interaction.mean_field(polarization) + outer_mean
             along = np.einsum("ni,ni->n", field, easy)
-            return law.kept(along), law.slope(along)
-        part, slope = kept(polarization)
-        return np.einsum("nq,nq->n", cells.weights, part), slope
+            return field, law.kept(along), law.slope(along)
+        along, field = field_of(polarization)
+        part, slope = kept(along + outer_along, polarization)
+        return (field + outer_mean, np.einsum("nq,nq->n", cells.weights, part),
+                np.einsum("nq,nq->n", cells.weights, slope))
 
-    polarization, part, steps = _uniform(system, strength, easy, mean_kept, cells.mean(outer))
+    polarization, part, steps = _uniform(system, strength, easy, state, 0.0 if by_mean else TUBE)
     # the polarization about the nodes differs as the field there does; its means stay
     field = interaction.node_field(polarization) + outer
-    at_nodes = law.kept(np.einsum("nqi,ni->nq", field, easy)) if by_mean else kept(polarization)[0]
+    along = np.einsum("nqi,ni->nq", field, easy)
+    at_nodes = law.kept(along) if by_mean else kept(along, polarization)[0]
     by_node = np.einsum("nij,nqj->nqi", chi, field) + (
         strength[:, None] * at_nodes)[..., None] * easy[:, None]
     by_node += (polarization - cells.mean(by_node))[:, None]
@@ -183,23 +189,22 @@ def solve_irreversible(
 
 def _uniform(
     system: System, strength: Floats, easy: Floats,
-    mean_kept: Callable[[Floats, Floats], tuple[Floats, Floats]], outer: Floats
+    state: Callable[[Floats], tuple[Floats, Floats, Floats]], tube: float
 ) -> tuple[Floats, Floats, int]:
     """Return the mean polarizations (cells, 3) in T, the mean part (cells,) of the remanence that
     is left, and the number of Newton's steps.
 
-    ``strength`` (cells,) in T and ``easy`` (cells, 3) are amount and direction of the remanence;
-    ``outer`` (cells, 3) in T is the mean of mu_0 H of other sources. ``mean_kept`` takes the mean
-    field and the polarization, both (cells, 3) in T, and returns that part and its derivative by
-    the field in 1/T.
+    ``strength`` (cells,) in T and ``easy`` (cells, 3) are amount and direction of the remanence.
+    ``state`` takes the polarization (cells, 3) in T and returns the mean of mu_0 H (cells, 3) in T,
+    that part, and its derivative by the field in 1/T; by the polarization along the easy axis it is
+    ``tube`` times as large.
     """
     interaction, chi = system.interaction, system.susceptibility
     scale = float(strength.max(initial=0.0))
 
     def residual(polarization: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the residual (cells, 3) in T, the part that is left, and its derivative."""
-        field = interaction.mean_field(polarization) + outer
-        part, slope = mean_kept(field, polarization)
+        field, part, slope = state(polarization)
         return (polarization - (strength * part)[:, None] * easy
                 - np.einsum("nij,nj->ni", chi, field)), part, slope
 
@@ -209,15 +214,16 @@ def _uniform(
         size = float(np.linalg.norm(left))
         if np.abs(left).max(initial=0.0) <= TOLERANCE * scale:
             return polarization, part, count
-        tangent = chi + (strength * slope)[:, None, None] * (
-            easy[:, :, None] * easy[:, None])
+        by_field = (strength * slope)[:, None, None] * (easy[:, :, None] * easy[:, None])
+        tangent, own = chi + by_field, np.eye(3) - tube * by_field
 
-        def times(vector: Floats, tangent: Floats = tangent) -> Floats:
+        def times(vector: Floats, tangent: Floats = tangent, own: Floats = own) -> Floats:
             step = vector.reshape(-1, 3)
             field = interaction.mean_field(step, INNER_DEGREE)
-            return np.asarray(step - np.einsum("nij,nj->ni", tangent, field)).ravel()
+            return np.asarray(np.einsum("nij,nj->ni", own, step)
+                              - np.einsum("nij,nj->ni", tangent, field)).ravel()
 
-        inverse = np.asarray(np.linalg.inv(np.eye(3) + OWN_FIELD * tangent), float)
+        inverse = np.asarray(np.linalg.inv(own + OWN_FIELD * tangent), float)
 
         def precondition(vector: Floats, inverse: Floats = inverse) -> Floats:
             return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).ravel()

@@ -11,6 +11,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.solver.prism_kernel import Six, compiled, prism_field
 
 Flags = NDArray[np.bool_]
+Singles = NDArray[np.float32]
 
 
 @compiled
@@ -94,6 +95,55 @@ def add_at_nodes(starts: Ints, sources: Ints, first: int, last: int, centre: Flo
                 out[t, q, 0] += g[0] * jx + g[3] * jy + g[4] * jz
                 out[t, q, 1] += g[3] * jx + g[1] * jy + g[5] * jz
                 out[t, q, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def turn_to_magnet(targets: Ints, kinds: Ints, first: int, last: int, axes: Floats,
+                   matrices: Floats, out: Floats) -> None:
+    """Write matrices (pairs, 6) along the axes of the magnet from those of kinds of pairs.
+
+    ``matrices`` (kinds, 6) are along the axes of the target cells, and ``kinds`` (pairs,) says
+    which belongs to a pair.
+    """
+    for pair in range(first, last):
+        m = matrices[kinds[pair]]
+        g = turned(axes[targets[pair]], (m[0], m[1], m[2], m[3], m[4], m[5]))
+        for c in range(6):
+            out[pair, c] = g[c]
+
+
+@compiled
+def rows_along(targets: Ints, kinds: Ints, first: int, last: int, axes: Floats, matrices: Floats,
+               along: Floats, out: Singles) -> None:
+    """Write the component along ``along`` (cells, 3) of fields at the nodes of target cells.
+
+    The result (pairs, q, 3) is per component of the polarization of the source cells, by
+    ``matrices`` (kinds, q, 6) as for `turn_to_magnet`.
+    """
+    for pair in range(first, last):
+        frame, u = axes[targets[pair]], along[targets[pair]]
+        x = frame[0, 0] * u[0] + frame[1, 0] * u[1] + frame[2, 0] * u[2]
+        y = frame[0, 1] * u[0] + frame[1, 1] * u[1] + frame[2, 1] * u[2]
+        z = frame[0, 2] * u[0] + frame[1, 2] * u[1] + frame[2, 2] * u[2]
+        for q in range(matrices.shape[1]):
+            m = matrices[kinds[pair], q]
+            px = m[0] * x + m[3] * y + m[4] * z
+            py = m[3] * x + m[1] * y + m[5] * z
+            pz = m[4] * x + m[5] * y + m[2] * z
+            for c in range(3):
+                out[pair, q, c] = frame[c, 0] * px + frame[c, 1] * py + frame[c, 2] * pz
+
+
+@compiled
+def add_along(starts: Ints, sources: Ints, matrices: Singles, polarization: Floats, first: int,
+              last: int, out: Floats) -> None:
+    """Add the fields of near cells by `rows_along` at the nodes (n, q) of target cells."""
+    for t in range(first, last):
+        for pair in range(starts[t], starts[t + 1]):
+            jx, jy, jz = polarization[sources[pair]]
+            for q in range(matrices.shape[1]):
+                g = matrices[pair, q]
+                out[t, q] += g[0] * jx + g[1] * jy + g[2] * jz
 
 
 @compiled

@@ -9,8 +9,8 @@ import pytest
 
 from halbach_fe.solver.moments import tree
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.solver.moments.interaction import Interaction
-from tests.solver.moments.bodies import cuboid
+from halbach_fe.solver.moments.interaction import QUADRATURES, Interaction
+from tests.solver.moments.bodies import block, cuboid
 
 SIDE = 0.01
 
@@ -81,3 +81,42 @@ def test_points(cells, generator):
     np.testing.assert_allclose(found, exact, atol=5e-3 * np.abs(exact).max())
     coarse = replace(interaction, reading_degree=1).field_at(points, polarization)
     assert np.abs(coarse - exact).max() > 1e-2 * np.abs(exact).max()
+
+
+def ring(turned=0.0):
+    """A ring of 8 sectors, the first of which is turned about its middle by an angle in rad."""
+    turns = np.arange(8) * np.pi / 4
+    blocks = [block("sector", turn=(0.0, 0.0, turn)) for turn in turns]
+    return [replace(blocks[0], orientation_rad=(0.0, 0.0, turned)), *blocks[1:]]
+
+
+def test_congruent_pairs_share_their_matrices():
+    """In a ring all blocks are alike, so that an eighth of the pairs represent all of them,
+    and fewer where layers are alike too. The matrices are those of every pair by itself.
+    """
+    interaction = Interaction(cells_of(ring(), 2), opening=0.0)
+    close, (first, _, quadrature) = interaction._pairs[1], interaction._kinds
+    assert len(close.sources) / 16 < len(first) <= len(close.sources) / 8
+    targets, sources = close.targets, close.sources
+    for number, (nodes, is_graded) in enumerate(QUADRATURES):
+        some = np.flatnonzero(quadrature[interaction._kinds[1]] == number)[::7]
+        np.testing.assert_allclose(
+            interaction._matrices[some],
+            interaction._means(targets[some], sources[some], nodes, is_graded), atol=1e-8)
+    # a block that is turned a little shares nothing with the others but what is inside it
+    other = Interaction(cells_of(ring(1e-5), 2), opening=0.0)
+    assert len(other._kinds[0]) > 1.5 * len(first)
+
+
+@pytest.mark.parametrize("most", [10**6, 0])
+def test_field_along_an_axis(monkeypatch, generator, most):
+    """Whether matrices are kept, in single precision, or computed each time."""
+    monkeypatch.setattr("halbach_fe.solver.moments.interaction.MOST_KEPT", most)
+    interaction = Interaction(cells_of(ring(), 2))
+    polarization = generator.normal(size=(len(interaction.cells), 3))
+    along = generator.normal(size=polarization.shape)
+    at_nodes, mean = interaction.field_along(along)(polarization)
+    expected = interaction.node_field(polarization)
+    np.testing.assert_allclose(at_nodes, np.einsum("nqi,ni->nq", expected, along), atol=1e-5)
+    np.testing.assert_allclose(mean, interaction.mean_field(polarization), atol=1e-12)
+    assert np.abs(at_nodes - np.einsum("nqi,ni->nq", expected, along[::-1])).max() > 0.1
