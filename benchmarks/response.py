@@ -93,8 +93,8 @@ def process_per_column_seconds(folder: Path) -> float:
             runner.run(find_getdp(), runner.Job(
                 problem="azimuthal_modes.pro", mesh="meridian.msh", resolution="Modes",
                 outputs=("gradients.txt",), solutions="solutions.bin", solves=modes,
-                numbers={"VACUUM": "vacuum" in run.name, "FIRST_SOURCE": source, "LAST_SOURCE": source,
-                         "PRINTED_SOURCE": source}), run)
+                numbers={"VACUUM": "vacuum" in run.name, "FIRST_SOURCE": source,
+                         "LAST_SOURCE": source, "PRINTED_SOURCE": source}), run)
         seconds.append((time.monotonic() - started) / 2)
     return float(np.mean(seconds))
 

@@ -70,8 +70,8 @@ SOLVED_NUMBERS = 2**28
 read."""
 
 SHARED_UNKNOWNS = 100_000
-"""Unknowns of all modes that the nominal array shares a run for. GetDP takes 0.2 s to start, as long
-as a mode of 10 000 unknowns; larger modes are runs of their own, side by side."""
+"""Largest number of unknowns of the nominal array's modes that share a run of GetDP. It takes 0.2 s
+to start, as long as a mode of 10 000 unknowns. Large modes are runs of their own, side by side."""
 
 MAX_MODES = 64
 """Highest mode up to which this route applies; points close to the blocks need more modes."""
