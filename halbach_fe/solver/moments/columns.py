@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.sparse import bsr_array
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.solver.moments.interaction import Neighbours
 from halbach_fe.solver.moments.solve import MAX_STEPS, System
 
 PANEL = 256
@@ -55,26 +57,46 @@ def reaction_columns(
     found = np.zeros((len(blocks), len(points), 3, 3))
     if np.any(system.susceptibility):
         deviations, extra = _deviations(system)
-        panels = _Panels(system, {})
+        panels = _Panels(system, extra, {})
         step = max(1, AT_ONCE // (9 * len(system.remanence)))
         for first in range(0, len(points), step):
             part = slice(first, first + step)
-            found[:, part] = _some(system, np.array(points[part], float), deviations, extra,
-                                   panels)
+            found[:, part] = _some(system, np.array(points[part], float), deviations, panels)
     return lambda number, some: found[number, some]
 
 
-def _deviations(system: System) -> tuple[Any, Any]:
+@dataclass(frozen=True)
+class _Deviations:
+    """The polarization at nodes beyond its mean, per polarization of near cells.
+
+    Attributes
+    ----------
+    close : Neighbours
+        Pairs of a cell and the near ones that polarize it.
+    matrices : ndarray, shape (pairs, q, 3, 3)
+    """
+
+    close: Neighbours
+    matrices: Floats
+
+    def add(self, by_node: Floats, to: Floats) -> None:
+        """Add readings per polarization of the cells, by those per polarization of the nodes.
+
+        The latter are rows (r, n, q, 3), the former (r, n, 3).
+        """
+        starts, rows = self.close.starts.tolist(), len(by_node)
+        for target, (first, last) in enumerate(pairwise(starts)):
+            matrix = np.moveaxis(self.matrices[first:last], 0, 2).reshape(-1, 3 * (last - first))
+            # a cell has each of its near cells once
+            to[:, self.close.sources[first:last]] += (
+                by_node[:, target].reshape(rows, -1) @ matrix).reshape(rows, -1, 3)
+
+
+def _deviations(system: System) -> tuple[_Deviations, Any]:
     """Return what the field of near cells makes of polarizations beyond uniform ones.
 
-    Both results are transposed, because they multiply rows from the right.
-
-    Returns
-    -------
-    deviations : sparse array, shape (3 n, 3 n q)
-        Deviation of the polarization at the nodes from its mean, per polarization of the cells.
-    extra : sparse array, shape (3 n, 3 n)
-        Mean field of these deviations over near cells.
+    With it comes the mean field of these deviations over near cells per polarization of the cells,
+    a sparse array (3 n, 3 n).
     """
     cells = system.interaction.cells
     count, nodes = cells.weights.shape
@@ -88,15 +110,19 @@ def _deviations(system: System) -> tuple[Any, Any]:
     share = (cells.weights * cells.volume[:, None])[targets] / cells.volume[close.sources, None]
     means = sparse(field * share[..., None, None])
     field -= np.einsum("pq,pqij->pij", cells.weights[targets], field)[:, None]
-    deviations = sparse(system.susceptibility[targets, None] @ field)
-    return deviations.T, (means.T @ deviations).T
+    matrices = system.susceptibility[targets, None] @ field
+    return _Deviations(close, matrices), (means.T @ sparse(matrices)).tocsc()
 
 
 @dataclass(frozen=True)
 class _Panels:
-    """The mean field of cells in all cells, for a part of the sources at a time."""
+    """The mean field of cells in all cells, for a part of the sources at a time.
+
+    ``extra`` is that of the deviations within near cells, see `_deviations`.
+    """
 
     system: System
+    extra: Any
     kept: dict[int, NDArray[np.float32]]
 
     def add(self, rows: Floats, to: Floats) -> None:
@@ -106,29 +132,31 @@ class _Panels:
             last = min(first + PANEL, count)
             panel = self.kept.get(first)
             if panel is None:
-                panel = self.system.interaction.panel(first, last).astype(np.float32)
+                panel = (self.system.interaction.panel(first, last)
+                         + self.extra[:, 3 * first:3 * last].toarray()).astype(np.float32)
                 if 36 * count**2 <= KEPT:
                     self.kept[first] = panel
             to[:, 3 * first:3 * last] += short @ panel
 
 
-def _some(system: System, points: Floats, deviations: Any, extra: Any,
-          panels: _Panels) -> Floats:
+def _some(
+    system: System, points: Floats, deviations: _Deviations, panels: _Panels
+) -> Floats:
     """Return the columns (blocks, k, 3, 3) for some points (k, 3) in m."""
     interaction, chi = system.interaction, system.susceptibility
     count = len(chi)
     rows, size = 3 * len(points), 3 * count
     uniform, start = np.empty((rows, size)), np.empty((rows, size))
-    step = max(1, AT_ONCE // (4 * 3 * deviations.shape[1]))
+    step = max(1, AT_ONCE // (9 * interaction.cells.weights.size))
     for first in range(0, len(points), step):
         by_node = interaction.readings(points[first:first + step])
         part = slice(3 * first, 3 * first + 3 * len(by_node))
-        uniform[part] = by_node.sum(axis=3).reshape(-1, size)
-        start[part] = uniform[part] + _times(by_node.reshape(-1, deviations.shape[1]), deviations)
+        start[part] = uniform[part] = by_node.sum(axis=3).reshape(-1, size)
+        deviations.add(by_node.reshape(-1, *by_node.shape[2:]), start[part].reshape(-1, count, 3))
     damping, total = 2 / (2 + system.largest_susceptibility), start
     for _ in range(MAX_STEPS):
         back = np.einsum("rni,nij->rnj", total.reshape(rows, count, 3), chi).reshape(rows, size)
-        change = start - total + _times(back, extra)
+        change = start - total
         panels.add(back, change)
         total = total + damping * change
         if np.abs(change).max() <= TOLERANCE * np.abs(start).max():
@@ -137,8 +165,3 @@ def _some(system: System, points: Floats, deviations: Any, extra: Any,
     np.add.at(found, interaction.cells.block, np.moveaxis(
         (total - uniform).reshape(rows, count, 3), 1, 0))
     return found.reshape(system.blocks, len(points), 3, 3)
-
-
-def _times(rows: Floats, transposed: Any) -> Floats:
-    """Return the product of dense rows and a sparse matrix, which is given transposed."""
-    return np.asarray((transposed @ rows.T).T)
