@@ -187,7 +187,7 @@ def test_the_command_writes_a_study_that_infers(generator, tmp_path, capsys):
     assert "middle of the map lies at" in capsys.readouterr().err
     page = (tmp_path / "out" / "registration.html").read_text()
     assert "Where does the map lie" in page
-    for column in ("middle of the map in mm", "turned about the axis by mrad"):
+    for column in ("z in mm", "about z in mrad"):
         assert f"<th>{column}</th>" in page
     summary = json.loads((tmp_path / "out" / "registration.json").read_text())
     assert sum(pose["odds"] for pose in summary["poses"]) == pytest.approx(1.0)
