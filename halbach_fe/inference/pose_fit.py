@@ -69,6 +69,9 @@ AT_REST, NO_BETTER = 0.02, 1e-3
 """A fit is at rest if no step is longer than the first, in standard deviations of a parameter, or
 if a step decreases chi-squared by a smaller part than the second."""
 
+NO_BETTER_ON_A_LINE = 1e-4
+"""The same on a line, where place, step, length and bore stand in for each other."""
+
 SEEN = 0.1
 """Combinations of blocks' deviations are left out whose rms effect is below this part of the noise
 of a reading."""
@@ -267,7 +270,7 @@ class PoseFit:
         for blurred in self._blur(state):
             # noise of positions grows with the gradient: a fit would look for one, so it is held
             sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
-            at_rest = False
+            at_rest, renewed = False, False
 
             def reach(state: _State, blurred: float = blurred) -> float:
                 """Return how far in m the block columns hold; on a line only the noise counts."""
@@ -294,10 +297,16 @@ class PoseFit:
                         if now <= chi2:
                             break
                     share /= 2
-                else:
-                    break
-                pose, values, state, columns = other, changed, tried, near
-                if chi2 - now < NO_BETTER * chi2:
+                else:  # the derivatives may be those of another place
+                    if renewed:
+                        break
+                    self.derivatives.clear()
+                    columns = self._columns(pose, values)
+                    state, renewed = self._state(pose, values, columns), True
+                    continue
+                pose, values, state, columns, renewed = other, changed, tried, near, False
+                if chi2 - now < chi2 * (
+                        NO_BETTER_ON_A_LINE if self.on_a_line else NO_BETTER):
                     at_rest = True
                     break
             state = state.with_noise(None)
@@ -374,13 +383,7 @@ class PoseFit:
     def _columns(self, pose: Floats, values: Floats) -> _BlockColumns:
         """Return the field of the blocks' magnetizations at a pose."""
         middle = self._middle(pose, values)
-        fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
-            self.magnet.blocks, unit_fields(self.magnet.blocks, middle), strict=True)]
-        variations = self.variations
-        if variations is not None:
-            fields.append(variations.fields(middle))
-        root = root_matrix(self.prior.root)
-        whole = np.concatenate(fields, axis=2)
+        whole, root = self._unit_fields(middle), root_matrix(self.prior.root)
         nominal = np.zeros(whole.shape[-1])
         nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
         flat = whole.reshape(-1, whole.shape[-1])
@@ -389,7 +392,27 @@ class PoseFit:
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
-        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept])
+        combined = root @ directions[:, kept]
+        slopes = None
+        if self.on_a_line:
+            slopes = np.empty((*columns.shape[:2], int(kept.sum()), 3))
+            for axis in range(2):
+                step = DIFFERENCE_M * np.eye(3)[axis]
+                slopes[..., axis] = (self._unit_fields(middle + step) - whole) @ combined / (
+                    DIFFERENCE_M)
+            # there are no currents and no magnets: curl B = 0, div B = 0
+            slopes[:, :2, :, 2] = np.moveaxis(slopes[:, 2, :, :2], -1, 1)
+            slopes[:, 2, :, 2] = -slopes[:, 0, :, 0] - slopes[:, 1, :, 1]
+        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept],
+                             slopes)
+
+    def _unit_fields(self, places: Floats) -> Floats:
+        """Return B (n, 3, parameters) at places (n, 3) in m per parameter of the blocks."""
+        fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
+            self.magnet.blocks, unit_fields(self.magnet.blocks, places), strict=True)]
+        if self.variations is not None:
+            fields.append(self.variations.fields(places))
+        return np.concatenate(fields, axis=2)
 
     def _magnet(self, values: Floats) -> Magnet:
         """Return the magnet with the values of the open keys."""
@@ -440,6 +463,16 @@ class PoseFit:
         matrix = sensor_matrix(instrument)
         here, gradient = field_at_sensors(self._field(values), sensors)
         residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
+        at_mean = gradient.mean(axis=1)
+        sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
+            "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
+        own_fields = near.at(middle)
+        by_block = np.einsum("ij,njk->nik", matrix, own_fields)
+        if near.slopes is not None:
+            # of the magnet whose blocks explain the readings here: a line bends them far
+            amounts = _amounts(residual, by_block, sigma, self.training)
+            here = here + (own_fields @ amounts)[:, None]
+            gradient = gradient + np.einsum("nckj,k->ncj", near.slopes, amounts)[:, None]
         columns = list(np.moveaxis(by_terms(
             instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
             gradient, STEADY), -1, 0))
@@ -453,11 +486,7 @@ class PoseFit:
             moved = sensor_positions(other, self.points) - sensors
             there = here + np.einsum("nsck,nsk->nsc", gradient, moved)
             columns.append((seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL)
-        at_mean = gradient.mean(axis=1)
-        sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
-            "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
-        return _State(residual, np.stack(columns, axis=-1),
-                      np.einsum("ij,njk->nik", matrix, near.fields), sigma,
+        return _State(residual, np.stack(columns, axis=-1), by_block, sigma,
                       np.concatenate([self.pose_sd, self.prior_sd()]),
                       self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(
                           at_mean**2, axis=(1, 2)))))))
@@ -476,12 +505,32 @@ class _BlockColumns:
         B of the prior's mean less that of the nominal magnet.
     directions : ndarray, shape (columns of the prior's root, k)
         The combinations.
+    slopes : ndarray, shape (n, 3, k, 3), in T/m, optional
+        Derivatives of ``fields`` along x, y and z, on a line.
     """
 
     places: Floats
     fields: Floats
     shift: Floats
     directions: Floats
+    slopes: Floats | None = None
+
+    def at(self, places: Floats) -> Floats:
+        """Return the fields (n, 3, k) in T at places (n, 3) in m near those of the map."""
+        if self.slopes is None:
+            return self.fields
+        return self.fields + np.einsum("nckj,nj->nck", self.slopes, places - self.places)
+
+
+def _amounts(
+    residual: Floats, by_block: Floats, sigma: Floats, training: NDArray[np.bool_]
+) -> Floats:
+    """Return the most probable amounts (k,) of the blocks' combinations at a fixed pose."""
+    rows = by_block[training] / sigma[training][:, None]
+    inner = rows.T @ rows
+    inner[np.diag_indices(len(inner))] += 1.0
+    return np.asarray(cho_solve(cho_factor(inner, lower=True),
+                                rows.T @ (residual[training] / sigma[training])))
 
 
 @dataclass(frozen=True)

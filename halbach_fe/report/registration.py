@@ -140,14 +140,14 @@ def pose_table(
 
 
 def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
-    """Return rows of text, one per pose and axis of the magnet."""
-    return [{"pose": str(number), "axis of the magnet": axis,
-             "middle of the map in mm": with_error(1e3 * middle, 1e3 * middle_sd),
-             "turned about the axis by mrad": with_error(1e3 * turn, 1e3 * turn_sd)}
-            for number, each in enumerate(found, 1)
-            for axis, middle, middle_sd, turn, turn_sd in zip(
-                "xyz", each.middle_m, each.translation_sd_m, turn_from_axes(each.instrument),
-                each.rotation_sd_rad, strict=True)]
+    """Return a row of text per pose: the middle of the map in mm, and its turns in mrad."""
+    return [{"pose": str(number),
+             **{f"{axis} in mm": with_error(1e3 * value, 1e3 * sd) for axis, value, sd in zip(
+                 COMPONENTS, each.middle_m, each.translation_sd_m, strict=True)},
+             **{f"about {axis} in mrad": with_error(1e3 * value, 1e3 * sd)
+                for axis, value, sd in zip(COMPONENTS, turn_from_axes(each.instrument),
+                                           each.rotation_sd_rad, strict=True)}}
+            for number, each in enumerate(found, 1)]
 
 
 def probe_table(instrument: Instrument) -> list[dict[str, str]]:

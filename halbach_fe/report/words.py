@@ -46,7 +46,8 @@ def with_error(value: float, sd: float) -> str:
     if not abs(sd) > ROUNDING * abs(value):
         return f"{value:.6g}"
     places = int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))
-    return f"{value:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
+    rounded = round(value, places) + 0.0  # without a sign where it is 0
+    return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
 
 
 def ppm(value: float) -> str:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,7 @@ from halbach_fe.solver.iron_grid import IronRectangle, Resolution
 from halbach_fe.solver.session import Session
 
 if TYPE_CHECKING:
+    from halbach_fe.solver.moments.irreversible import KneeLaw
     from halbach_fe.solver.moments.solve import Moments, System
 
 ALTERNATION_TOLERANCE = 1e-6
@@ -138,10 +139,10 @@ def solve_separate(
     GetDPError
         If the iron cannot be solved.
     """
-    blocks = present_blocks(magnet.blocks)
-    systems = _systems(magnet)[:2 if estimate else 1]
+    own = _Blocks.of(magnet, 2 if estimate else 1)
     if not magnet.iron:
-        return _reaction(magnet, systems, None)
+        return _alone(own)
+    blocks, systems = own.blocks, own.systems()
     bodies = iron_rectangles(magnet)
     remanent = _remembered(field_in_vacuum(blocks))
     if not systems:
@@ -152,14 +153,14 @@ def solve_separate(
     scale = max(abs(block.remanence) for block in blocks)
     before = iron.field(middles)
     for _ in range(MAX_TURNS):
-        polarized = _polarized(magnet, systems[0], iron.field)
+        polarized = own.polarized(systems[0], iron.field)
         source = _sum(remanent, partial(polarized.reaction, degree=IRON_DEGREE))
         iron = solve_iron(bodies, source, session, magnet.name, estimate=False, start=iron)
         now = iron.field(middles)
         if np.abs(now - before).max() <= ALTERNATION_TOLERANCE * scale:
             if estimate:
                 iron = solve_iron(bodies, source, session, magnet.name, start=iron)
-            return _reaction(magnet, systems, iron)
+            return own.reaction(systems, iron)
         before = now
     raise HalbachError(
         f"Blocks and iron of study {magnet.name} do not come to rest in {MAX_TURNS} turns: the "
@@ -267,45 +268,85 @@ def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
     return any(not block.isotropic or block.recoil_permeability != 1.0 for block in blocks)
 
 
-def _systems(magnet: Magnet) -> tuple[System, ...]:
-    """Return the blocks in cells of two sizes, see `refinement`; none where nothing reacts."""
-    blocks = present_blocks(magnet.blocks)
-    if not _permeable(blocks) and not magnet.has_losses:
-        return ()
-    from halbach_fe.solver.moments.solve import refinement  # imports numba
+@dataclass(frozen=True)
+class _Blocks:
+    """What the polarization of blocks depends on.
 
-    return refinement(blocks, magnet.study.mesh.cells_per_side)
-
-
-def _reaction(
-    magnet: Magnet, systems: Sequence[System], iron: IronReaction | None
-) -> SeparateReaction:
-    """Return the reaction of blocks in the field of the iron, with another if there are two systems
-    for its error bar.
+    Attributes
+    ----------
+    blocks : tuple of MagnetBlock
+        Those that are there.
+    law : KneeLaw or None
+        Of irreversible losses, if there are any.
+    varies : bool
+        Whether the study infers variations inside the blocks.
+    cells_per_side : int or None
+        See `halbach_fe.solver.moments.solve.refinement`.
+    sizes : int
+        Number of sizes of the cells: 2 for error bars.
     """
-    applied = None if iron is None else iron.field
-    if not magnet.has_losses or len(systems) < 2:
-        return SeparateReaction(
-            tuple(_polarized(magnet, system, applied) for system in systems), iron)
-    laws = (False,) if magnet.study.prior.variation_sd > 0 else (False, True)
-    return SeparateReaction(
-        tuple(_polarized(magnet, systems[0], applied, by_mean) for by_mean in laws), iron,
-        tuple(system.solve(applied) for system in systems))
+
+    blocks: tuple[MagnetBlock, ...]
+    law: KneeLaw | None
+    varies: bool
+    cells_per_side: int | None
+    sizes: int
+
+    @classmethod
+    def of(cls, magnet: Magnet, sizes: int) -> _Blocks:
+        """Return those of a magnet."""
+        law, material = None, magnet.study.demagnetization
+        if magnet.has_losses and material is not None:
+            from halbach_fe.solver.moments.irreversible import KneeLaw  # imports numba
+
+            law = KneeLaw.of(material)
+        return cls(present_blocks(magnet.blocks), law, magnet.study.prior.variation_sd > 0,
+                   magnet.study.mesh.cells_per_side, sizes)
+
+    def systems(self) -> tuple[System, ...]:
+        """Return the blocks in cells, see `refinement`; none where nothing reacts."""
+        if not _permeable(self.blocks) and self.law is None:
+            return ()
+        from halbach_fe.solver.moments.solve import refinement  # imports numba
+
+        return refinement(self.blocks, self.cells_per_side)[:self.sizes]
+
+    def reaction(
+        self, systems: Sequence[System], iron: IronReaction | None = None,
+        known: Sequence[Moments] = (),
+    ) -> SeparateReaction:
+        """Return the reaction of blocks in the field of the iron, with another if there are two
+        systems for its error bar.
+
+        ``known`` is the polarization of the first system, if it has been solved.
+        """
+        applied = None if iron is None else iron.field
+        first = known or [self.polarized(system, applied) for system in systems[:1]]
+        if self.law is None or len(systems) < 2:
+            return SeparateReaction(
+                (*first, *(self.polarized(system, applied) for system in systems[1:])), iron)
+        by_mean = () if self.varies else (self.polarized(systems[0], applied, by_mean=True),)
+        return SeparateReaction((*first, *by_mean), iron,
+                                tuple(system.solve(applied) for system in systems))
+
+    def polarized(self, system: System, applied: Field | None = None,
+                  by_mean: bool = False) -> Moments:
+        """Return the polarization of the blocks, less what they have lost irreversibly.
+
+        ``by_mean`` tells whether to use the mean field of the cells, see `solve_irreversible`.
+        """
+        if self.law is None:
+            return system.solve(applied)
+        from halbach_fe.solver.moments.irreversible import solve_irreversible
+
+        return solve_irreversible(system, self.law, applied, by_mean=by_mean)[0]
 
 
-def _polarized(magnet: Magnet, system: System, applied: Field | None = None,
-               by_mean: bool = False) -> Moments:
-    """Return the polarization of the blocks, less what they have lost irreversibly if they have.
-
-    ``by_mean`` tells whether to use the mean field of the cells, see `solve_irreversible`.
-    """
-    if not magnet.has_losses:
-        return system.solve(applied)
-    from halbach_fe.solver.moments.irreversible import KneeLaw, solve_irreversible
-
-    assert magnet.study.demagnetization is not None  # there are losses
-    return solve_irreversible(
-        system, KneeLaw.of(magnet.study.demagnetization), applied, by_mean=by_mean)[0]
+@lru_cache(maxsize=4)  # every map of a campaign, and every round of an update, asks for the same
+def _alone(own: _Blocks) -> SeparateReaction:
+    """Return the reaction of blocks without iron."""
+    known = _alone(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
+    return own.reaction(own.systems(), known=known)
 
 
 def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
