@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -53,12 +53,11 @@ from halbach_fe.measurement.instrument_terms import (
 )
 from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.response.block_variation import Variations, study_prior
-from halbach_fe.solver.exact_block_field import unit_fields
+from halbach_fe.response.block_variation import study_prior
+from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.solver.formulation_choice import field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
@@ -153,7 +152,7 @@ class PoseFit:
     open: tuple[OpenKey, ...]
     pose_sd: Floats
     on_known_stage: bool
-    variations: Variations | None
+    deviations: Deviations
     prior: Gaussian
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
@@ -190,13 +189,13 @@ class PoseFit:
             study = study.with_(noise=None)
         sigma = np.ones(measured.size)
         sigma[entries] = reading_noise(magnet.with_study(study), observation, data).sd
-        variations = Variations.of(magnet)
+        deviations = Deviations.of(magnet)
         if blocks is None:
-            blocks = study_prior(magnet, len(variations.names) if variations is not None else 0)
+            blocks = study_prior(magnet, deviations.count - len(magnet.parameter_names))
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
                    session, probe, base, open_keys, pose.sd(magnet), pose.stage is not None,
-                   variations, blocks)
+                   deviations, blocks)
 
     @property
     def smallest_sigma(self) -> float:
@@ -384,10 +383,8 @@ class PoseFit:
         """Return the field of the blocks' magnetizations at a pose."""
         middle = self._middle(pose, values)
         whole, root = self._unit_fields(middle), root_matrix(self.prior.root)
-        nominal = np.zeros(whole.shape[-1])
-        nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
         flat = whole.reshape(-1, whole.shape[-1])
-        shift = (flat @ (self.prior.mean - nominal)).reshape(-1, 3)
+        shift = (flat @ (self.prior.mean - self._nominal)).reshape(-1, 3)
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
@@ -408,11 +405,14 @@ class PoseFit:
 
     def _unit_fields(self, places: Floats) -> Floats:
         """Return B (n, 3, parameters) at places (n, 3) in m per parameter of the blocks."""
-        fields = [unit @ (MU_0 * block.recoil_tensor) for block, unit in zip(
-            self.magnet.blocks, unit_fields(self.magnet.blocks, places), strict=True)]
-        if self.variations is not None:
-            fields.append(self.variations.fields(places))
-        return np.concatenate(fields, axis=2)
+        return self.deviations.columns(places).reshape(len(places), 3, -1)
+
+    @property
+    def _nominal(self) -> Floats:
+        """The nominal magnetizations in A/m, and amplitudes of variations, (parameters,)."""
+        nominal = np.zeros(self.deviations.count)
+        nominal[:3 * len(self.magnet.blocks)] = self.magnet.nominal_magnetization
+        return nominal
 
     def _magnet(self, values: Floats) -> Magnet:
         """Return the magnet with the values of the open keys."""
@@ -468,11 +468,16 @@ class PoseFit:
             "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
         own_fields = near.at(middle)
         by_block = np.einsum("ij,njk->nik", matrix, own_fields)
+        # the derivatives are those in the field of the blocks that explain the readings here best
+        amounts = _amounts(residual, by_block, sigma, self.training)
         if near.slopes is not None:
-            # of the magnet whose blocks explain the readings here: a line bends them far
-            amounts = _amounts(residual, by_block, sigma, self.training)
             here = here + (own_fields @ amounts)[:, None]
             gradient = gradient + np.einsum("nckj,k->ncj", near.slopes, amounts)[:, None]
+        else:
+            deviations = self.prior.mean - self._nominal + root_matrix(self.prior.root) @ (
+                near.directions @ amounts)
+            own = field_at_sensors(partial(self.deviations.field, deviations), sensors)
+            here, gradient = here + own[0], gradient + own[1]
         columns = list(np.moveaxis(by_terms(
             instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
             gradient, STEADY), -1, 0))
