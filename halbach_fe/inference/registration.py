@@ -114,11 +114,12 @@ def register(
         for number, start in enumerate(starts):
             say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
                 + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
+            reached = [fit.refined(start)]
             if fit.open and fit.on_a_line:
                 if number not in without:
                     without[number] = closed.refined(start)
-                start = _pose(without[number])
-            by_fit[-1].append(fit.refined(start))
+                reached.append(fit.refined(_pose(without[number])))
+            by_fit[-1].append(max(reached, key=lambda each: each.log_evidence))
     best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
     for fit, own in zip(fits, by_fit, strict=True):
         # no hypothesis shall lose because it came to rest somewhere else
