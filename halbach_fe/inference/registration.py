@@ -119,7 +119,10 @@ def register(
                 if number not in without:
                     without[number] = closed.refined(start)
                 reached.append(fit.refined(_pose(without[number])))
-            by_fit[-1].append(max(reached, key=lambda each: each.log_evidence))
+            direct, detour = reached[0], reached[-1]
+            # a detour may end in an equal pose, which is that of another start
+            by_fit[-1].append(detour if detour.log_evidence > direct.log_evidence
+                              + EQUAL_LOG_EVIDENCE else direct)
     best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
     for fit, own in zip(fits, by_fit, strict=True):
         # no hypothesis shall lose because it came to rest somewhere else
