@@ -1,7 +1,8 @@
 """Least squares of a map's pose, its probe and open numbers, together with the blocks.
 
 The magnetizations of the blocks have the study's prior and are eliminated from the normal
-equations. On a line, where a wrong start is bent into shape by blocks, noise is added at first and
+equations; derivatives by the pose are those in the field of the blocks that explain the readings
+best. On a line, where a wrong start is bent into shape by blocks, noise is added at first and
 taken away in steps.
 """
 
@@ -382,30 +383,13 @@ class PoseFit:
     def _columns(self, pose: Floats, values: Floats) -> _BlockColumns:
         """Return the field of the blocks' magnetizations at a pose."""
         middle = self._middle(pose, values)
-        whole, root = self._unit_fields(middle), root_matrix(self.prior.root)
-        flat = whole.reshape(-1, whole.shape[-1])
+        flat, root = self.deviations.columns(middle), root_matrix(self.prior.root)
         shift = (flat @ (self.prior.mean - self._nominal)).reshape(-1, 3)
         flat = flat @ root if isinstance(root, np.ndarray) else (root.T.tocsr() @ flat.T).T
         columns = flat.reshape(len(middle), 3, -1)
         sizes, directions = np.linalg.eigh(flat.T @ flat)
         kept = sizes > len(flat) * (SEEN * self.smallest_sigma)**2
-        combined = root @ directions[:, kept]
-        slopes = None
-        if self.on_a_line:
-            slopes = np.empty((*columns.shape[:2], int(kept.sum()), 3))
-            for axis in range(2):
-                step = DIFFERENCE_M * np.eye(3)[axis]
-                slopes[..., axis] = (self._unit_fields(middle + step) - whole) @ combined / (
-                    DIFFERENCE_M)
-            # there are no currents and no magnets: curl B = 0, div B = 0
-            slopes[:, :2, :, 2] = np.moveaxis(slopes[:, 2, :, :2], -1, 1)
-            slopes[:, 2, :, 2] = -slopes[:, 0, :, 0] - slopes[:, 1, :, 1]
-        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept],
-                             slopes)
-
-    def _unit_fields(self, places: Floats) -> Floats:
-        """Return B (n, 3, parameters) at places (n, 3) in m per parameter of the blocks."""
-        return self.deviations.columns(places).reshape(len(places), 3, -1)
+        return _BlockColumns(middle, columns @ directions[:, kept], shift, directions[:, kept])
 
     @property
     def _nominal(self) -> Floats:
@@ -455,6 +439,19 @@ class PoseFit:
                     changed - values)[PROBE + number]
         return [self.derivatives[each.key] for each in self.open if not each.of_instrument]
 
+    def _most_probable(
+        self, near: _BlockColumns, residual: Floats, by_block: Floats, sigma: Floats
+    ) -> Floats:
+        """Return the most probable deviations (parameters,) of the blocks at a fixed pose."""
+        chosen = self.training
+        rows = by_block[chosen] / sigma[chosen][:, None]
+        inner = rows.T @ rows
+        inner[np.diag_indices(len(inner))] += 1.0
+        amounts = cho_solve(cho_factor(inner, lower=True),
+                            rows.T @ (residual[chosen] / sigma[chosen]))
+        return np.asarray(self.prior.mean - self._nominal
+                          + root_matrix(self.prior.root) @ (near.directions @ amounts))
+
     def _state(self, pose: Floats, values: Floats, near: _BlockColumns) -> _State:
         """Return residual and derivatives of all readings at a pose and instrument."""
         instrument = self.instrument(pose, values)
@@ -466,18 +463,11 @@ class PoseFit:
         at_mean = gradient.mean(axis=1)
         sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
             "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
-        own_fields = near.at(middle)
-        by_block = np.einsum("ij,njk->nik", matrix, own_fields)
+        by_block = np.einsum("ij,njk->nik", matrix, near.fields)
         # the derivatives are those in the field of the blocks that explain the readings here best
-        amounts = _amounts(residual, by_block, sigma, self.training)
-        if near.slopes is not None:
-            here = here + (own_fields @ amounts)[:, None]
-            gradient = gradient + np.einsum("nckj,k->ncj", near.slopes, amounts)[:, None]
-        else:
-            deviations = self.prior.mean - self._nominal + root_matrix(self.prior.root) @ (
-                near.directions @ amounts)
-            own = field_at_sensors(partial(self.deviations.field, deviations), sensors)
-            here, gradient = here + own[0], gradient + own[1]
+        own = field_at_sensors(partial(
+            self.deviations.field, self._most_probable(near, residual, by_block, sigma)), sensors)
+        here, gradient = here + own[0], gradient + own[1]
         columns = list(np.moveaxis(by_terms(
             instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
             gradient, STEADY), -1, 0))
@@ -510,32 +500,12 @@ class _BlockColumns:
         B of the prior's mean less that of the nominal magnet.
     directions : ndarray, shape (columns of the prior's root, k)
         The combinations.
-    slopes : ndarray, shape (n, 3, k, 3), in T/m, optional
-        Derivatives of ``fields`` along x, y and z, on a line.
     """
 
     places: Floats
     fields: Floats
     shift: Floats
     directions: Floats
-    slopes: Floats | None = None
-
-    def at(self, places: Floats) -> Floats:
-        """Return the fields (n, 3, k) in T at places (n, 3) in m near those of the map."""
-        if self.slopes is None:
-            return self.fields
-        return self.fields + np.einsum("nckj,nj->nck", self.slopes, places - self.places)
-
-
-def _amounts(
-    residual: Floats, by_block: Floats, sigma: Floats, training: NDArray[np.bool_]
-) -> Floats:
-    """Return the most probable amounts (k,) of the blocks' combinations at a fixed pose."""
-    rows = by_block[training] / sigma[training][:, None]
-    inner = rows.T @ rows
-    inner[np.diag_indices(len(inner))] += 1.0
-    return np.asarray(cho_solve(cho_factor(inner, lower=True),
-                                rows.T @ (residual[training] / sigma[training])))
 
 
 @dataclass(frozen=True)

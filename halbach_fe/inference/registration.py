@@ -10,13 +10,11 @@ map's coordinates to those of the magnet.
 2. For each of the best, least squares with the magnet's own model: pose and probe are fitted
    together with the magnetizations of the blocks, whose prior is that of the study. The evidence
    compares the candidates. A symmetric magnet makes some of them equal, and all of these are
-   results. On a line, where open numbers and the place can stand in for each other, a fit with open
-   numbers starts from the place that is found without them too.
+   results.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -107,27 +105,17 @@ def register(
             "points inside blocks in every likely pose", "Check its unit of length."))
     found: list[Registration] = []
     by_fit: list[list[Registration]] = []
-    closed = dataclasses.replace(fit, open=(), solved={}, built={}, derivatives={})
-    without: dict[int, Registration] = {}
     for fit in fits:
         by_fit.append([])
         for number, start in enumerate(starts):
             say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
                 + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
-            reached = [fit.refined(start)]
-            if fit.open and fit.on_a_line:
-                if number not in without:
-                    without[number] = closed.refined(start)
-                reached.append(fit.refined(_pose(without[number])))
-            direct, detour = reached[0], reached[-1]
-            # a detour may end in an equal pose, which is that of another start
-            by_fit[-1].append(detour if detour.log_evidence > direct.log_evidence
-                              + EQUAL_LOG_EVIDENCE else direct)
+            by_fit[-1].append(fit.refined(start))
     best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
     for fit, own in zip(fits, by_fit, strict=True):
         # no hypothesis shall lose because it came to rest somewhere else
         if not any(each is best for each in own):
-            own.append(fit.refined(_pose(best)))
+            own.append(fit.refined(np.append(best.middle_m, best.instrument.rotation_rad)))
         own.sort(key=lambda each: -each.log_evidence)
         found += [each for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]
@@ -145,11 +133,6 @@ def least_turned_first(found: Sequence[Registration]) -> list[Registration]:
              if each.log_evidence > ordered[0].log_evidence - EQUAL_LOG_EVIDENCE]
     return sorted(equal, key=lambda each: float(np.linalg.norm(
         each.instrument.rotation_rad))) + ordered[len(equal):]
-
-
-def _pose(found: Registration) -> Floats:
-    """Return place in m and rotation vector in rad, (6,), of a registration."""
-    return np.append(found.middle_m, found.instrument.rotation_rad)
 
 
 def _on_stage(starts: Sequence[Floats], stage: StagePose) -> list[Floats]:

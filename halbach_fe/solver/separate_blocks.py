@@ -342,7 +342,7 @@ class _Blocks:
         return solve_irreversible(system, self.law, applied, by_mean=by_mean)[0]
 
 
-@lru_cache(maxsize=4)  # every map of a campaign, and every round of an update, asks for the same
+@lru_cache(maxsize=2)  # every map of a campaign, and every round of an update, asks for the same
 def _alone(own: _Blocks) -> SeparateReaction:
     """Return the reaction of blocks without iron."""
     known = _alone(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
