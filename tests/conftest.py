@@ -33,8 +33,9 @@ settings.load_profile("patient")
 
 os.environ[LIMIT_VARIABLE] = "0"  # tests compute; those of the cache name one of their own
 
-# A second thread of NGSolve, which is busy while it waits, makes these small problems no faster and
-# twice as dear, and `make test` has a worker on each core. It is read where ngsolve is imported.
+# A second thread of NGSolve spins while it waits: these small problems become no faster and take
+# twice the processor time, and `make test` has a worker on each core. ngsolve reads the variable
+# when it is imported.
 os.environ.setdefault("NGS_NUM_THREADS", "1")
 
 # A dipole of FASER's cross-section; sizes coarse enough for tests.
