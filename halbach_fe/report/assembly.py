@@ -62,14 +62,21 @@ def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
     """Return a row of text for every plate."""
     return [{"holder": str(plate.number), "files": f"{holder_name(plate)}.step, .stl",
              "to make": str(len(plate.heights_m)), "pockets": str(len(plate.blocks[0])),
-             "outer diameter": f"{2e3 * plate.outer_radius_m:.5g}\u00a0mm",
-             "bore": (f"{2e3 * plate.inner_radius_m:.5g}\u00a0mm" if plate.inner_radius_m
-                      else "none"),
              "thickness": f"{1e3 * plate.thickness_m:.4g}\u00a0mm",
              "floor": f"{1e3 * plate.floor_m:.3g}\u00a0mm" if plate.floor_m else "none",
              "thinnest wall": f"{1e3 * plate.wall_m:.3g}\u00a0mm",
              "lower faces at z": ", ".join(f"{1e3 * z:.5g}" for z in sorted(plate.heights_m))
              + "\u00a0mm"} for plate in assembly.plates]
+
+
+def plate_diameters(assembly: Assembly) -> str:
+    """Return the diameters of the plates in words; all have the same."""
+    if not assembly.plates:
+        return ""
+    outer, inner = (2e3 * radius for radius in (
+        assembly.plates[0].outer_radius_m, assembly.plates[0].inner_radius_m))
+    bore = f"and a bore of {inner:.5g}\u00a0mm" if inner else "and no bore"
+    return f"All plates have an outer diameter of {outer:.5g}\u00a0mm {bore}."
 
 
 def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str, object]:
@@ -123,7 +130,8 @@ def write_assembly(
     prefix = common_beginning([one.serial for one in assembly.blocks])
     write_page(folder / "assembly.html", "assembly.html.j2", [], study=assembly.magnet.study,
                provenance=provenance, answer=answer(assembly), kinds=kind_rows(assembly),
-               plates=plate_rows(assembly), prefix=prefix, holder=assembly.holder,
+               plates=plate_rows(assembly), diameters=plate_diameters(assembly),
+               prefix=prefix, holder=assembly.holder,
                measured=any(one.serial for one in assembly.blocks),
                files=["assembly.csv", "assembly.json", *files],
                sheets=[drawing(sheet, prefix) for sheet in sheets(assembly)])

@@ -127,8 +127,10 @@ def test_the_plan_says_which_block_goes_where(made):
         north = {0: "outwards", 2: "counter-clockwise", 4: "inwards", 6: " clockwise"}
         assert north.get((slot - 1) % 8, "") in row["way_round"]
     assert rows[0]["serial"] != "B0001"  # the table says another one
-    page = (folder / "assembly.html").read_text()
-    assert all(one in page for one in ("holder_01.step", "ring 1"))
+    page = (folder / "assembly.html").read_text().replace("\u00a0", " ")
+    # the diameters of the ring whose volume the plates have
+    assert all(one in page for one in ("holder_01.step", "ring 1", (
+        f"outer diameter of {2e3 * OUTER:.5g} mm and a bore of {2e3 * INNER:.5g} mm")))
 
 
 @pytest.mark.parametrize(("holder", "said"), [
