@@ -29,7 +29,8 @@ BINS = 10
 
 def ranks(
     prior: Gaussian, simulate: Simulator, sampler: Sampler, repeats: int,
-    generator: np.random.Generator, say: Callable[[int], None] = lambda number: None,
+    generator: np.random.Generator,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Ints, int]:
     """Simulate ``repeats`` inferences and rank the true parameters among posterior draws.
 
@@ -44,8 +45,8 @@ def ranks(
     repeats : int
         Number of simulated inferences.
     generator : numpy.random.Generator
-    say : callable
-        Reports progress; called with the number of completed inferences.
+    progress : callable
+        Called with the number of completed inferences and with ``repeats``.
 
     Returns
     -------
@@ -60,7 +61,7 @@ def ranks(
         truth = prior.sample(1, generator)[0]
         draws = sampler(simulate(truth, generator), generator)
         found.append((draws < truth).sum(axis=0))
-        say(number + 1)
+        progress(number + 1, repeats)
     return np.array(found), len(draws)
 
 

@@ -319,7 +319,9 @@ def run(arguments: argparse.Namespace) -> int:
             study, session, prior, arguments.repeats, generator)
     for name, case in cases.items():
         common.say(f"{name}: {case.repeats} truths")
-        found[name], draws = ranks(prior, case.simulate, case.sampler, case.repeats, generator)
+        with common.progress_bar("truths") as progress:
+            found[name], draws = ranks(prior, case.simulate, case.sampler, case.repeats, generator,
+                                       progress)
         values, together = uniformity(found[name], draws)
         results[name] = {
             "repeats": case.repeats, "p_value": together,
