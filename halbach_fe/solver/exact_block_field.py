@@ -33,6 +33,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.outline import Outline
 
 _STEP = 1e-4
 """Step of finite differences, relative to the largest radius of the blocks. Their relative error is
@@ -40,6 +41,9 @@ the square of the step over the distance to a block."""
 
 _SHARE = 10_000
 """Number of points that a thread evaluates at a time."""
+
+_RECTANGULAR = 1e-13
+"""Largest deviation of a rectangle's corners, relative to its sides: some rounding errors."""
 
 
 def unit_field(block: MagnetBlock, points: Floats) -> Floats:
@@ -81,18 +85,43 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
 
     The order of the components is xx, yy, zz, xy, xz, yz.
     """
-    from halbach_fe.solver.prism_kernel import arc_table, outline_fields
+    from halbach_fe.solver.prism_kernel import arc_table, cuboid_fields, outline_fields
 
-    edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc]
-    arcs = [(edge.radius, *edge.angles) for edge in block.outline if edge.arc]
-    tables = [arc_table(sweep) for _, _, sweep in arcs] or [arc_table(0.0)]
     out = np.empty((len(points), 6))
-    work = partial(
-        outline_fields, np.array(edges).reshape(-1, 4), np.array(arcs).reshape(-1, 3),
-        np.stack([turns for turns, _ in tables]), tables[0][1], block.z_min, block.z_max, points)
+    rectangle = _rectangle(block.outline)
+    if rectangle is not None and np.isfinite(block.z_max):
+        (x, y), (a, b), cosine, sine = rectangle
+        work = partial(
+            cuboid_fields, np.array([x, y, (block.z_min + block.z_max) / 2]),
+            np.array([a, b, (block.z_max - block.z_min) / 2]), cosine, sine, points)
+    else:
+        edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc]
+        arcs = [(edge.radius, *edge.angles) for edge in block.outline if edge.arc]
+        tables = [arc_table(sweep) for _, _, sweep in arcs] or [arc_table(0.0)]
+        work = partial(
+            outline_fields, np.array(edges).reshape(-1, 4), np.array(arcs).reshape(-1, 3),
+            np.stack([turns for turns, _ in tables]), tables[0][1], block.z_min, block.z_max,
+            points)
     in_threads(lambda first, last: work(first, last, out),
                share_out(len(points), 1 + len(points) // _SHARE))
     return out
+
+
+def _rectangle(outline: Outline) -> tuple[Floats, Floats, float, float] | None:
+    """Return middle (2,) and half sides (2,) in m of a rectangle, and cosine and sine of the angle
+    from x to its first side; None if an outline is none.
+    """
+    if len(outline) != 4 or any(edge.arc for edge in outline):
+        return None
+    corners = np.array([edge.start for edge in outline])
+    first, second = corners[1] - corners[0], corners[3] - corners[0]
+    length, width = np.hypot(*first), np.hypot(*second)
+    small = _RECTANGULAR * (length + width)
+    if np.abs(corners[2] - corners[1] - second).max() > small or (
+            abs(first @ second) > small * min(length, width)):
+        return None
+    cosine, sine = (first / length).tolist()
+    return corners.mean(axis=0), np.array([length, width]) / 2, cosine, sine
 
 
 def matrix_of(six: Floats) -> Floats:

@@ -311,46 +311,78 @@ def outline_fields(
         out[n] = _scaled(total)
 
 
-Eight = tuple[float, float, float, float, float, float, float, float]
+Four = tuple[float, float, float, float]
 
 
 @compiled
-def _corner_angles(u0: float, u1: float, v0: float, v1: float, w0: float, w1: float,
-                   r: Eight, zero: float) -> float:
-    """Return the sum of +-atan(v w/(u R)) over the corners, whose distances R are r (u, v, w).
+def _face(u: float, v0: float, v1: float, w0: float, w1: float, r: Four) -> tuple[float, float]:
+    """Return a complex number whose argument is the solid angle of a face at the distance u.
 
-    Two angles at a time are added as the argument of a product of complex numbers; both are smaller
-    than pi/2. Terms with u = 0 vanish, which is the mean of the limits on a face.
+    The face is between v0 and v1, w0 and w1; its corners (v0, w0), (v0, w1), (v1, w0), (v1, w1)
+    are at the distances r. The solid angle is the sum over these of +-atan(v w/(abs(u) R)), added
+    as a product of complex numbers.
     """
-    total = 0.0
-    if abs(u0) > zero:
-        both = _angle_between(u0, v1, w0, w1, r[2], r[3]) - _angle_between(
-            u0, v0, w0, w1, r[0], r[1])
-        total -= both if u0 > 0 else -both
-    if abs(u1) > zero:
-        both = _angle_between(u1, v1, w0, w1, r[6], r[7]) - _angle_between(
-            u1, v0, w0, w1, r[4], r[5])
-        total += both if u1 > 0 else -both
-    return total
+    u = abs(u)
+    im0, re0 = u * v0 * (w1 * r[0] - w0 * r[1]), u * u * r[0] * r[1] + v0 * v0 * w0 * w1
+    im1, re1 = u * v1 * (w1 * r[2] - w0 * r[3]), u * u * r[2] * r[3] + v1 * v1 * w0 * w1
+    return re1 * re0 + im1 * im0, im1 * re0 - re1 * im0
 
 
 @compiled
-def _angle_between(u: float, v: float, w0: float, w1: float, r0: float, r1: float) -> float:
-    """Return atan(v w/(abs(u) R)) at the end 1 of an edge along w minus that at its end 0."""
-    return atan2(abs(u) * v * (w1 * r0 - w0 * r1), u * u * r0 * r1 + v * v * w0 * w1)
+def _angle_of(re: float, im: float, least: float) -> float:
+    """Return the argument of a complex number between ``least`` and that plus 2 pi."""
+    angle = atan2(im, re)
+    return angle + 2 * pi if angle < least else angle
 
 
 @compiled
-def _edge(u0: float, u1: float, r0: float, r1: float, square: float) -> float:
-    """Return the exponential of ``int ds/R`` along an edge from u0 to u1.
+def _across(
+    u0: float, u1: float, v0: float, v1: float, w0: float, w1: float, r0: Four, r1: Four,
+    size: float, zero: float,
+) -> float:
+    """Return 4 pi times the diagonal component of a cuboid's field matrix across two of its faces.
 
-    ``square`` is the square of the distance of the edge's line.
+    The faces are at u0 and u1 with corners at the distances r0 and r1; u1 is not negative. A face
+    at u = 0 has none, which is the mean of the limits from both sides.
+    """
+    re0, im0 = _face(u0, v0, v1, w0, w1, r0)
+    re1, im1 = _face(u1, v0, v1, w0, w1, r1)
+    # a face is seen as more than half of the sphere by what is near and in front of it only; other
+    # angles are at most pi, and 0 but for rounding if they are negative
+    before = v0 < 0 < v1 and w0 < 0 < w1
+    least0 = 0.0 if before and abs(u0) < size else -1.0
+    least1 = 0.0 if before and u1 < size else -1.0
+    if u0 > zero:  # beside the near face the far one may be larger
+        return _angle_of(re0 * re1 + im0 * im1, im0 * re1 - re0 * im1, least0 if before else -pi)
+    total = -_angle_of(re1, im1, least1)
+    return total - _angle_of(re0, im0, least0) if u0 < -zero else total
+
+
+@compiled
+def _edge(u0: float, u1: float, r0: float, r1: float, square: float) -> tuple[float, float]:
+    """Return numerator and denominator of the exponential of ``int ds/R`` along an edge.
+
+    The edge is from u0 to u1, which is not negative; ``square`` is the square of the distance of
+    its line.
     """
     if u0 >= 0:
-        return (u1 + r1) / (u0 + r0)
-    if u1 <= 0:
-        return (r0 - u0) / (r1 - u1)
-    return (u1 + r1) * (r0 - u0) / square
+        return u1 + r1, u0 + r0
+    return (u1 + r1) * (r0 - u0), square
+
+
+@compiled
+def _edges(
+    u0: float, u1: float, r: tuple[Four, Four], squares: Four,
+) -> float:
+    """Return the sum of ``int ds/R`` along four parallel edges, the second and third negative.
+
+    ``r`` are the distances of their beginnings and ends.
+    """
+    n0, d0 = _edge(u0, u1, r[0][0], r[1][0], squares[0])
+    n1, d1 = _edge(u0, u1, r[0][1], r[1][1], squares[1])
+    n2, d2 = _edge(u0, u1, r[0][2], r[1][2], squares[2])
+    n3, d3 = _edge(u0, u1, r[0][3], r[1][3], squares[3])
+    return log(n0 * d1 * d2 * n3 / (d0 * n1 * n2 * d3))
 
 
 @compiled
@@ -368,26 +400,62 @@ def cuboid_field(a: float, b: float, c: float, x: float, y: float, z: float) -> 
     diagonal component follows from the trace, -1 inside and 0 outside. See Z. J. Yang et al.,
     Supercond. Sci. Technol. 3 (1990) 591.
     """
-    size = max(a, max(b, c))
+    size = 2 * max(a, max(b, c))
     tiny, zero = _TINY * size * size, 1e-12 * size
+    along, across, height = _sign(x), _sign(y), _sign(z)
+    x, y, z = abs(x), abs(y), abs(z)
     u0, u1, v0, v1, w0, w1 = x - a, x + a, y - b, y + b, z - c, z + c
     p0, p1, q0, q1, t0, t1 = u0 * u0, u1 * u1, v0 * v0, v1 * v1, w0 * w0 + tiny, w1 * w1 + tiny
-    r = (sqrt(p0 + q0 + t0), sqrt(p0 + q0 + t1), sqrt(p0 + q1 + t0), sqrt(p0 + q1 + t1),
-         sqrt(p1 + q0 + t0), sqrt(p1 + q0 + t1), sqrt(p1 + q1 + t0), sqrt(p1 + q1 + t1))
-    xx = -_corner_angles(u0, u1, v0, v1, w0, w1, r, zero)
-    yy = -_corner_angles(v0, v1, u0, u1, w0, w1,
-                         (r[0], r[1], r[4], r[5], r[2], r[3], r[6], r[7]), zero)
+    r000, r001 = sqrt(p0 + q0 + t0), sqrt(p0 + q0 + t1)
+    r010, r011 = sqrt(p0 + q1 + t0), sqrt(p0 + q1 + t1)
+    r100, r101 = sqrt(p1 + q0 + t0), sqrt(p1 + q0 + t1)
+    r110, r111 = sqrt(p1 + q1 + t0), sqrt(p1 + q1 + t1)
+    xx = _across(u0, u1, v0, v1, w0, w1, (r000, r001, r010, r011), (r100, r101, r110, r111),
+                 size, zero)
+    yy = _across(v0, v1, u0, u1, w0, w1, (r000, r001, r100, r101), (r010, r011, r110, r111),
+                 size, zero)
     trace = -4 * pi * _inside(x, a, zero) * _inside(y, b, zero) * _inside(z, c, zero)
-    xy = log(_edge(w0, w1, r[0], r[1], p0 + q0 + tiny) * _edge(w0, w1, r[6], r[7], p1 + q1 + tiny)
-             / (_edge(w0, w1, r[2], r[3], p0 + q1 + tiny)
-                * _edge(w0, w1, r[4], r[5], p1 + q0 + tiny)))
-    xz = log(_edge(v0, v1, r[0], r[2], p0 + t0) * _edge(v0, v1, r[5], r[7], p1 + t1)
-             / (_edge(v0, v1, r[1], r[3], p0 + t1) * _edge(v0, v1, r[4], r[6], p1 + t0)))
-    yz = log(_edge(u0, u1, r[0], r[4], q0 + t0) * _edge(u0, u1, r[3], r[7], q1 + t1)
-             / (_edge(u0, u1, r[1], r[5], q0 + t1) * _edge(u0, u1, r[2], r[6], q1 + t0)))
+    xy = along * across * _edges(
+        w0, w1, ((r000, r010, r100, r110), (r001, r011, r101, r111)),
+        (p0 + q0 + tiny, p0 + q1 + tiny, p1 + q0 + tiny, p1 + q1 + tiny))
+    xz = along * height * _edges(
+        v0, v1, ((r000, r001, r100, r101), (r010, r011, r110, r111)),
+        (p0 + t0, p0 + t1, p1 + t0, p1 + t1))
+    yz = across * height * _edges(
+        u0, u1, ((r000, r001, r010, r011), (r100, r101, r110, r111)),
+        (q0 + t0, q0 + t1, q1 + t0, q1 + t1))
     factor = 1 / (4 * pi)
     return (xx * factor, yy * factor, (trace - xx - yy) * factor,
             xy * factor, xz * factor, yz * factor)
+
+
+@compiled
+def cuboid_fields(
+    middle: Floats, half: Floats, cosine: float, sine: float, points: Floats, first: int, last: int,
+    out: Floats,
+) -> None:
+    """Write the field matrices of a cuboid that is turned about the z axis.
+
+    Parameters
+    ----------
+    middle, half : ndarray, shape (3,), in m
+        Its middle, and its half sides.
+    cosine, sine : float
+        Of the angle from x to the first side.
+    points : ndarray, shape (n, 3), in m
+    first, last : int
+        The points to do.
+    out : ndarray, shape (n, 6)
+    """
+    for n in range(first, last):
+        dx, dy, dz = (points[n, 0] - middle[0], points[n, 1] - middle[1], points[n, 2] - middle[2])
+        xx, yy, zz, xy, xz, yz = cuboid_field(
+            half[0], half[1], half[2], cosine * dx + sine * dy, cosine * dy - sine * dx, dz)
+        out[n, 0] = cosine * cosine * xx + sine * sine * yy - 2 * cosine * sine * xy
+        out[n, 1] = xx + yy - out[n, 0]
+        out[n, 2] = zz
+        out[n, 3] = cosine * sine * (xx - yy) + (cosine * cosine - sine * sine) * xy
+        out[n, 4], out[n, 5] = cosine * xz - sine * yz, sine * xz + cosine * yz
 
 
 @compiled

@@ -8,7 +8,7 @@ import pytest
 
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver import prism_kernel
+from halbach_fe.solver import exact_block_field, prism_kernel
 from halbach_fe.solver.exact_block_field import field_of, gradient_of, unit_field
 from halbach_fe.solver.prism_kernel import arc_table
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
@@ -58,6 +58,22 @@ def test_one_block_against_magpylib(short_dipole, generator, shape):
         source = magpylib_block(study, block)
         source.polarization = np.eye(3)[axis]
         np.testing.assert_allclose(ours[:, :, axis], source.getB(points), atol=MAGPYLIB_ERROR)
+
+
+def test_only_rectangles_are_cuboids(monkeypatch, short_dipole):
+    """Cuboids have a closed form of their own. Negative control: of a trapezoid it is wrong."""
+    def unit(**shape):
+        study = short_dipole(array__block=shape)
+        return unit_field(build_magnet(study).blocks[3], scattered(study, np.random.default_rng(1)))
+
+    cuboid, trapezoid = {"shape": "cuboid", "width_m": 0.03}, {"shape": "trapezoid"}
+    expected, other = unit(**cuboid), unit(**trapezoid)
+    assert exact_block_field._rectangle(build_magnet(
+        short_dipole(array__block=trapezoid)).blocks[3].outline) is None
+    monkeypatch.setattr(exact_block_field, "_RECTANGULAR", 10.0)
+    assert np.abs(unit(**trapezoid) - other).max() > 1e-3
+    monkeypatch.setattr(exact_block_field, "_rectangle", lambda outline: None)
+    np.testing.assert_allclose(unit(**cuboid), expected, atol=1e-13)  # some 24 terms of size 1
 
 
 def test_near_a_curved_face(short_dipole, generator):

@@ -47,6 +47,24 @@ def test_cuboid_against_numpy(generator, cuboid):
                                cuboid_matrix(SIDES, points), atol=ROUNDING)
 
 
+def test_cuboid_near_its_faces_edges_and_corners(generator):
+    """The argument of a product of complex numbers is right on all sides of all faces.
+
+    The polygon's solid angles are added edge by edge instead. On edges the field is infinite.
+    """
+    for _ in range(40):
+        sides = 10**generator.uniform(-2, 0, 3)
+        base = generator.choice([-1, 0, 1], (500, 3))
+        away = generator.choice([-1, 1], (500, 3)) * 10**generator.uniform(-8, 2, (500, 3))
+        away *= generator.uniform(size=away.shape) < 0.8
+        infinite = ((away == 0) & (base != 0)).sum(axis=1) > 1
+        points = (base * sides + away * sides.max())[~infinite]
+        flat = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * sides[:2]
+        # 1e-8 of the size from an edge the logarithms have lost half of their digits
+        np.testing.assert_allclose(field(flat, sides[2], points, cuboid=True),
+                                   field(flat, sides[2], points), atol=1e-9)
+
+
 CONVEX = {"trapezoid": [slice(None)], "triangle": [slice(None)], "hexagon": [slice(None)],
           "L": [[0, 1, 2, 3], [0, 3, 4, 5]]}
 """Corners of the convex pieces of every outline."""
