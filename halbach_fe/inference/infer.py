@@ -17,7 +17,6 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
     Beside,
-    Linearization,
     OpenTerms,
     joined,
     of_the_first,
@@ -130,11 +129,10 @@ def infer(
         if solved is None:
             check_validation_map(readings, magnet.study)
         training = readings.training
-        here = None if at is None else open_terms.linearized(at.field, maps, readings)
-        if solved is None or (here is not None and (
-                solved.here is None or not here.is_near(solved.here, readings))):
+        if solved is None or (at is not None
+                              and solved.neglected(at, maps, readings) > AT_REST):
             solved = _Solved(
-                _response(magnet, readings.observation, session), maps, here,
+                _response(magnet, readings.observation, session), maps,
                 np.zeros(0) if at is None else readings_of_field(at.nominal, maps, readings))
             model = solved.response
         elif at is not None:
@@ -144,8 +142,8 @@ def infer(
                                  else study_prior(magnet, varying))
         matrix: Rows = model.matrix
         whole_prior = magnet_prior
-        if here is not None:
-            matrix = Beside(model.matrix, here.columns)
+        if at is not None:
+            matrix = Beside(model.matrix, open_terms.columns(at.field, maps, readings))
             whole_prior = joined(magnet_prior, -total, open_terms.sd)
         residual = readings.values - model.offset
         errors = readings.noise.with_independent_errors(model.error)
@@ -231,8 +229,24 @@ class _Solved:
 
     response: Response
     maps: Sequence[Map]
-    here: Linearization | None
     nominal: Floats
+
+    def neglected(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> float:
+        """Return the standard deviations by which `moved` may be wrong after changes of the terms.
+
+        The field of the deviations of permeable blocks or beside iron is not that of the same
+        deviations in vacuum, by which it is moved. The part that is missing is taken to change by
+        the same fraction as the one that is known. No combination of the unknowns is wrong by
+        more standard deviations than the norm of the error in units of the noise.
+        """
+        if not estimate.deviations.any():
+            return 0.0
+        own = partial(estimate.of_deviations.field, estimate.deviations)
+        before = readings_of_field(own, self.maps, readings)
+        change = readings_of_field(own, maps, readings) - before
+        missing = np.asarray(self.response.matrix @ estimate.deviations) - before
+        part = np.linalg.norm(missing) / np.linalg.norm(before)
+        return float(part * np.linalg.norm(change / readings.noise.sd))
 
     def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
         """Return the response after small changes of the terms.

@@ -43,11 +43,6 @@ from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, s
 from halbach_fe.stats.linear_gaussian import Rows
 from halbach_fe.study.types import COMPONENTS
 
-NEGLECTED = 0.01
-"""Part of the field that is not known at shifted sensors without a new response matrix: what
-permeable blocks and iron answer to deviations of the blocks, and what the next update changes. The
-matrix is kept as long as a shift changes this part by less than the noise."""
-
 
 @dataclass(frozen=True)
 class OpenTerms:
@@ -148,27 +143,24 @@ class OpenTerms:
                 instrument=instrument.with_(translation_m=(x, y, z)))))
         return with_pivots(found)
 
-    def linearized(
+    def columns(
         self, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
-    ) -> Linearization:
-        """Return how the readings depend on the open terms.
+    ) -> Floats:
+        """Return the derivatives (readings, terms) of the readings by the open terms.
 
         ``field`` takes points (n, 3) in m and returns B (n, 3) in T of the magnet as it is
         estimated.
         """
-        columns, sensors, steepness = [], [], []
+        found = []
         for number, one in enumerate(maps):
             instrument = one.study.instrument
             data = in_si_and_magnet_axes(instrument, one.data)
             points = points_of(data)
             at_sensors, gradient = field_at_sensors(field, sensor_positions(instrument, points))
-            found = by_terms(instrument, points, one.pivot_m, map_time(data), at_sensors, gradient)
-            columns.append(found.reshape(3 * len(points), -1) @ self._effect(number, one))
-            sensors.append(sensor_positions(instrument, points).reshape(-1, 3))
-            steepness.append(np.linalg.norm(gradient.reshape(-1, 9), axis=1))
-        return Linearization(
-            np.concatenate(sensors), np.concatenate(steepness),
-            readings.observation.read(np.concatenate(columns).T.reshape(len(self), -1, 3)).T)
+            changes = by_terms(instrument, points, one.pivot_m, map_time(data), at_sensors,
+                               gradient)
+            found.append(changes.reshape(3 * len(points), -1) @ self._effect(number, one))
+        return readings.observation.read(np.concatenate(found).T.reshape(len(self), -1, 3)).T
 
 
 def readings_of_field(
@@ -186,33 +178,6 @@ def readings_of_field(
         found.append(seen(sensor_matrix(instrument),
                           field(sensors.reshape(-1, 3)).reshape(sensors.shape)))
     return readings.observation.read(np.concatenate(found))
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """How the readings of a magnet depend on terms of the instruments, about some values of them.
-
-    Attributes
-    ----------
-    sensors : ndarray, shape (n, 3), in m
-        Places of all sensors.
-    steepness : ndarray, shape (n,), in T/m
-        Norm of the gradient there.
-    columns : ndarray, shape (readings, terms)
-        Derivatives by the terms.
-    """
-
-    sensors: Floats
-    steepness: Floats
-    columns: Floats
-
-    def is_near(self, other: Linearization, readings: Readings) -> bool:
-        """Tell whether the same response matrix serves both, for the noise of the readings."""
-        moved = np.linalg.norm(self.sensors - other.sensors, axis=1)
-        change, entries = NEGLECTED * moved * self.steepness, readings.observation.analysis
-        if (np.diff(entries.indptr) == 1).all():  # each reading is one component at one point
-            return bool((change[entries.indices] < readings.noise.sd).all())
-        return float(change.max()) < float(readings.noise.sd.min())
 
 
 @dataclass(frozen=True)
