@@ -45,9 +45,13 @@ LINEAR_ENOUGH = 0.3
 """Error that the linearization of the iron may cause in a reading, relative to its error bar; a
 larger error causes a warning."""
 
-ROUNDS, AT_REST = 8, 0.3
+ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its
 standard deviations up to which they are at rest."""
+
+NO_WORSE, SMALLEST_SHARE = 1.0, 0.2
+"""A change of the terms is halved if their log posterior density decreases by more than the first,
+but not to less than the second."""
 
 LEFT_OUT = 0.02
 """Relative change of a posterior variance (1 % of a standard deviation) that discarded information
@@ -113,11 +117,13 @@ def infer(
     of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
     if prior is not None:
         prior = distribution_of(magnet, prior, "prior")
-    maps = maps_of(magnet.study, data, validation_map)
+    maps: Sequence[Map] = maps_of(magnet.study, data, validation_map)
     open_terms = OpenTerms.of(maps)
     total = np.zeros(len(open_terms))
     noises: Noises = {}
     solved: _Solved | None = None
+    place: _Place | None = None
+    share = 1.0
     at = _Estimate.of(magnet, session) if len(open_terms) else None
     uncertain = any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
                     for one in maps)
@@ -154,15 +160,20 @@ def infer(
         values, change = np.split(whole.mean, [len(model.parameters)])
         sd = whole.sd_of(np.hstack([np.zeros((len(change), len(model.parameters))),
                                     open_terms.counted]))
-        total, at_rest = total + change, bool(
-            (np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
         if at is not None:
-            maps = open_terms.applied(maps, change)
-            at = replace(at, deviations=values - model.nominal)
+            here = _Place(maps, total, at, change, values - model.nominal,
+                          update.log_evidence + _log_density_at_zero(whole, len(change)))
+            if place is not None and here.log_posterior < place.log_posterior - NO_WORSE and (
+                    share > SMALLEST_SHARE):
+                share /= 2  # the readings are not linear in so large a change
+            else:
+                place, share = here, 1.0
+            total, maps, at = place.moved(open_terms, share)
+        at_rest = share == 1.0 and bool((np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
         if at_rest and not uncertain:
             break
         if at_rest:  # again, with the noise that positions make in this magnet's gradient
-            uncertain, noises, rounds = False, {}, 0
+            uncertain, noises, rounds, place = False, {}, 0, None
             estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
         warnings.warn(
@@ -201,22 +212,78 @@ def infer(
 
 @dataclass(frozen=True)
 class _Estimate:
-    """The magnet as it is estimated: ``nominal`` is B of the nominal one, see `field`."""
+    """The magnet as it is estimated.
+
+    ``nominal`` is B of the nominal one, see `field`. ``deviations`` are those of all parameters
+    (m,), and ``step`` is what the last update has changed of them.
+    """
 
     nominal: Callable[[Floats], Floats]
     of_deviations: Deviations
     deviations: Floats
+    step: Floats
 
     @classmethod
     def of(cls, magnet: Magnet, session: Session) -> _Estimate:
         """Return the nominal magnet."""
         deviations = Deviations.of(magnet)
-        return cls(field_function(magnet, session.within("instrument")), deviations,
-                   np.zeros(deviations.count))
+        nothing = np.zeros(deviations.count)
+        return cls(field_function(magnet, session.within("instrument")), deviations, nothing,
+                   nothing)
+
+    def updated(self, deviations: Floats) -> _Estimate:
+        """Return the estimate of an update."""
+        return replace(self, deviations=deviations, step=deviations - self.deviations)
 
     def field(self, points: Floats) -> Floats:
         """Return B (n, 3) in T at points (n, 3) in m."""
         return self.nominal(points) + self.of_deviations.field(self.deviations, points)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Terms of the instruments about which an update was made, and what it found.
+
+    Attributes
+    ----------
+    maps : sequence of Map
+        With instruments of these terms.
+    total : ndarray, shape (terms,)
+        Their change since the study.
+    estimate : _Estimate
+        The magnet about which the update was made.
+    change : ndarray, shape (terms,)
+        Of the terms, that the update found.
+    deviations : ndarray, shape (parameters,)
+        Of the blocks, that the update found.
+    log_posterior : float
+        Log posterior density of the terms about which the update was made, but for a constant.
+    """
+
+    maps: Sequence[Map]
+    total: Floats
+    estimate: _Estimate
+    change: Floats
+    deviations: Floats
+    log_posterior: float
+
+    def moved(
+        self, open_terms: OpenTerms, share: float
+    ) -> tuple[Floats, Sequence[Map], _Estimate]:
+        """Return terms, maps and magnet after a share of what the update found."""
+        change, before = share * self.change, self.estimate.deviations
+        return (self.total + change, open_terms.applied(self.maps, change),
+                self.estimate.updated(before + share * (self.deviations - before)))
+
+
+def _log_density_at_zero(distribution: Gaussian, count: int) -> float:
+    """Return the log density of a distribution's last ``count`` parameters at zero."""
+    mean = distribution.mean[-count:]
+    others = np.zeros((count, len(distribution.mean) - count))
+    root = np.hstack([others, np.eye(count)]) @ distribution.root
+    covariance = root @ root.T
+    return float(-(mean @ np.linalg.solve(covariance, mean)
+                   + np.linalg.slogdet(2 * np.pi * covariance)[1]) / 2)
 
 
 @dataclass(frozen=True)
@@ -234,19 +301,26 @@ class _Solved:
     def neglected(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> float:
         """Return the standard deviations by which `moved` may be wrong after changes of the terms.
 
-        The field of the deviations of permeable blocks or beside iron is not that of the same
-        deviations in vacuum, by which it is moved. The part that is missing is taken to change by
-        the same fraction as the one that is known. No combination of the unknowns is wrong by
-        more standard deviations than the norm of the error in units of the noise.
+        It is wrong in two parts. The field of the deviations of permeable blocks or beside iron is
+        not that of the same deviations in vacuum, by which it is moved; what is missing is taken to
+        change by the same fraction as what is known. And the matrix of the old places is wrong for
+        what the next update changes, which is taken to be at most what the last one has changed.
+        No combination of the unknowns is wrong by more standard deviations than the norm of the
+        error in units of the noise.
         """
-        if not estimate.deviations.any():
+        def at(maps: Sequence[Map], deviations: Floats) -> Floats:
+            return readings_of_field(partial(estimate.of_deviations.field, deviations), maps,
+                                     readings)
+
+        before = at(self.maps, estimate.deviations)
+        if not before.any():
             return 0.0
-        own = partial(estimate.of_deviations.field, estimate.deviations)
-        before = readings_of_field(own, self.maps, readings)
-        change = readings_of_field(own, maps, readings) - before
         missing = np.asarray(self.response.matrix @ estimate.deviations) - before
         part = np.linalg.norm(missing) / np.linalg.norm(before)
-        return float(part * np.linalg.norm(change / readings.noise.sd))
+        noise = readings.noise.sd
+        unmoved = at(maps, estimate.step) - at(self.maps, estimate.step)
+        return float(part * np.linalg.norm((at(maps, estimate.deviations) - before) / noise)
+                     + np.linalg.norm(unmoved / noise))
 
     def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
         """Return the response after small changes of the terms.

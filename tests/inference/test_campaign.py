@@ -12,10 +12,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import infer as infer_module
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.campaign import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map
@@ -130,6 +131,20 @@ def test_large_deviations_turn_the_gradient_too(generator, tmp_path, monkeypatch
     monkeypatch.setattr(Deviations, "field", lambda self, deviations, points: 0 * points)
     nominal = infer(magnet, maps, Session.open(tmp_path / "nominal"))
     assert distance_of_truth(nominal, magnet_of) > high
+
+
+def test_readings_are_solved_for_where_the_sensors_are(generator, tmp_path, monkeypatch):
+    """Also of permeable blocks, which answer to deviations. Control: only the nominal field moves.
+
+    Then the deviations act where the sensors were, and the terms chase what they do.
+    """
+    maps = two_maps(generator, mixing=MIXING)
+    for permeability in (1.0, 1.1):
+        magnet = build_magnet(stage_study("table").with_(array__recoil_permeability=permeability))
+        assert infer(magnet, maps, Session.open(tmp_path / f"{permeability}")).terms.at_rest
+    monkeypatch.setattr(infer_module._Solved, "neglected", lambda *arguments: 0.0)
+    with pytest.raises(HalbachWarning, match="not come to rest"):
+        infer(magnet, maps, Session.open(tmp_path / "control"))
 
 
 def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
