@@ -19,6 +19,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     begin_at_zero,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -114,7 +116,7 @@ def write_homogeneity_tolerance(found: HomogeneityTolerance, folder: Path) -> No
 
 def _figure(found: HomogeneityTolerance) -> Figure:
     """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
     for axis, values, ordered, name in (
             (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
@@ -128,5 +130,5 @@ def _figure(found: HomogeneityTolerance) -> Figure:
         left.axvline(found.limit, color=PRIOR, ls="--", label="limit")
     for axis in (left, right):
         begin_at_zero(axis)
-    left.legend(loc="lower right")
+    legend_above(figure, left)
     return figure

@@ -17,7 +17,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
-    SMALL,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -63,7 +64,7 @@ def reference_text(model: MultipoleModel) -> str:
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
     """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    figure = figure_of(3.8)
     axes = figure.subplots(1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
     place = np.arange(len(orders))
@@ -80,7 +81,7 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("units of 1e-4")
-    axes[1].legend(fontsize=SMALL)
+    legend_above(figure, axes[1], columns=4)
     return figure
 
 

@@ -17,7 +17,15 @@ from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    SECOND,
+    figure_of,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import counted, decimals, flux_density, with_error
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
@@ -242,7 +250,7 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     base = best.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
     read = in_si_and_magnet_axes(base, data)
     points = 1e3 * probe_points(best.instrument, points_of(read))
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
                                     (SECOND, POSTERIOR, MEASURED), strict=True):
@@ -250,10 +258,11 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     along.set_xlabel("z in the magnet in mm")
     along.set_ylabel("B in mT")
     along.grid(alpha=0.3)
-    along.legend(markerscale=4)
     across.plot(points[:, 0], points[:, 1], ".", ms=3, color=POSTERIOR)
     across.set_aspect("equal", adjustable="datalim")
     across.set_xlabel("x in the magnet in mm")
     across.set_ylabel("y in the magnet in mm")
     across.grid(alpha=0.3)
+    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=3,
+                  frameon=False, markerscale=4)
     return figure

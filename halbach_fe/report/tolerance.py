@@ -25,6 +25,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     begin_at_zero,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -139,14 +141,14 @@ def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> No
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:
     """Draw median and quantiles of |c_n| by order."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     place = np.arange(len(found.model.orders))
     low, middle, high = found.quantiles[:3]
     axis.errorbar(place, middle, [middle - low, high - middle], fmt="o", color=POSTERIOR, capsize=4)
     if found.limit is not None:
         axis.axhline(found.limit, color=PRIOR, ls="--", label="limit")
-        axis.legend()
+        legend_above(figure, axis)
     axis.set_xticks(place, [f"c$_{{{order}}}$" for order in found.model.orders])
     axis.set(ylabel="|c$_n$| in units", ylim=(0, None))
     axis.grid(alpha=0.3)
@@ -155,13 +157,13 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
 
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     largest = np.sort(found.sizes.max(axis=1))
     axis.plot(largest, np.arange(1, len(largest) + 1) / len(largest), color=POSTERIOR)
     if found.limit is not None:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
-        axis.legend(loc="lower right")
+        legend_above(figure, axis)
     axis.axhline(1, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02))
     begin_at_zero(axis)

@@ -25,6 +25,7 @@ from halbach_fe.report.page import (
     SMALL,
     THIRD,
     axis_of_points,
+    figure_of,
     geometry_figure,
     label_logarithmic,
     own_style,
@@ -168,7 +169,7 @@ def write_verification(
 
 def _convergence_figure(found: Verification) -> Figure:
     """Draw the change by the next finer mesh, relative to the largest field, by element size."""
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    figure = figure_of(4.6)
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
     sizes = size * np.array([REFINEMENT**2, REFINEMENT, 1.0])
