@@ -128,7 +128,7 @@ def worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
-             "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
+             "lowest H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
              "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
              "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}

@@ -23,7 +23,6 @@ from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
-    PUBLISHED,
     SMALL,
     figure_of,
     own_style,
@@ -153,8 +152,8 @@ def force_rows(found: Forces) -> list[dict[str, str]]:
                           if size > NEGLIGIBLE else "none"),
             "torque": decimals(float(np.linalg.norm(found.in_place.torque_Nm[number])))
             + "\u00a0Nm",
-            "inserted": _newton(float(found.inserted.magnitude[number])),
-            "inserted as": _ordinal(int(found.step[number]))})
+            "as it is inserted": _newton(float(found.inserted.magnitude[number])),
+            "inserted as the": _ordinal(int(found.step[number]))})
     return rows
 
 
@@ -199,7 +198,7 @@ def forces_figure(found: Forces) -> Figure:
     _draw_ring(above, found)
     order = found.order
     step = np.arange(1, len(order) + 1)
-    below.plot(step, found.in_place.magnitude[order], ".", ms=4, color=PUBLISHED,
+    below.plot(step, found.in_place.magnitude[order], "o", ms=4, color=PRIOR,
                label="with all others in place")
     below.plot(step, found.inserted.magnitude[order], "-", lw=1, color=POSTERIOR,
                label="as the next one to be inserted")

@@ -25,7 +25,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import ppm
+from halbach_fe.report.words import ppm, with_error
 
 ENOUGH = 0.9
 """Share of the magnets within the limit from which the tolerances suffice."""
@@ -79,7 +79,7 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
             f"{ppm(found.ordered.rms_ppm)} ppm rms.")
     share, prior = found.share, found.study.prior
     if share is not None and found.limit is not None:
-        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")

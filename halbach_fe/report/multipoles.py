@@ -58,8 +58,8 @@ def reference_text(model: MultipoleModel) -> str:
              else f"at z = {1e3 * round(model.z, 9):.4g} mm (Fourier coefficients of B_r)")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
             f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
-            "the dipole). b_n is normal and a_n skew, in axes turned about z such that the main "
-            "multipole of the nominal magnet is normal.")
+            "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
+            "about z such that the main multipole of the nominal magnet is normal.")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
@@ -151,7 +151,8 @@ def answer(
         return Answer(
             question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "
             "tolerances of its blocks (the study's prior) and the solver leave open.",
-            "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
+            "Measure it, update its blocks, and ask again with --posterior and the posterior.h5 of "
+            "that update.",
             "halbach-fe infer STUDY --measurements MAP -o DIR")
     if disagreement:
         return of_a_conflict(question, said, disagreement)

@@ -20,9 +20,9 @@ from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
+    MEASURED,
     POSTERIOR,
     PRIOR,
-    PUBLISHED,
     draw_cross_section,
     figure_of,
     label_logarithmic,
@@ -222,7 +222,7 @@ def _pattern_figure(plan: MeasurementPlan) -> Figure:
     axis.plot(range(1, len(plan.gain) + 1), left(plan.gain), color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, left(plan.baseline_gain), color=PRIOR,
               label="as many positions of the study, evenly spread")
-    axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":",
+    axis.axhline(left(plan.baseline_gain)[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
              yscale="log")
@@ -240,7 +240,7 @@ def _deviation_figure(plan: MeasurementPlan) -> Figure:
     axis.plot(range(1, len(plan.gain) + 1), plan.deviation.planned, color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, plan.deviation.baseline, color=PRIOR,
               label="as many positions of the study, evenly spread")
-    axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":",
+    axis.axhline(plan.deviation.baseline[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
              yscale="log")

@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
-from halbach_fe.inference.pose_result import Registration
+from halbach_fe.inference.pose_result import ProbePrior, Registration
 from halbach_fe.inference.registration import axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
@@ -142,8 +142,9 @@ def pose_table(
             "pose": str(number), "odds": f"{100 * probability:.3g} %",
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
-            "nominal" if before == NOMINAL else "before": _rms_in_words(each.nominal_rms_T),
-            "updated": _rms_in_words(each.rms_T), "chi²/reading": decimals(each.chi2)})
+            f"{before} off by": _rms_in_words(each.nominal_rms_T),
+            "updated blocks off by": _rms_in_words(each.rms_T),
+            "chi²/reading": decimals(each.chi2)})
     return rows
 
 
@@ -158,16 +159,20 @@ def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
             for number, each in enumerate(found, 1)]
 
 
-def probe_table(instrument: Instrument) -> list[dict[str, str]]:
-    """Return rows of text: what the fit says about the probe."""
-    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}", "value": f"{1e3 * value:+.2f} mrad"}
+def probe_table(instrument: Instrument, sd: ProbePrior) -> list[dict[str, str]]:
+    """Return rows of text: what the fit says about the probe, with standard deviations."""
+    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}",
+             "value": with_error(1e3 * value, 1e3 * sd.crosstalk) + "\u00a0mrad"}
             for name, value in instrument.crosstalk.items()]
     for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
                                          instrument.sensor_position_m, strict=True):
-        rows += [{"of the probe": f"gain of B{name}", "value": f"{100 * gain:+.3f} %"},
-                 {"of the probe": f"offset of B{name}", "value": f"{1e3 * offset:+.3f} mT"},
-                 {"of the probe": f"place of the B{name} sensor",
-                  "value": ", ".join(f"{1e3 * value:+.3f}" for value in place) + " mm"}]
+        rows += [{"of the probe": f"gain of B{name}",
+                  "value": with_error(100 * gain, 100 * sd.gain) + "\u00a0%"},
+                 {"of the probe": f"offset of B{name}",
+                  "value": with_error(1e3 * offset, 1e3 * sd.offset_T) + "\u00a0mT"},
+                 *({"of the probe": f"place of the B{name} sensor, {axis}",
+                    "value": with_error(1e3 * value, 1e3 * sd.sensor_m) + "\u00a0mm"}
+                   for axis, value in zip(COMPONENTS, place, strict=True))]
     return rows
 
 
@@ -242,7 +247,7 @@ def _write_page(
                provenance, answer=answer(found, before, name),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
-               name=study.name, probe=probe_table(best.instrument), map=name)
+               name=study.name, probe=probe_table(best.instrument, best.probe), map=name)
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:

@@ -31,6 +31,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
+from halbach_fe.report.words import whole, with_error
 from halbach_fe.response.multipoles import plain
 
 LEAST_OF_SD = 5e-3
@@ -73,7 +74,7 @@ def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, st
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
-        row = {"n": str(order), "|c_n| of the mean": _size(found, i),
+        row = {"n": str(order), "|c_n| of the mean magnet": _size(found, i),
                "sd of b_n": f"{sd[i]:.3g}", "sd of a_n": f"{sd[size + i]:.3g}"}
         row |= {f"{100 * q:g} % below": f"{value:.3g}"
                 for q, value in zip(QUANTILES, found.quantiles[:, i], strict=True)}
@@ -103,7 +104,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
             f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
     share, prior = found.share, found.study.prior
     if share is not None:
-        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
@@ -115,7 +116,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
         "Which multipoles do the tolerances of the blocks make?", said,
         f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
         f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
-        f"those tolerances come on top. {len(found.sizes)} magnets were drawn.", *step)
+        f"those tolerances come on top. {whole(len(found.sizes))} magnets were drawn.", *step)
 
 
 @own_style
@@ -136,7 +137,8 @@ def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> No
     }, folder)
     write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
                study=found.study, answer=answer(found), reference=reference_text(found.model),
-               rows=quantile_table(found), main=main_in_words(found.model, found.known))
+               rows=quantile_table(found), draws=whole(len(found.sizes)),
+               main=main_in_words(found.model, found.known))
 
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:
