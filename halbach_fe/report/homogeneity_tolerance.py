@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
@@ -125,6 +126,7 @@ def _figure(found: HomogeneityTolerance) -> Figure:
         axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
         axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
         axis.grid(alpha=0.3)
+        axis.xaxis.set_major_locator(MaxNLocator(4))  # numbers of five digits side by side
     left.set_ylabel("share of magnets")
     if found.limit is not None:
         left.axvline(found.limit, color=PRIOR, ls="--", label="limit")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_design import Designed, RingDesign
@@ -120,8 +120,9 @@ def front_figure(found: Designed) -> Figure:
     axis.plot(1e3 * found.best.mean_T, found.best.peak_to_peak_ppm, "o", ms=11, color=POSTERIOR,
               label="the best design")
     axis.set(xlabel="mean field in mT", ylabel="deviation in ppm", yscale="log")
-    for labels in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
-        labels(FuncFormatter(lambda value, _: ppm(value)))
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))  # others would touch each other
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3)
     legend_above(figure, axis, columns=3)
     return figure
