@@ -54,7 +54,7 @@ def score_table(result: InferenceResult,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "before, rms": flux_density(score.rms_error_prior_T),
             "after, rms": flux_density(score.rms_error_posterior_T),
-            "of the largest reading": relative(score.rms_error_posterior_T / largest)
+            "after, of the largest reading": relative(score.rms_error_posterior_T / largest)
             if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
