@@ -182,7 +182,9 @@ def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> 
     inputs = [value for value in (*vars(arguments).values(),
                                   *getattr(arguments, "listed_maps", {}).values())
               if isinstance(value, InputFile)]
-    arguments.at_end.enter_context(result_folder(arguments.output, command, study, inputs))
+    named = {word: path for word, path in _given(arguments).items() if path in inputs}
+    arguments.at_end.enter_context(result_folder(
+        arguments.output, command, study, inputs, named))
     arguments.at_end.enter_context(known_paths({
         word: _from_here(path) for word, path in _paths_of(arguments).items()}))
 
@@ -571,17 +573,33 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
         say(sentence)
     if named.command:
         say(f"  {named.command}")
+        if named.to_fill_in:
+            say(f"  {named.to_fill_in}")
     if page is not None:
         say(f"Report: {page}")
 
 
 def _paths_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
-    """Return the paths of the command line by the words for them in commands of an answer."""
+    """Return the paths that are known by the words for them in commands of an answer.
+
+    They are those of the command line. A posterior that is among them is of a map and blocks, which
+    the record of its folder names.
+    """
+    from halbach_fe.core.result_folder import named_inputs
+
+    given = {word: path for word, path in _given(arguments).items() if path is not None}
+    posterior = given.get("POSTERIOR")
+    behind = named_inputs(posterior.parent) if posterior else {}
+    return {**{word: path for word, path in behind.items() if word in ("MAP", "BLOCKS")}, **given,
+            "DIR": getattr(arguments, "output", None)}
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, Path | None]:
+    """Return the input files of the command line by the words for them in commands."""
     return {
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
         "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
-        "POSTERIOR": getattr(arguments, "posterior", None),
-        "DIR": getattr(arguments, "output", None)}
+        "POSTERIOR": getattr(arguments, "posterior", None)}
 
 
 def _from_here(path: Path | None) -> str | None:

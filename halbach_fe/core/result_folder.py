@@ -14,7 +14,7 @@ import fcntl
 import hashlib
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -57,6 +57,8 @@ class Record(BaseModel):
         SHA-256 of every result, by its path within the folder.
     inputs : dict of str to str
         SHA-256 of every file that the run was given, by its path.
+    named : dict of str to str
+        Path of an input by the word that stands for it in commands: STUDY, MAP, BLOCKS, POSTERIOR.
     ended : str
         When the run ended, in ISO 8601 (UTC); empty until it has ended well.
     """
@@ -66,6 +68,7 @@ class Record(BaseModel):
     study: str
     files: dict[Annotated[str, AfterValidator(_inside)], str] = {}
     inputs: dict[str, str] = {}
+    named: dict[str, str] = {}
     ended: str = ""
 
 
@@ -120,9 +123,12 @@ class Results:
 
 @contextlib.contextmanager
 def result_folder(
-    folder: Path, command: str, study: str, inputs: Iterable[Path] = ()
+    folder: Path, command: str, study: str, inputs: Iterable[Path] = (),
+    named: Mapping[str, Path] = {},
 ) -> Iterator[None]:
     """Own a folder while the block writes results of a command and a study into it.
+
+    ``named`` are those of the inputs that commands name, see `Record`.
 
     If the block succeeds, results of earlier runs that it did not write again are removed, unless
     somebody has changed them since.
@@ -154,6 +160,7 @@ def result_folder(
                     "run would replace. Name another folder, or copy the input to another place.")
         record, written = before.model_copy(deep=True), set[str]()
         record.inputs, record.ended = _inputs(inputs), ""
+        record.named = {word: printable(path, MAX_QUOTED) for word, path in named.items()}
         _write(file, record)
 
         def note(path: Path) -> None:
@@ -238,6 +245,22 @@ def keep_results(path: Path) -> None:
         if record and str(path.absolute().relative_to(folder)) in record.files:
             raise OutputError(f"File {path} is a result of `{record.command}`, which this run "
                               "would replace. Name another file.")
+
+
+def named_inputs(folder: Path) -> dict[str, Path]:
+    """Return the files that the run in a folder was given, by the words for them in commands.
+
+    Files that are not there any more, or have changed, are left out; so are all of a folder whose
+    record cannot be read.
+    """
+    try:
+        with _regular(folder / RECORD) as file:
+            record = _read(file)
+    except (OSError, ValueError):
+        return {}
+    return {} if record is None else {
+        word: Path(path) for word, path in record.named.items()
+        if path in record.inputs and _digest(Path(path)) == record.inputs[path]}
 
 
 @contextlib.contextmanager

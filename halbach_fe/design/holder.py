@@ -82,6 +82,8 @@ class Plate:
         The plate without openings; its lower face is at z = 0.
     openings : tuple of Prism
         Bore, pockets, holes and engraved bars. Those below z = 0 go through.
+    bars : tuple of Prism
+        Those of the openings that are the engraved number.
     heights_m : tuple of float
         z of the lower face of every copy.
     blocks : tuple of tuple of int
@@ -103,6 +105,7 @@ class Plate:
     wall_m: float
     inner_radius_m: float
     outer_radius_m: float
+    bars: tuple[Prism, ...] = ()
 
     @property
     def thickness_m(self) -> float:
@@ -388,7 +391,7 @@ def _numbered(plate: Plate, number: int, holder: Holder, frame: _Frame) -> Plate
             wall, _, _ = thinnest_wall([*rods, *(bar.polygon for bar in bars)],
                                        ["rod"] * len(rods) + ["number"] * len(bars))
             if wall >= holder.least_wall_m:
-                return replace(plate, number=number, openings=plate.openings + bars)
+                return replace(plate, number=number, openings=plate.openings + bars, bars=bars)
     return replace(plate, number=number)
 
 

@@ -68,7 +68,14 @@ OUTWARDS = {"wrong_radius": "farther out"}
 MAX_LISTED_ROWS = 10
 """Largest number of outliers that a report lists. The summary has all of them."""
 
-PERCENT_PARAMETERS = {"gain", "loss", "gradient", "scale"}
+UNTOLD = 1e-9
+"""Amplitude in standard deviations below which the readings say nothing of a parameter, such as the
+z of a map in a cross-section: its value is that of the prior, 0 but for rounding."""
+
+LOSS = "loss"
+"""Parameter of effects that weaken blocks; a block that loses more than it had is reversed."""
+
+PERCENT_PARAMETERS = {"gain", LOSS, "gradient", "scale"}
 """Dimensionless parameters that reports show in percent."""
 
 
@@ -210,6 +217,10 @@ def amounts(identified: IdentifiedEffect) -> list[str]:
         unit, factor = human_unit(parameter)
         alone = len(fitted) == 1 and parameter.name in identified.hypothesis.effect.title
         name = "" if alone else f"{parameter.name} "
+        if parameter.name == LOSS and value > 1:
+            found.append(f"reversed, with {_rounded(factor * (value - 1), factor * sd)} % of its "
+                         "strength")
+            continue
         text = _rounded(factor * value, factor * sd).replace("-", "−")
         found.append(f"{name}{text}{_spaced(unit)}")
     return found or [PRESENT]
@@ -219,7 +230,8 @@ def _uncertain(identified: IdentifiedEffect) -> list[tuple[Parameter, float, flo
     """Return the parameters, values and standard deviations of amplitudes that were fitted."""
     values, deviations = identified.reported
     return [(parameter, value, sd) for parameter, value, sd in zip(
-        identified.parameters, values.tolist(), deviations.tolist(), strict=True) if sd > 0]
+        identified.parameters, values.tolist(), deviations.tolist(), strict=True)
+        if sd > 0 and (abs(value) > UNTOLD * sd or np.abs(values).max() == 0)]
 
 
 def human_unit(parameter: Parameter) -> tuple[str, float]:

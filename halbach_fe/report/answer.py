@@ -9,6 +9,16 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from halbach_fe.report.words import in_a_row
+
+STANDS_FOR = {
+    "STUDY": "your study file", "MAP": "the file of your field map (CSV or HDF5)",
+    "NEW_MAP": "the file of the map that you measure then",
+    "BLOCKS": "the table of your measured blocks (CSV)",
+    "POSTERIOR": "the posterior.h5 that halbach-fe infer wrote",
+    "DIR": "a new folder for the results"}
+"""What a command's words stand for where the path is not known."""
+
 _NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
 
 
@@ -55,6 +65,13 @@ class Answer:
     def sentences(self) -> tuple[str, str, str]:
         """What the terminal says before the command."""
         return self.said, self.trust, f"Next: {self.step}"
+
+    @property
+    def to_fill_in(self) -> str:
+        """What the words of the command stand for that no path is known for; empty without any."""
+        found = [f"{word} is {meaning}" for word, meaning in STANDS_FOR.items()
+                 if word in self.command.split(" ")]
+        return f"In this command {in_a_row(found)}." if found else ""
 
     def with_paths(self, paths: Mapping[str, object]) -> Answer:
         """Return the answer with the paths that are known in place of the words of its command.

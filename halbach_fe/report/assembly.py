@@ -13,7 +13,7 @@ from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import Assembly
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.assembly_sheets import common_beginning, drawing, sheets
+from halbach_fe.report.assembly_sheets import common_beginning, drawing, height_mm, sheets
 from halbach_fe.report.page import write_page
 from halbach_fe.report.solids import holder_name, write_solids
 from halbach_fe.report.words import counted
@@ -30,8 +30,8 @@ def answer(assembly: Assembly) -> Answer:
                if copies else " go without a holder.")]
     said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
              for reason in assembly.reasons]
-    trust = ("Yes, as far as shapes and places of the study are right; the holder does not know "
-             "the forces.")
+    trust = ("Yes, as far as shapes and places of the study are right. Whether the holder bears "
+             "the forces was not computed.")
     if assembly.plates:
         wall = min(plate.wall_m for plate in assembly.plates)
         said.append(f"Pockets are {1e3 * assembly.holder.clearance_m:.3g}\u00a0mm larger than the "
@@ -39,7 +39,7 @@ def answer(assembly: Assembly) -> Answer:
                         "." if np.isinf(wall) else
                         f", and the thinnest wall is {1e3 * wall:.3g}\u00a0mm."))
         step = ("Make one pocket first and try a block in it; then print this page, and go sheet "
-                "by sheet. See which forces wait.")
+                "by sheet. See which forces the blocks will feel.")
     else:
         step = "See which forces the blocks feel, for tools and glue."
     if assembly.left_over:
@@ -65,7 +65,7 @@ def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
              "thickness": f"{1e3 * plate.thickness_m:.4g}\u00a0mm",
              "floor": f"{1e3 * plate.floor_m:.3g}\u00a0mm" if plate.floor_m else "none",
              "thinnest wall": f"{1e3 * plate.wall_m:.3g}\u00a0mm",
-             "lower faces at z": ", ".join(f"{1e3 * z:.5g}" for z in sorted(plate.heights_m))
+             "lower faces at z": ", ".join(map(height_mm, sorted(plate.heights_m)))
              + "\u00a0mm"} for plate in assembly.plates]
 
 

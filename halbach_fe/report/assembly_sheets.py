@@ -53,7 +53,7 @@ def sheets(assembly: Assembly) -> list[Sheet]:
         blocks = [assembly.blocks[one] for one in sorted(plate.blocks[copy])]
         of = f", copy {copy + 1} of {len(plate.heights_m)}" if len(plate.heights_m) > 1 else ""
         found.append(Sheet(f"Holder {number}{of}: {_rings(blocks)}, lower face at z = "
-                           f"{1e3 * height:.5g} mm", blocks, plate))
+                           f"{height_mm(height)} mm", blocks, plate))
     heights: list[list[AssembledBlock]] = []
     for one in sorted((one for one in assembly.blocks if one.plate is None),
                       key=lambda one: float(one.block.middle[2])):
@@ -65,10 +65,15 @@ def sheets(assembly: Assembly) -> list[Sheet]:
         if len(level) > 1:
             level.sort(key=lambda one: (one.block.ring, one.block.slot))
             found.append(Sheet(f"Without a holder: {_rings(level)}, middle at z = "
-                               f"{1e3 * float(level[0].block.middle[2]):.5g} mm", level))
+                               f"{height_mm(float(level[0].block.middle[2]))} mm", level))
     alone = [level[0] for level in heights if len(level) == 1]
     return found + ([Sheet("Blocks at heights of their own, seen from above", alone)]
                     if alone else [])
+
+
+def height_mm(z: float) -> str:
+    """Return a height in m as text in mm; what is 0 but for rounding is 0."""
+    return f"{1e3 * round(z, 9) + 0.0:.5g}"
 
 
 def _rings(blocks: Sequence[AssembledBlock]) -> str:
@@ -120,6 +125,10 @@ class Drawing:
     blocks : list of Drawn
     plate : str
         Path of the plate and its openings.
+    engraved : str
+        Path of the bars of the engraved number.
+    number : int or None
+        Number of the plate; None without one.
     reach : float
         Half the size of the drawing.
     tables : list of list of dict
@@ -129,6 +138,8 @@ class Drawing:
     title: str
     blocks: list[Drawn]
     plate: str
+    engraved: str
+    number: int | None
     reach: float
     tables: list[list[dict[str, str]]]
 
@@ -141,8 +152,10 @@ def drawing(sheet: Sheet, prefix: str) -> Drawing:
     """
     outlines = [_outline_mm(one) for one in sheet.blocks]
     plate = sheet.plate
+    bars = plate.bars if plate else ()
     parts = [] if plate is None else [1e3 * plate.body.polygon, *(
-        1e3 * opening.polygon for opening in plate.openings)]
+        1e3 * opening.polygon for opening in plate.openings
+        if not any(opening is bar for bar in bars))]
     radius = max(float(np.hypot(*polygon.T).max()) for polygon in [*outlines, *parts])
     bore = min(float(np.hypot(*polygon.T).min()) for polygon in outlines)
     labels = [_label(one, len(sheet.rings) > 1, prefix) for one in sheet.blocks]
@@ -162,7 +175,9 @@ def drawing(sheet: Sheet, prefix: str) -> Drawing:
         angle = float(np.arctan2(middle[1], middle[0]))
         place: tuple[float, float, float, str, float]
         if layers[number] == max(layers):
-            place = _radial(angle, radius + size / 2, size, outwards=True)
+            place = (_upright(angle, radius + size / 2, size, len(label)) if (
+                LETTER * len(label) * size < 0.9 * pitch) else
+                _radial(angle, radius + size / 2, size, outwards=True))
         elif layers[number] == 0 and LETTER * small * longest < 0.8 * bore:
             place = _radial(angle, 0.97 * bore, small, outwards=False)
         else:
@@ -172,7 +187,9 @@ def drawing(sheet: Sheet, prefix: str) -> Drawing:
         drawn.append(Drawn(_path(polygon), _arrow(one, middle, width), 0.09 * width, label,
                            float(x), float(y), turn, anchor, letters))
     reach = radius + size * (1 + LETTER * longest)
-    return Drawing(sheet.title, drawn, " ".join(map(_path, parts)), reach, _tables(sheet))
+    engraved = " ".join(_path(1e3 * bar.polygon) for bar in bars)
+    return Drawing(sheet.title, drawn, " ".join(map(_path, parts)), engraved,
+                   plate.number if plate else None, reach, _tables(sheet))
 
 
 def _layers(outlines: Sequence[Floats]) -> list[int]:
@@ -209,6 +226,15 @@ def _radial(
     return float(x), float(y), turn + (180.0 if flipped else 0.0), anchor, size
 
 
+def _upright(
+    angle: float, radius: float, size: float, letters: int
+) -> tuple[float, float, float, str, float]:
+    """Return the place of a text that begins at a radius and is not turned."""
+    x, y = np.cos(angle), np.sin(angle)
+    away = radius + size * (0.5 * LETTER * letters * abs(x) + 0.35 * abs(y))
+    return float(away * x), float(-away * y + 0.35 * size), 0.0, "middle", size
+
+
 def _arrow(
     one: AssembledBlock, middle: Floats, width: float
 ) -> tuple[float, float, float, float] | None:
@@ -217,7 +243,7 @@ def _arrow(
     flat = float(np.linalg.norm(direction))
     if flat < FLAT:
         return None
-    along = 0.38 * width * direction / flat
+    along = 0.34 * width * direction / flat
     start, end = middle - along, middle + along
     return float(start[0]), -float(start[1]), float(end[0]), -float(end[1])
 

@@ -8,11 +8,10 @@ from textwrap import wrap
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Ints
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import POSTERIOR, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, PUBLISHED, figure_of, own_style, save, write_page
 from halbach_fe.report.words import counted, fraction, p_value
 from halbach_fe.stats.sbc import BINS
 
@@ -67,7 +66,7 @@ def write_calibration(
     """
     columns = min(PANELS_IN_A_ROW, len(ranks))
     rows = -(-len(ranks) // columns)
-    figure = Figure(figsize=(3.2 * columns, 2.8 * rows), layout="constrained")
+    figure = figure_of(2.8 * rows, 3.2 * columns)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(ranks):]:
         axis.remove()
@@ -75,7 +74,7 @@ def write_calibration(
         edges = np.linspace(0, draws + 1, BINS + 1)
         axis.hist(case_ranks.ravel(), edges, density=True, color=POSTERIOR)
         axis.axhline(1 / (draws + 1), color=PUBLISHED)
-        axis.set(title="\n".join(wrap(name, 32)), xlabel="rank of the true value", yticks=[])
+        axis.set(title="\n".join(wrap(name, 28)), xlabel="rank of the true value", yticks=[])
         axis.title.set_fontsize(9)
     pictures = save({"ranks.png": (figure, "Ranks of the true parameters among draws of the "
                                    "posterior, all parameters together; a calibrated posterior "

@@ -131,7 +131,7 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
             f"B{name}": 1e3 * data["B_T"].values[:, COMPONENTS.index(name)]
             for name in observed_components(study)}, "mT")
     figure, (axis,) = stacked_axes(1)
-    figure.set_size_inches(8, 4)
+    figure.set_figheight(4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
         for component in observed_components(study):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.numbers import decimals
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.campaign import with_paths_from
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND
+from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, figure_of
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.reader import read_study
 
@@ -62,7 +62,7 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
 
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
     places, maps = 1e3 * result.observation.places, np.array(result.maps)
     for number, name in enumerate(dict.fromkeys(result.maps)):
@@ -73,7 +73,8 @@ def maps_figure(result: InferenceResult) -> Figure:
         across.plot(places[mine, 0], places[mine, 1], **style)
     along.set_xlabel("z in the magnet in mm")
     along.set_ylabel("distance from the axis in mm")
-    along.legend(markerscale=3)
+    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=4,
+                  frameon=False, markerscale=3)
     across.set_aspect("equal", adjustable="datalim")
     across.set_xlabel("x in the magnet in mm")
     across.set_ylabel("y in the magnet in mm")

@@ -33,6 +33,9 @@ PAGE = "report.html"
 DIAGNOSED = "study.diagnosed.toml"
 """The study that halbach-fe diagnose writes, with what was missing."""
 
+POSTERIOR = "posterior.h5"
+"""The updated blocks that halbach-fe infer writes."""
+
 MOST_ROWS = 40
 """Largest number of rows of a folded table. All of them are on its page."""
 
@@ -70,9 +73,21 @@ class Campaign:
     @property
     def answered(self) -> list[tuple[Chapter, Page, Answer]]:
         """All answers, with the folders that hold what their commands name."""
-        return [(chapter, page, _with_folder(page.said.answer, chapter))
+        return [(chapter, page, _with_folder(page.said.answer, chapter).with_paths(self.named))
                 for chapter in self.chapters for page in chapter.pages
                 if page.said.answer is not None]
+
+    @cached_property
+    def named(self) -> dict[str, str]:
+        """Map, blocks and posterior, if all results use the same, by the words of commands."""
+        found: dict[str, set[str | None]] = {"MAP": set(), "BLOCKS": set(), "POSTERIOR": {
+            _from_here(one.folder / POSTERIOR) for one in self.chapters if one.verb == "infer"
+            and POSTERIOR in one.record.files and self.replaced(one) is None}}
+        for one in self.chapters:
+            for word in found.keys() & one.record.named.keys():
+                found[word].add(_from_here(Path(one.record.named[word])))
+        return {word: path for word, paths in found.items()
+                if len(paths) == 1 and (path := paths.pop()) is not None}
 
     def continued(self, chapter: Chapter, answer: Answer) -> Chapter | None:
         """Return the later chapter of the command that an answer names as the next step."""
@@ -157,11 +172,21 @@ class Campaign:
                     for chapter in self.chapters for page in chapter.pages]}
 
 
+def _from_here(path: Path) -> str | None:
+    """Return a path relative to the current folder, where commands are run; None if it is not in
+    it: the page says nothing of other folders.
+    """
+    here, whole = Path.cwd(), path.absolute()
+    return printable(str(whole.relative_to(here)), MAX_QUOTED) if (
+        whole.is_relative_to(here) and ".." not in whole.parts) else None
+
+
 def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
     """Return an answer whose command has the folder of the files that its own command wrote."""
     def named(found: re.Match[str]) -> str:
-        return (shlex.quote(f"{chapter.label}/{found[1]}") if found[1] in chapter.record.files
-                else found[0])
+        if found[1] not in chapter.record.files:
+            return found[0]
+        return shlex.quote(_from_here(chapter.folder / found[1]) or f"{chapter.label}/{found[1]}")
 
     return replace(answer, command=re.sub(r"DIR/(\S+)", named, answer.command))
 

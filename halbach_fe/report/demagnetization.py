@@ -25,6 +25,8 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -126,7 +128,7 @@ def worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
-             "least H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
+             "lowest H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
              "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
              "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}
@@ -151,7 +153,7 @@ def _layers(found: DemagnetizationMap) -> dict[str, Ints]:
 def _map_figure(found: DemagnetizationMap) -> Figure:
     """Draw H along the magnetization in layers of cells."""
     layers = _layers(found)
-    figure = Figure(figsize=(5.2 * len(layers) + 1, 5), layout="constrained")
+    figure = figure_of(5, 6.2) if len(layers) == 1 else figure_of(3.6)
     limits = 1e-3 * float(found.along.min()), 1e-3 * float(found.along.max())
     threshold = -1e-3 * float(knee(found.material, found.material.temperature_C))
     axes: list[Axes] = list(figure.subplots(1, len(layers), squeeze=False)[0])
@@ -174,7 +176,7 @@ def _map_figure(found: DemagnetizationMap) -> Figure:
 def _temperature_figure(found: DemagnetizationMap) -> Figure:
     """Draw the share of the volume past the knee against the temperature."""
     material = found.material
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    figure = figure_of(3.4)
     axis = figure.subplots()
     limit = found.limit_temperature(SHARES[-1])
     hottest = max(material.temperature_C, limit if math.isfinite(limit) else -np.inf)
@@ -184,7 +186,7 @@ def _temperature_figure(found: DemagnetizationMap) -> Figure:
     axis.axvline(material.temperature_C, color=PRIOR, ls="--",
                  label=f"temperature of the magnet, {material.temperature_C:g} °C")
     axis.set(xlabel="temperature in °C", ylabel="volume past the knee in %", ylim=(0, None))
-    axis.legend()
+    legend_above(figure, axis)
     axis.grid(alpha=0.3)
     return figure
 
@@ -192,7 +194,7 @@ def _temperature_figure(found: DemagnetizationMap) -> Figure:
 def _slots_figure(found: DemagnetizationMap) -> Figure:
     """Draw the mean and the smallest H of every block by slot."""
     rows = found.by_block()
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    figure = figure_of(3.4)
     axis = figure.subplots()
     slots = np.array([row["slot"] for row in rows])
     for key, words, colour, shift in (("mean_H_A_per_m", "mean", POSTERIOR, -0.15),
@@ -203,7 +205,7 @@ def _slots_figure(found: DemagnetizationMap) -> Figure:
                  label="knee")
     axis.axhline(0, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="slot", ylabel="H along the\nmagnetization in kA/m")
-    axis.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1))
+    legend_above(figure, axis, columns=3)
     axis.grid(alpha=0.3)
     return figure
 

@@ -20,7 +20,16 @@ from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SECOND, SMALL
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    SECOND,
+    SMALL,
+    figure_of,
+    legend_above,
+)
 from halbach_fe.report.point_maps import residual_figure
 from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 
@@ -77,7 +86,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
         return _empty("too few readings to group them")
     first, *others = sorted(sizes, key=lambda kind: -sizes[kind])
     tallest = max(sizes[first], sum(sizes[kind] + 1.5 for kind in others))
-    figure = Figure(figsize=(9, 1.1 + 0.21 * tallest), layout="constrained")
+    figure = figure_of(1.1 + 0.21 * tallest)
     left, *right = figure.subfigures(1, 2 if others else 1, squeeze=False)[0]
     axes = [left.subplots()]
     if others:
@@ -107,7 +116,8 @@ def groups(diagnosis: Diagnosis) -> Figure:
             axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_xlim(*limits)
-    axes[0].legend(fontsize=SMALL)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2,
+                  frameon=False)
     for axis in (axes[0], axes[-1]):
         axis.set_xlabel("chi² per reading (1 expected)")
     return figure
@@ -130,7 +140,7 @@ def residuals(diagnosis: Diagnosis) -> Figure:
     if not apart:
         rows = [(label, -1.0) for label in dict.fromkeys(labels.tolist())]
     shown = states(diagnosis)
-    figure = Figure(figsize=(9, 1.2 + 1.15 * len(rows)), layout="constrained")
+    figure = figure_of(1.2 + 1.15 * len(rows))
     axes = figure.subplots(len(rows), len(shown), sharex=True, sharey="row", squeeze=False)
     coloured = False
     for (label, one), row in zip(rows, axes, strict=True):
@@ -211,8 +221,9 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     if diagnosis.unknown is not None:
         bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MAX_BARS]
-    figure = Figure(figsize=(9, 1.4 + 0.3 * max(len(top), len(bars))), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    heights = [0.7 + 0.3 * len(top), 0.7 + 0.3 * max(len(bars), 1)]
+    figure = figure_of(sum(heights) + 0.2)
+    left, right = figure.subplots(2, 1, height_ratios=heights)
     left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
@@ -231,8 +242,8 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     else:
         right.text(0.5, 0.5, "no effect was identified", ha="center", transform=right.transAxes)
         right.set_axis_off()
-    for axis in (left, right):
-        axis.set_ylim(max(len(top), len(bars)) - 0.4, -0.6)
+    for axis, shown in ((left, top), (right, bars)):
+        axis.set_ylim(max(len(shown), 1) - 0.4, -0.6)
     return figure
 
 
@@ -252,7 +263,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
     line = {"lw": 1.2} if connected else {"ls": "none", "marker": "_", "ms": 8}
-    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    figure = figure_of(5.4)
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
     for state in shown:
@@ -278,7 +289,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
                   f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
                   else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     top.set_ylabel(f"{label} in mT")
-    top.legend(fontsize=SMALL)
+    legend_above(figure, top)
     bottom.set_ylabel("measured − predicted\nin mT")
     bottom.set_xlabel(name)
     for axis in (top, bottom):
@@ -396,8 +407,7 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
     shown = states(diagnosis)
     found = [_deviations(state.update) for state in shown]
     rings, slots = next(iter(found[0].values())).shape
-    figure = Figure(figsize=(9, 1.0 + len(found[0]) * (1.0 + 0.14 * min(rings, 40))),
-                    layout="constrained")
+    figure = figure_of(1.0 + len(found[0]) * (1.0 + 0.14 * min(rings, 40)))
     axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(axes, found[0], strict=True):
         limit = max(float(np.nanmax(np.abs(deviations[name]))) for deviations in found) or 1.0
@@ -427,7 +437,7 @@ def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 def _empty(text: str) -> Figure:
     """Return a figure that shows a text only."""
-    figure = Figure(figsize=(8, 1), layout="constrained")
+    figure = figure_of(1)
     axis = figure.subplots()
     axis.text(0.5, 0.5, text, ha="center", transform=axis.transAxes)
     axis.set_axis_off()

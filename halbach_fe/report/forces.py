@@ -23,8 +23,8 @@ from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
-    PUBLISHED,
     SMALL,
+    figure_of,
     own_style,
     save,
     write_page,
@@ -152,8 +152,8 @@ def force_rows(found: Forces) -> list[dict[str, str]]:
                           if size > NEGLIGIBLE else "none"),
             "torque": decimals(float(np.linalg.norm(found.in_place.torque_Nm[number])))
             + "\u00a0Nm",
-            "inserted": _newton(float(found.inserted.magnitude[number])),
-            "inserted as": _ordinal(int(found.step[number]))})
+            "as it is inserted": _newton(float(found.inserted.magnitude[number])),
+            "inserted as the": _ordinal(int(found.step[number]))})
     return rows
 
 
@@ -193,18 +193,18 @@ def force_columns(found: Forces) -> dict[str, Iterable[object]]:
 
 def forces_figure(found: Forces) -> Figure:
     """Draw the ring with the largest force, and the forces by the order of insertion."""
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.1))
-    _draw_ring(left, found)
+    figure = figure_of(8.8)
+    above, below = figure.subplots(2, 1, height_ratios=(2, 1))
+    _draw_ring(above, found)
     order = found.order
     step = np.arange(1, len(order) + 1)
-    right.plot(step, found.in_place.magnitude[order], ".", ms=4, color=PUBLISHED,
+    below.plot(step, found.in_place.magnitude[order], "o", ms=4, color=PRIOR,
                label="with all others in place")
-    right.plot(step, found.inserted.magnitude[order], "-", lw=1, color=POSTERIOR,
+    below.plot(step, found.inserted.magnitude[order], "-", lw=1, color=POSTERIOR,
                label="as the next one to be inserted")
-    right.set(xlabel="step of the assembly", ylabel="force in N", ylim=(0, None))
-    right.grid(alpha=0.3)
-    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    below.set(xlabel="step of the assembly", ylabel="force in N", ylim=(0, None))
+    below.grid(alpha=0.3)
+    below.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return figure
 
 
@@ -256,8 +256,8 @@ def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> 
     with atomic(folder / "forces.csv") as temporary:
         write_csv(force_columns(found), {"study": found.magnet.name}, temporary)
     pictures = save({"forces.png": (
-        forces_figure(found), "Left: forces in place in the ring of the largest one; arrows show "
-        "their part in the plane, numbers are slots. Right: forces in the order of the assembly")},
+        forces_figure(found), "Above: forces in place in the ring of the largest one; arrows show "
+        "their part in the plane, numbers are slots. Below: forces in the order of the assembly")},
         folder)
     write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
                provenance=provenance, answer=answer(found), rows=force_rows(found), found=found,

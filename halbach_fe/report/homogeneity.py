@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -21,7 +22,15 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
-from halbach_fe.report.page import POSTERIOR, PUBLISHED, SMALL, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PUBLISHED,
+    SMALL,
+    figure_of,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
@@ -216,12 +225,12 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
     in the corners, the field of a homogeneous magnet deviates many times more. Colours end at
     ``largest`` in ppm, by default at `largest_shown`.
     """
-    figure = Figure(figsize=(8.4, 3.0), layout="constrained")
+    figure = figure_of(6.0)
     deviations, within = _deviations(slices, mean_T)
     largest = largest or largest_shown(slices, mean_T)
     levels = np.linspace(-largest, largest, 21)
     round_levels = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(-largest, largest)
-    axes = figure.subplots(1, 3)
+    *axes, last = figure.subplots(2, 2).ravel()
     for axis, each, deviation in zip(axes, slices, deviations, strict=True):
         names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
@@ -238,13 +247,17 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
         axis.set_xlabel(f"{names[0]} in mm")
         axis.set_ylabel(f"{names[1]} in mm")
     colours = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
-    figure.colorbar(colours, ax=axes, label="|B| over its mean, in ppm", shrink=0.9)
+    last.set_axis_off()
+    last.legend(handles=[Line2D([], [], color="black", lw=0.8, ls="--", label="the region")],
+                loc="upper center", frameon=False)
+    figure.colorbar(colours, cax=last.inset_axes((0.05, 0.5, 0.9, 0.07)), extend="both",
+                    orientation="horizontal", label="|B| over its mean, in ppm")
     return figure
 
 
 def harmonics_figure(known: Homogeneity) -> Figure:
     """Draw the largest harmonics by degree, with error bars of two standard deviations."""
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    figure = figure_of(3.4)
     axis = figure.subplots()
     largest = sorted(sorted(range(len(known.harmonics)),
                             key=lambda number: -abs(known.harmonics[number].ppm))[:DRAWN])

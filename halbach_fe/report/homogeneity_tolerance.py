@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
@@ -19,11 +20,13 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     begin_at_zero,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
 )
-from halbach_fe.report.words import ppm
+from halbach_fe.report.words import ppm, with_error
 
 ENOUGH = 0.9
 """Share of the magnets within the limit from which the tolerances suffice."""
@@ -77,7 +80,7 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
             f"{ppm(found.ordered.rms_ppm)} ppm rms.")
     share, prior = found.share, found.study.prior
     if share is not None and found.limit is not None:
-        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
@@ -114,7 +117,7 @@ def write_homogeneity_tolerance(found: HomogeneityTolerance, folder: Path) -> No
 
 def _figure(found: HomogeneityTolerance) -> Figure:
     """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
     for axis, values, ordered, name in (
             (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
@@ -123,10 +126,11 @@ def _figure(found: HomogeneityTolerance) -> Figure:
         axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
         axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
         axis.grid(alpha=0.3)
+        axis.xaxis.set_major_locator(MaxNLocator(4))  # numbers of five digits side by side
     left.set_ylabel("share of magnets")
     if found.limit is not None:
         left.axvline(found.limit, color=PRIOR, ls="--", label="limit")
     for axis in (left, right):
         begin_at_zero(axis)
-    left.legend(loc="lower right")
+    legend_above(figure, left)
     return figure

@@ -17,7 +17,7 @@ from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.magnetic_axis import axis_rows, definition
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
-from halbach_fe.report.page import POSTERIOR, SMALL, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, SMALL, figure_of, own_style, save, write_page
 from halbach_fe.report.prediction import (
     PublishedErrors,
     has_profile,
@@ -54,7 +54,7 @@ def score_table(result: InferenceResult,
             "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
             "before, rms": flux_density(score.rms_error_prior_T),
             "after, rms": flux_density(score.rms_error_posterior_T),
-            "of the largest reading": relative(score.rms_error_posterior_T / largest)
+            "after, of the largest reading": relative(score.rms_error_posterior_T / largest)
             if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
@@ -195,7 +195,7 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
     picture = 100 * result.magnet.by_ring(along)
     rings, slots = picture.shape
-    figure = Figure(figsize=(8, _figure_height(rings)), layout="constrained")
+    figure = figure_of(_figure_height(rings))
     axis = figure.subplots()
     limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
     image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
@@ -216,8 +216,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         result.contraction)
     rings = len(percent)
     slots = np.arange(1, percent.shape[1] + 1)
-    figure = Figure(figsize=(8, 3 if rings == 1 else _figure_height(rings)),
-                    layout="constrained")
+    figure = figure_of(3 if rings == 1 else _figure_height(rings))
     axis = figure.subplots()
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
     if rings == 1:

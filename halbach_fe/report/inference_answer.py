@@ -77,9 +77,13 @@ def _blocks(result: InferenceResult) -> str:
     row = np.zeros((1, len(result.posterior.mean)))
     result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
-    return (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
-            f"rms, the most {place_of(block)} by "
-            f"{'+' if mean[worst] > 0 else ''}{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
+    start = (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
+             f"rms, the most {place_of(block)}")
+    if mean[worst] < -1:
+        return (f"{start}, which is reversed: magnetized the other way round, with "
+                f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")
+    return (f"{start} by {'+' if mean[worst] > 0 else ''}"
+            f"{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
 
 
 def _rms(values: Floats) -> float:

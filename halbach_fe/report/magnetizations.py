@@ -16,7 +16,8 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
-    SMALL,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -118,7 +119,7 @@ def _magnetizations_figure(
     part = slice(first * size, (first + slots) * size)
     blocks = magnet.blocks[first:first + slots]
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
-    figure = Figure(figsize=(8, 1 + 2.4 * size), layout="constrained")
+    figure = figure_of(1 + 2.4 * size)
     axes = figure.subplots(size, 1, sharex=True)
     places = np.arange(1, slots + 1)
     shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
@@ -135,7 +136,7 @@ def _magnetizations_figure(
                   mew=2, label="truth", zorder=3)
         axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
         axis.grid(alpha=0.3)
-    axes[0].legend(ncols=4, fontsize=SMALL)
+    legend_above(figure, axes[0], columns=4)
     axes[-1].set_xlabel("slot")
     axes[-1].set_xticks(places)
     return figure

@@ -16,7 +16,15 @@ from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_
 from halbach_fe.measurement.map_check import VIOLATED, MapCheck, Reach
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    SECOND,
+    figure_of,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.point_maps import draw, panels
 from halbach_fe.report.words import decimals, flux_density, relative
 from halbach_fe.study.types import COMPONENTS
@@ -267,7 +275,7 @@ def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
     largest = float(np.nanmax(np.abs(field)))
     shown = [number for number in range(3)
              if np.nanmax(np.abs(field[:, number]), initial=0.0) > ZERO * largest]
-    figure = Figure(figsize=(10, 0.6 + 2.4 * len(shown)), layout="constrained")
+    figure = figure_of(0.6 + 2.4 * len(shown))
     for column, row in zip(shown, figure.subplots(len(shown), 2, sharex=True, sharey=True,
                                                   squeeze=False), strict=True):
         residual = 1e6 * np.where(check.excluded, np.nan, check.residual_T[:, column])[panel.points]
@@ -290,7 +298,7 @@ def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
 
 def _readings(check: MapCheck) -> Figure:
     """Draw the residuals of every column in the order of the map."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
+    figure = figure_of(4)
     axis = figure.subplots()
     number = np.arange(1, len(check.residual_T) + 1)
     for values, name, colour in zip(check.residual_T.T, COMPONENTS,
@@ -300,5 +308,6 @@ def _readings(check: MapCheck) -> Figure:
     axis.set_xlabel("row of the map")
     axis.set_ylabel("residual in µT")
     axis.grid(alpha=0.3)
-    axis.legend(markerscale=4)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3,
+                  frameon=False, markerscale=4)
     return figure

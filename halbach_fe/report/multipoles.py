@@ -17,7 +17,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
-    SMALL,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -57,13 +58,13 @@ def reference_text(model: MultipoleModel) -> str:
              else f"at z = {1e3 * round(model.z, 9):.4g} mm (Fourier coefficients of B_r)")
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
             f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
-            "the dipole). b_n is normal and a_n skew, in axes turned about z such that the main "
-            "multipole of the nominal magnet is normal.")
+            "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
+            "about z such that the main multipole of the nominal magnet is normal.")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
     """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    figure = figure_of(3.8)
     axes = figure.subplots(1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
     place = np.arange(len(orders))
@@ -80,7 +81,7 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("units of 1e-4")
-    axes[1].legend(fontsize=SMALL)
+    legend_above(figure, axes[1], columns=4)
     return figure
 
 
@@ -150,7 +151,8 @@ def answer(
         return Answer(
             question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "
             "tolerances of its blocks (the study's prior) and the solver leave open.",
-            "Measure it, update its blocks, and ask again with --posterior DIR/posterior.h5.",
+            "Measure it, update its blocks, and ask again with --posterior and the posterior.h5 of "
+            "that update.",
             "halbach-fe infer STUDY --measurements MAP -o DIR")
     if disagreement:
         return of_a_conflict(question, said, disagreement)

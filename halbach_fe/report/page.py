@@ -28,7 +28,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page_record import DPI, SMALLEST_PT, Picture, write_record
+from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -151,6 +151,22 @@ def _without_empty_cells(value: Any) -> Any:
     return "" if value is None else value
 
 
+def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:
+    """Return an empty figure of a height and width in inches, no wider than `WIDEST_IN`."""
+    return Figure(figsize=(min(width_in, WIDEST_IN), height_in), layout="constrained")
+
+
+def legend_above(figure: Figure, *axes: Axes, columns: int = 2) -> None:
+    """Put the names of what is drawn above a figure, where they hide nothing.
+
+    What several axes name alike is named once.
+    """
+    named = {name: shown for axis in axes for shown, name in zip(
+        *axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named.keys(), loc="outside upper center", frameon=False,
+                  ncols=min(columns, len(named)))
+
+
 def stacked_axes(
     rows: int, ratios: Sequence[float] | None = None, shared: bool = True
 ) -> tuple[Figure, list[Axes]]:
@@ -158,7 +174,7 @@ def stacked_axes(
 
     ``shared`` tells whether they share the x axis.
     """
-    figure = Figure(figsize=(8, 2.4 + 1.7 * rows), layout="constrained")
+    figure = figure_of(2.4 + 1.7 * rows)
     axes = figure.subplots(rows, 1, sharex=shared, squeeze=False,
                            gridspec_kw={"height_ratios": ratios or [1] * rows})
     for axis in axes[:, 0]:
@@ -234,7 +250,7 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
         Positions of held-out readings.
     """
     flat = np.ptp(points[:, 2]) == 0
-    figure = Figure(figsize=(5.5, 5.8) if flat else (10, 5.4), layout="constrained")
+    figure = figure_of(5.8, 5.5) if flat else figure_of(4.2)
     left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
     draw_cross_section(left, magnet)
     left.set(aspect="equal", xlabel="x in mm", ylabel="y in mm")

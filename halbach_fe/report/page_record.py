@@ -26,6 +26,11 @@ DPI = 130
 SMALLEST_PT = 9
 """Size of the smallest texts of a figure, in points of 1/72 inch."""
 
+WIDEST_IN = 6.9
+"""Largest width of a figure in inches. It fits between the margins of A4 and of US letter without
+being made smaller, so that its texts keep their size on paper, and on a screen of 500 px they are
+`LEGIBLE_PX` high."""
+
 LEGIBLE_PX, POINTS_PER_INCH = 9, 72
 """Size in px at which a text can still be read on a screen."""
 
@@ -52,9 +57,17 @@ class Picture(NamedTuple):
     @property
     def legible_px(self) -> int:
         """Width in px of a page below which its smallest texts could not be read."""
+        return round(self._width_px * LEGIBLE_PX / (SMALLEST_PT * DPI / POINTS_PER_INCH))
+
+    @property
+    def width_in(self) -> float:
+        """Width in inches at which its texts have the size that they were drawn with."""
+        return round(self._width_px / DPI, 2)
+
+    @property
+    def _width_px(self) -> int:
         header = base64.b64decode(self.png[:32])  # signature, length and name of the first chunk
-        width = int.from_bytes(header[16:20], "big")
-        return round(width * LEGIBLE_PX / (SMALLEST_PT * DPI / POINTS_PER_INCH))
+        return int.from_bytes(header[16:20], "big")
 
 
 def _cleaned(text: str) -> str:

@@ -20,11 +20,13 @@ from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
+    MEASURED,
     POSTERIOR,
     PRIOR,
-    PUBLISHED,
     draw_cross_section,
+    figure_of,
     label_logarithmic,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -177,7 +179,7 @@ def _rms(values: Floats) -> float:
 def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     """Draw all positions in the cross-section, and by z and angle if not in a single plane."""
     flat = np.ptp(plan.candidates[:, 2]) == 0
-    figure = Figure(figsize=(6.4, 5.2) if flat else (10, 5.2), layout="constrained")
+    figure = figure_of(5.2, 6.4) if flat else figure_of(4.2)
     left, *others = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
     draw_cross_section(left, magnet)
     shown = _draw_points(left, plan, lambda points: 1e3 * points[:, :2])
@@ -215,42 +217,42 @@ def _pattern_figure(plan: MeasurementPlan) -> Figure:
         """Return that mean in per cent of the prior's, of information in nats."""
         return np.asarray(100 * np.exp(-gain / len(plan.parameters)))
 
-    figure = Figure(figsize=(8, 4), layout="constrained")
+    figure = figure_of(4)
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), left(plan.gain), color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, left(plan.baseline_gain), color=PRIOR,
               label="as many positions of the study, evenly spread")
-    axis.axhline(left(plan.baseline_gain)[-1], color=PUBLISHED, lw=0.8, ls=":",
+    axis.axhline(left(plan.baseline_gain)[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
-    axis.legend()
+    legend_above(figure, axis)
     return figure
 
 
 def _deviation_figure(plan: MeasurementPlan) -> Figure:
     """Draw what is left unknown of the deviation of |B| against the number of points."""
     assert plan.deviation is not None
-    figure = Figure(figsize=(8, 4), layout="constrained")
+    figure = figure_of(4)
     axis = figure.subplots()
     axis.plot(range(1, len(plan.gain) + 1), plan.deviation.planned, color=POSTERIOR, label="plan")
     axis.plot(plan.baseline_counts, plan.deviation.baseline, color=PRIOR,
               label="as many positions of the study, evenly spread")
-    axis.axhline(plan.deviation.baseline[-1], color=PUBLISHED, lw=0.8, ls=":",
+    axis.axhline(plan.deviation.baseline[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
     axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
-    axis.legend()
+    legend_above(figure, axis)
     return figure
 
 
 def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     """Draw the ratio of posterior to prior standard deviations, by slot."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
+    figure = figure_of(4)
     axis = figure.subplots()
     slots = np.array([block.slot for block in magnet.blocks])
     places = np.arange(1, max(magnet.blocks_by_ring) + 1)

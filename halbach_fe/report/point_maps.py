@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.report.page import figure_of
 
 SAME = 1e-3
 """Part of the size of a map within which lengths count as equal."""
@@ -206,7 +207,7 @@ def _not_zero(rows: Mapping[str, Floats]) -> dict[str, Floats]:
 
 def _grid(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and its axes in rows and columns."""
-    figure = Figure(figsize=(max(4.6 * columns, 6.0), 0.4 + 2.4 * rows), layout="constrained")
+    figure = figure_of(0.4 + 2.4 * rows, max(4.6 * columns, 6.0))
     return figure, figure.subplots(rows, columns, squeeze=False).tolist()
 
 

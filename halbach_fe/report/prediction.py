@@ -22,7 +22,15 @@ from halbach_fe.inference.result import (
     Prediction,
 )
 from halbach_fe.measurement.scan_lines import point_spacing
-from halbach_fe.report.page import MEASURED, POSTERIOR, PRIOR, PUBLISHED, SMALL, stacked_axes
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    figure_of,
+    legend_above,
+    stacked_axes,
+)
 from halbach_fe.report.point_maps import curve, residual_figure, unit_for
 
 MARKERS: dict[str, dict[str, Any]] = {
@@ -161,10 +169,9 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
             axis.plot(line.place[mask], values[mask], ls="none", color=MEASURED, **MARKERS[part],
                       label=f"measured, {part}" if axis is top else None)
     top.set_ylabel(f"{line.what} in mT")
-    top.legend()
     bottom.set_ylabel(f"measured − predicted\nin {unit}")
     bottom.set_xlabel(line.axis)
-    bottom.legend(loc="lower center")
+    legend_above(figure, top, bottom)
     return figure
 
 
@@ -217,7 +224,7 @@ def relative_error_figure(result: InferenceResult, published: PublishedErrors | 
     """Draw the relative error |measured - predicted| / |measured| along the main line."""
     line = main_line(result)
     figure, (axis,) = stacked_axes(1)
-    figure.set_size_inches(8, 4.5)
+    figure.set_figheight(4.5)
     if published is not None:
         axis.semilogy(1e3 * published.z, published.prior, ":", color=PUBLISHED, lw=1,
                       label=f"{published.label}, prior")
@@ -232,7 +239,7 @@ def relative_error_figure(result: InferenceResult, published: PublishedErrors | 
                               label=f"{name}, {part}", **MARKERS[part])
     axis.set_xlabel(line.axis)
     axis.set_ylabel(f"|measured − predicted| / |measured| of {line.what}")
-    axis.legend(ncols=2, fontsize=SMALL)
+    legend_above(figure, axis)
     return figure
 
 
@@ -250,8 +257,8 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.2, lw=0)
         axis.set_ylabel(f"standardized\nresidual, {name}")
         _scale(axis, scores)
-    axes[0].legend(ncols=3, fontsize=SMALL, loc="upper right",
-                   markerscale=5 if len(result.readings) > CROWD else 1)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3,
+                  frameon=False, markerscale=5 if len(result.readings) > CROWD else 1)
     axes[1].set_xlabel(label)
     return figure
 
@@ -262,7 +269,7 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     The residuals are those of the held-out readings for prior and posterior. If nothing is held
     out, they are those of the training readings for the prior, which does not depend on them.
     """
-    figure = Figure(figsize=(5.2, 5), layout="constrained")
+    figure = figure_of(5.4, 5.2)
     axis = figure.subplots()
     unseen = result.held_out.any()
     chosen = result.held_out if unseen else ~result.held_out
@@ -283,7 +290,7 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
              + ("held-out readings" if unseen else "training readings"))
     _scale(axis, np.concatenate(found))
     axis.grid(alpha=0.3)
-    axis.legend(loc="upper left")
+    legend_above(figure, axis, columns=1)
     return figure
 
 

@@ -16,12 +16,18 @@ from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import MEASURED, PUBLISHED, figure_of, own_style, save, write_page
 from halbach_fe.report.words import counted, fraction, p_value
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
 (across it)."""
+
+PARTS = ("in length", "in direction, in the plane of the ring", "in direction, towards z")
+"""Parts of the deviation of a magnetization from the nominal one."""
+
+ALONG_Z = 1e-9
+"""Part of a magnetization in the plane of the ring below which it is along z."""
 
 NOTHING = "–"
 SIMULATIONS = 1000
@@ -35,7 +41,7 @@ def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
     """
     tested = _tested(prior)
     return [
-        {"type": samples.label, "n": str(len(samples.deviations)),
+        {"type": samples.label, "blocks": str(len(samples.deviations)),
          **{f"{name} in {unit}": f"{mean:+.2f}{sd}" for name, unit, mean, sd in zip(
              DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
              ["" if np.isnan(sd) else f" ± {sd:.2f}" for sd in _sd_of_type(samples)],
@@ -72,13 +78,57 @@ def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     }
 
 
+def parts_table(magnet: Magnet, prior: MeasuredPrior) -> list[dict[str, str]]:
+    """Return rows of text: how far blocks deviate from the study, and how far they remain unknown,
+    along the nominal magnetization, across it, and together.
+    """
+    size, count = magnet.dimension, len(magnet.blocks)
+    uniform = slice(size * count)  # without the variations inside blocks
+    nominal = prior.nominal[uniform].reshape(count, size)
+    there = np.linalg.norm(nominal, axis=1) > 0
+    nominal = nominal[there]
+    shift = (prior.gaussian.mean - prior.nominal)[uniform].reshape(count, size)[there]
+    covariance = prior.gaussian.covariance[uniform, uniform].reshape(count, size, count, size)
+    own = np.einsum("iaib->iab", covariance)[there]
+    axes = _axes(nominal)
+    square = np.sum(nominal**2, axis=1)[:, None]
+    weight = square / square.mean()
+    squares = {
+        "deviation from the study": np.einsum("ikb,ib->ik", axes, shift)**2 / square,
+        "unknown now (sd)": np.einsum("ika,iab,ikb->ik", axes, own, axes) / square}
+    rows = []
+    for name, values in squares.items():
+        parts = np.sqrt(np.mean(weight * values, axis=0))
+        rows.append({"rms over the blocks": name} | {
+            PARTS[number]: f"{100 * part:.2f}\u00a0%" if not number else
+            f"{np.degrees(part):.2f}° = {100 * part:.2f}\u00a0%"
+            for number, part in enumerate(parts.tolist())} | {
+            "together": f"{100 * float(np.linalg.norm(parts)):.2f}\u00a0%"})
+    return rows
+
+
+def _axes(nominal: Floats) -> Floats:
+    """Return unit vectors (n, dimension, dimension) along magnetizations (n, dimension), across
+    them in the plane of the ring, and for three dimensions across both.
+    """
+    along = nominal / np.linalg.norm(nominal, axis=1)[:, None]
+    if nominal.shape[1] == 2:
+        return np.stack([along, np.column_stack([-along[:, 1], along[:, 0]])], axis=1)
+    flat = np.hypot(along[:, 0], along[:, 1])[:, None] > ALONG_Z
+    across = np.where(flat, np.column_stack([-along[:, 1], along[:, 0], 0 * along[:, 0]]),
+                      [0.0, 1.0, 0.0])
+    across = across / np.linalg.norm(across, axis=1)[:, None]
+    return np.stack([along, across, np.cross(along, across)], axis=1)
+
+
 def answer(prior: MeasuredPrior) -> Answer:
     """Say how the measured blocks deviate from the study, and what to do next."""
     size = np.sqrt(np.mean(prior.nominal**2))
     spread = float(np.sqrt(np.mean(prior.gaussian.sd**2))) / size
     shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
     said = (f"The {counted(prior.count, 'measured block')} deviate from the study's magnetization "
-            f"by {fraction(shift)} rms, and each is now known to {fraction(spread)}. " + (
+            f"by {fraction(shift)} rms, and each is now known to {fraction(spread)}, both in "
+            "length and direction together. " + (
                 "Ring and slot of every block are known: each has its own measurement."
                 if prior.placed else "Which block is in which slot is not known: all blocks of a "
                 "type have its mean and spread."))
@@ -126,7 +176,8 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
             _deviations_figure(prior), "Deviation of each block from the study's magnetization: "
             "along it, and across it")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
-               summary=summary, rows=type_table(prior), tested=_tested(prior), answer=answer(prior))
+               summary=summary, rows=type_table(prior), tested=_tested(prior), answer=answer(prior),
+               parts=parts_table(magnet, prior))
 
 
 def _mean_of_type(samples: TypeSamples) -> Floats:
@@ -157,7 +208,7 @@ def _standardized(samples: Floats) -> Floats:
 def _deviations_figure(prior: MeasuredPrior) -> Figure:
     """Draw the deviations of all blocks, in the order of their types."""
     deviations = np.vstack([samples.deviations for samples in prior.types])
-    figure = Figure(figsize=(8, 1 + 1.8 * deviations.shape[1]), layout="constrained")
+    figure = figure_of(1 + 1.8 * deviations.shape[1])
     axes = figure.subplots(deviations.shape[1], 1, sharex=True, squeeze=False)[:, 0]
     for axis, name, unit, factor, values in zip(axes, DIRECTIONS, ("%", "°", "°"), UNITS,
                                                 deviations.T, strict=False):
@@ -176,7 +227,7 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     The simulated samples of the band are standardized in the same way.
     """
     groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
-    figure = Figure(figsize=(10, 3.9), layout="constrained")
+    figure = figure_of(3.9)
     axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
     count = sum(len(group) for group in groups)
     expected = special.ndtri((np.arange(count) + 0.5) / count)

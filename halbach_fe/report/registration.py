@@ -11,13 +11,21 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
-from halbach_fe.inference.pose_result import Registration
+from halbach_fe.inference.pose_result import ProbePrior, Registration
 from halbach_fe.inference.registration import axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, POSTERIOR, SECOND, own_style, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    SECOND,
+    figure_of,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import counted, decimals, flux_density, with_error
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
@@ -134,8 +142,9 @@ def pose_table(
             "pose": str(number), "odds": f"{100 * probability:.3g} %",
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
-            "nominal" if before == NOMINAL else "before": _rms_in_words(each.nominal_rms_T),
-            "updated": _rms_in_words(each.rms_T), "chi²/reading": decimals(each.chi2)})
+            f"{before} off by": _rms_in_words(each.nominal_rms_T),
+            "updated blocks off by": _rms_in_words(each.rms_T),
+            "chi²/reading": decimals(each.chi2)})
     return rows
 
 
@@ -150,16 +159,20 @@ def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
             for number, each in enumerate(found, 1)]
 
 
-def probe_table(instrument: Instrument) -> list[dict[str, str]]:
-    """Return rows of text: what the fit says about the probe."""
-    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}", "value": f"{1e3 * value:+.2f} mrad"}
+def probe_table(instrument: Instrument, sd: ProbePrior) -> list[dict[str, str]]:
+    """Return rows of text: what the fit says about the probe, with standard deviations."""
+    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}",
+             "value": with_error(1e3 * value, 1e3 * sd.crosstalk) + "\u00a0mrad"}
             for name, value in instrument.crosstalk.items()]
     for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
                                          instrument.sensor_position_m, strict=True):
-        rows += [{"of the probe": f"gain of B{name}", "value": f"{100 * gain:+.3f} %"},
-                 {"of the probe": f"offset of B{name}", "value": f"{1e3 * offset:+.3f} mT"},
-                 {"of the probe": f"place of the B{name} sensor",
-                  "value": ", ".join(f"{1e3 * value:+.3f}" for value in place) + " mm"}]
+        rows += [{"of the probe": f"gain of B{name}",
+                  "value": with_error(100 * gain, 100 * sd.gain) + "\u00a0%"},
+                 {"of the probe": f"offset of B{name}",
+                  "value": with_error(1e3 * offset, 1e3 * sd.offset_T) + "\u00a0mT"},
+                 *({"of the probe": f"place of the B{name} sensor, {axis}",
+                    "value": with_error(1e3 * value, 1e3 * sd.sensor_m) + "\u00a0mm"}
+                   for axis, value in zip(COMPONENTS, place, strict=True))]
     return rows
 
 
@@ -234,7 +247,7 @@ def _write_page(
                provenance, answer=answer(found, before, name),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
-               name=study.name, probe=probe_table(best.instrument), map=name)
+               name=study.name, probe=probe_table(best.instrument, best.probe), map=name)
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:
@@ -242,7 +255,7 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     base = best.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
     read = in_si_and_magnet_axes(base, data)
     points = 1e3 * probe_points(best.instrument, points_of(read))
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
                                     (SECOND, POSTERIOR, MEASURED), strict=True):
@@ -250,10 +263,11 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     along.set_xlabel("z in the magnet in mm")
     along.set_ylabel("B in mT")
     along.grid(alpha=0.3)
-    along.legend(markerscale=4)
     across.plot(points[:, 0], points[:, 1], ".", ms=3, color=POSTERIOR)
     across.set_aspect("equal", adjustable="datalim")
     across.set_xlabel("x in the magnet in mm")
     across.set_ylabel("y in the magnet in mm")
     across.grid(alpha=0.3)
+    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=3,
+                  frameon=False, markerscale=4)
     return figure

@@ -10,14 +10,24 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_design import Designed, RingDesign
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, slices_figure
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SMALL, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    SMALL,
+    figure_of,
+    legend_above,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import ppm
 from halbach_fe.study.edit_file import write_edited
 
@@ -101,7 +111,7 @@ def columns(found: Designed) -> dict[str, Iterable[object]]:
 
 def front_figure(found: Designed) -> Figure:
     """Draw the deviation of all designs over their field."""
-    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     field = [1e3 * one.mean_T for one in found.front]
     axis.plot(field, [one.peak_to_peak_ppm for one in found.front], "o-", color=PRIOR,
@@ -110,10 +120,11 @@ def front_figure(found: Designed) -> Figure:
     axis.plot(1e3 * found.best.mean_T, found.best.peak_to_peak_ppm, "o", ms=11, color=POSTERIOR,
               label="the best design")
     axis.set(xlabel="mean field in mT", ylabel="deviation in ppm", yscale="log")
-    for labels in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
-        labels(FuncFormatter(lambda value, _: ppm(value)))
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))  # others would touch each other
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3)
-    axis.legend(frameon=False)
+    legend_above(figure, axis, columns=3)
     return figure
 
 
@@ -122,7 +133,7 @@ def side_figure(found: Designed) -> Figure:
     rings = found.study.array.ring
     length = max(ring.z_m or 0.0 for ring in rings) - min(ring.z_m or 0.0 for ring in rings)
     shape = length / max(ring.outer_radius_m or length for ring in rings)
-    figure = Figure(figsize=(np.clip(1.5 + 3.0 * shape, 5.0, 11.0), 3.6), layout="constrained")
+    figure = figure_of(3.6, max(1.5 + 3.0 * shape, 5.0))
     axis = figure.subplots()
     for ring in rings:
         assert ring.z_m is not None  # those of a design are not stacked

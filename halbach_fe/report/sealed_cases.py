@@ -17,7 +17,17 @@ from scipy import stats
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.summary import EMPTY_CELL
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import POSTERIOR, PRIOR, PUBLISHED, SMALL, own_style, save, write_page
+from halbach_fe.report.page import (
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    SMALL,
+    figure_of,
+    legend_above,
+    own_style,
+    save,
+    write_page,
+)
 from halbach_fe.report.words import fraction
 from halbach_fe.study.model import Study
 
@@ -174,7 +184,7 @@ def _confusion(confusion: Confusion) -> Figure:
 
 def _reliability(kinds: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
     """Draw stated probability against frequency, with the binomial 95 % interval, side by side."""
-    figure = Figure(figsize=(4.6 * len(kinds), 4.4), layout="constrained")
+    figure = figure_of(4.4, 4.6 * len(kinds))
     for axis, (kind, rows) in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds.items(),
                                   strict=True):
         stated = np.array([row["stated"] for row in rows])
@@ -195,12 +205,12 @@ def _reliability(kinds: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
 
 def _gap(results: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw chi-squared of held-out readings before and after, with cases sorted by the former."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     ordered = sorted(results, key=lambda case: case["chi2_before"])
     axis.axhspan(0.9, 1.1, color=PUBLISHED, alpha=0.4, lw=0)
     axis.semilogy([case["chi2_before"] for case in ordered], ".", color=PRIOR, label="before")
     axis.semilogy([case["chi2_after"] for case in ordered], ".", color=POSTERIOR, label="after")
     axis.set(xlabel="case", ylabel="chi² per held-out reading")
-    axis.legend()
+    legend_above(figure, axis)
     return figure

@@ -25,7 +25,9 @@ from halbach_fe.report.page import (
     PUBLISHED,
     THIRD,
     draw_cross_section,
+    figure_of,
     label_logarithmic,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -144,7 +146,7 @@ def plan_rows(plans: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
 
 def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
     """Draw by how much 1 % more magnetization of the block changes B, with all blocks."""
-    figure = Figure(figsize=(7.4, 6), layout="constrained")
+    figure = figure_of(6)
     axis = figure.subplots()
     block = next(each for each in magnet.blocks if each.slot == found.block)
     change_mT = 1e3 * 0.01 * float(np.linalg.norm(block.magnetization)) * found.size
@@ -164,7 +166,7 @@ def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
 
 def _sensitivity_of_readings_figure(found: Sensitivity) -> Figure:
     """Draw the change of B by reading and block, for both kinds of change."""
-    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    figure = figure_of(4.2)
     axes = figure.subplots(1, 2, sharey=True)
     degrees = np.degrees(found.angle)
     blocks = np.arange(1, found.along.shape[1] + 1)
@@ -179,7 +181,7 @@ def _sensitivity_of_readings_figure(found: Sensitivity) -> Figure:
 
 def _uncertainty_of_plans_figure(found: Sensitivity) -> Figure:
     """Draw the uncertainty that all plans leave against the number of points."""
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    figure = figure_of(4.2)
     axis = figure.subplots()
     colours = (PRIOR, POSTERIOR, PUBLISHED, IRON)
     for (name, (counts, gain)), colour in zip(found.information.items(), colours, strict=False):
@@ -190,5 +192,5 @@ def _uncertainty_of_plans_figure(found: Sensitivity) -> Figure:
              yscale="log")
     label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
-    axis.legend()
+    legend_above(figure, axis)
     return figure

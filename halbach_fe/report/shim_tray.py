@@ -16,7 +16,7 @@ from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
-from halbach_fe.report.page import PUBLISHED, own_style, save, write_page
+from halbach_fe.report.page import PUBLISHED, figure_of, own_style, save, write_page
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.study.shim_tray import ShimTray
@@ -126,7 +126,9 @@ def tray_figure(found: FilledTray) -> Figure:
     Arrows are polarizations: upwards ones point away from the axis, those to the right towards
     larger angles.
     """
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    columns, rows = (len(np.unique(values.round(6))) for values in (
+        np.arctan2(found.places_m[:, 1], found.places_m[:, 0]), found.places_m[:, 2]))
+    figure = figure_of(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)))
     axis = figure.subplots()
 
     def unrolled(places: Floats) -> tuple[Floats, Floats]:
@@ -143,7 +145,7 @@ def tray_figure(found: FilledTray) -> Figure:
         turn = np.radians([one.from_radius_deg for one in mine])
         colour = COLOURS[number % len(COLOURS)]
         axis.quiver(angle, z, np.sin(turn), np.cos(turn), pivot="mid", color=colour,
-                    scale=45, width=0.0035, label=name)
+                    scale=max(26, 1.1 * columns), width=0.005, label=name)
     axis.set(xlabel="angle about z in degrees", ylabel="z in mm", xlim=(-10, 360))
     axis.margins(y=0.2)
     axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(names) + 1, frameon=False)

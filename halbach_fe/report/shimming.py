@@ -29,6 +29,7 @@ from halbach_fe.report.page import (
     SECOND,
     SMALL,
     draw_cross_section,
+    figure_of,
     own_style,
     save,
     write_page,
@@ -241,7 +242,7 @@ def _convention(shim: Shim) -> str:
 def _moves_figure(shim: Shim) -> Figure:
     """Draw the moves in the cross-section, or for several rings in a grid of rings and slots."""
     flat = len(shim.magnet.blocks_by_ring) == 1
-    figure = Figure(figsize=(6, 6) if flat else (9, 4.6), layout="constrained")
+    figure = figure_of(6, 6) if flat else figure_of(4.6)
     axis = figure.subplots()
     if flat:
         draw_cross_section(axis, shim.magnet)
@@ -275,7 +276,7 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
 
 def _gain_figure(shim: Shim) -> Figure:
     """Draw the rms of the values against the number of moves."""
-    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    figure = figure_of(3.4)
     axis = figure.subplots()
     sizes = [known.rms for known in (shim.before, *(step.after for step in shim.steps))]
     axis.plot(sizes, "-o", color=POSTERIOR)

@@ -20,6 +20,7 @@ from halbach_fe.report.page import (
     SECOND,
     geometry_figure,
     label_logarithmic,
+    legend_above,
     own_style,
     save,
     stacked_axes,
@@ -167,7 +168,7 @@ def field_figure(solution: Solution) -> Figure:
         top.plot(place[order], 1e3 * column[order], ".-", ms=4, lw=0.8, color=colour,
                  label=f"B{component}")
     top.set_ylabel("B in mT")
-    top.legend(ncols=3)
+    legend_above(figure, top, columns=3)
     if below:
         others[0].semilogy(below[0], 1e6 * solution.errors, ".", ms=3, color=MEASURED)
         others[0].set(ylabel="error bar in µT", xlabel=below[1])

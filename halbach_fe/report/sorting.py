@@ -27,6 +27,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     begin_at_zero,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -221,12 +223,12 @@ def _axis_text(found: SortedBlocks) -> str:
 
 def _random_orders_figure(found: SortedBlocks) -> Figure:
     """Draw the histogram of the rms of random orders."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
     axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
     axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")
     axis.set(xlabel=f"rms of {_axis_text(found)}", ylabel="random orders")
     begin_at_zero(axis)
-    axis.legend()
+    legend_above(figure, axis, columns=3)
     return figure

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import TypedDict
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
 
-from halbach_fe.report.page import POSTERIOR, SECOND, SMALL
+from halbach_fe.report.page import POSTERIOR, SECOND, SMALL, figure_of
 from halbach_fe.report.words import decimals, with_error
 from halbach_fe.response.stray_field import NEAREST, StrayField
 
@@ -89,12 +91,13 @@ def stray_pictures(stray: StrayField | None) -> Mapping[str, tuple[Figure, str]]
 
 def stray_figure(stray: StrayField) -> Figure:
     """Draw lines of equal |B| around the magnet in three planes, in mm and mT."""
-    figure = Figure(figsize=(9.6, 3.5), layout="constrained")
+    figure = figure_of(6.6)
+    axes = figure.subplots(2, 2).ravel()
     radius, half = 1e3 * stray.radius_m, 1e3 * stray.half_length_m
     reached = [reach.distance_m for reach in (stray.radial, stray.axial) if reach]
     widest = 1e3 * (AROUND * max(reached) if reached else max(
         float(np.abs(plane.first_m).max()) for plane in stray.planes))
-    for axis, plane in zip(figure.subplots(1, 3), stray.planes, strict=True):
+    for axis, plane in zip(axes[:-1], stray.planes, strict=True):
         names = [name for name in "xyz" if name != plane.across]
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
         size = np.log(plane.size_T)
@@ -125,4 +128,17 @@ def stray_figure(stray: StrayField) -> Figure:
         axis.set(aspect="equal", xlabel=f"{names[0]} in mm", ylabel=f"{names[1]} in mm",
                  xlim=(-widest, widest), ylim=(-widest, widest))
         axis.grid(alpha=0.3)
+    _explain(axes[-1], stray)
     return figure
+
+
+def _explain(axis: Axes, stray: StrayField) -> None:
+    """Say in an empty panel what is drawn in the others."""
+    axis.set_axis_off()
+    shown = [Patch(color="#cccccc", label="cylinder around the magnet"),
+             Line2D([], [], color=POSTERIOR, lw=2, label=line_name(stray)),
+             Line2D([], [], color="#777777", lw=0.6, label="other |B|, in mT")]
+    if stray.radial:
+        shown.append(Line2D([], [], color=SECOND, lw=0.8, ls="--",
+                            label="largest distances of\nthat line from the middle"))
+    axis.legend(handles=shown, loc="center", frameon=False)

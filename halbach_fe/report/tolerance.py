@@ -25,10 +25,13 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     begin_at_zero,
+    figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
 )
+from halbach_fe.report.words import whole, with_error
 from halbach_fe.response.multipoles import plain
 
 LEAST_OF_SD = 5e-3
@@ -71,7 +74,7 @@ def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, st
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
-        row = {"n": str(order), "|c_n| of the mean": _size(found, i),
+        row = {"n": str(order), "|c_n| of the mean magnet": _size(found, i),
                "sd of b_n": f"{sd[i]:.3g}", "sd of a_n": f"{sd[size + i]:.3g}"}
         row |= {f"{100 * q:g} % below": f"{value:.3g}"
                 for q, value in zip(QUANTILES, found.quantiles[:, i], strict=True)}
@@ -101,7 +104,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
             f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
     share, prior = found.share, found.study.prior
     if share is not None:
-        said = (f"{100 * share:.3g} ± {100 * (found.share_sd or 0.0):.2g}\u00a0% of the magnets "
+        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
@@ -113,7 +116,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
         "Which multipoles do the tolerances of the blocks make?", said,
         f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
         f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
-        f"those tolerances come on top. {len(found.sizes)} magnets were drawn.", *step)
+        f"those tolerances come on top. {whole(len(found.sizes))} magnets were drawn.", *step)
 
 
 @own_style
@@ -134,19 +137,20 @@ def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> No
     }, folder)
     write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
                study=found.study, answer=answer(found), reference=reference_text(found.model),
-               rows=quantile_table(found), main=main_in_words(found.model, found.known))
+               rows=quantile_table(found), draws=whole(len(found.sizes)),
+               main=main_in_words(found.model, found.known))
 
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:
     """Draw median and quantiles of |c_n| by order."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     place = np.arange(len(found.model.orders))
     low, middle, high = found.quantiles[:3]
     axis.errorbar(place, middle, [middle - low, high - middle], fmt="o", color=POSTERIOR, capsize=4)
     if found.limit is not None:
         axis.axhline(found.limit, color=PRIOR, ls="--", label="limit")
-        axis.legend()
+        legend_above(figure, axis)
     axis.set_xticks(place, [f"c$_{{{order}}}$" for order in found.model.orders])
     axis.set(ylabel="|c$_n$| in units", ylim=(0, None))
     axis.grid(alpha=0.3)
@@ -155,13 +159,13 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
 
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    figure = figure_of(3.6)
     axis = figure.subplots()
     largest = np.sort(found.sizes.max(axis=1))
     axis.plot(largest, np.arange(1, len(largest) + 1) / len(largest), color=POSTERIOR)
     if found.limit is not None:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
-        axis.legend(loc="lower right")
+        legend_above(figure, axis)
     axis.axhline(1, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02))
     begin_at_zero(axis)

@@ -22,11 +22,12 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
-    SMALL,
     THIRD,
     axis_of_points,
+    figure_of,
     geometry_figure,
     label_logarithmic,
+    legend_above,
     own_style,
     save,
     stacked_axes,
@@ -168,7 +169,7 @@ def write_verification(
 
 def _convergence_figure(found: Verification) -> Figure:
     """Draw the change by the next finer mesh, relative to the largest field, by element size."""
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    figure = figure_of(4.6)
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
     sizes = size * np.array([REFINEMENT**2, REFINEMENT, 1.0])
@@ -191,7 +192,7 @@ def _convergence_figure(found: Verification) -> Figure:
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3, which="both")
-    figure.legend(loc="outside upper center", ncols=2, fontsize=SMALL)
+    legend_above(figure, axis)
     return figure
 
 
@@ -206,5 +207,5 @@ def _change_figure(found: Verification) -> Figure:
                       label=difference.what.replace("_", " "))
     axis.set(xlabel=label, ylabel="|change of B| in µT")
     label_logarithmic(axis.yaxis)
-    figure.legend(loc="outside upper center", ncols=2, fontsize=SMALL)
+    legend_above(figure, axis)
     return figure

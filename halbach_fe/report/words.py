@@ -88,6 +88,11 @@ def p_value(value: float) -> str:
     return "less than 0.0001" if value < 1e-4 else f"{value:.2g}"
 
 
+def whole(number: int) -> str:
+    """Return a whole number with its thousands apart."""
+    return f"{number:,}".replace(",", "\u202f") if abs(number) >= 10_000 else str(number)
+
+
 def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a number and its noun: 1 move, 2 moves."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"

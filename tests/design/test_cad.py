@@ -15,6 +15,8 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.assembly import cad
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
+from halbach_fe.report.assembly_sheets import drawing, height_mm, sheets
+from halbach_fe.report.page import rendered
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_delivery
 
@@ -131,6 +133,31 @@ def test_the_plan_says_which_block_goes_where(made):
     # the diameters of the ring whose volume the plates have
     assert all(one in page for one in ("holder_01.step", "ring 1", (
         f"outer diameter of {2e3 * OUTER:.5g} mm and a bore of {2e3 * INNER:.5g} mm")))
+
+
+EXPLAINED = {"engraved number of this holder": "engraving_m", "notch in a pocket": "mark_m"}
+"""Words of the key of a drawing, and the depth of the mark that they explain."""
+
+
+@pytest.mark.parametrize("there", [*EXPLAINED.values(), ""])
+def test_a_drawing_explains_the_marks_that_it_has(there):
+    """And only these; bars of the number are drawn apart from the other openings."""
+    plan = cad(build_magnet(study(**({there: 5e-4} if there else {}))), None)
+    found = [drawing(sheet, "") for sheet in sheets(plan)]
+    page = rendered("assembly.html.j2", study=plan.magnet.study, answer=None, pictures=[],
+                    provenance={},
+                    sheets=found, holder=plan.holder, prefix="", measured=False, kinds=[],
+                    plates=[], diameters="", files=[])
+    for words, key in EXPLAINED.items():
+        assert (words in page) == (key == there)
+    assert all(bool(one.engraved) == (there == "engraving_m") for one in found)
+    (plate,) = plan.plates
+    outlines = found[0].plate.count("M")
+    assert outlines == 1 + len(plate.openings) - len(plate.bars)
+
+
+def test_heights_that_are_zero_but_for_rounding_are_zero():
+    assert [height_mm(z) for z in (1.7e-18, -1.7e-18, -0.034)] == ["0", "0", "-34"]
 
 
 @pytest.mark.parametrize(("holder", "said"), [

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import json
 import re
 import shlex
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import halbach_fe as hf
 from halbach_fe.cli import main
+from halbach_fe.cli.common import _paths_of
 from halbach_fe.cli.verbs import parser
+from halbach_fe.core.files import write_text
+from halbach_fe.core.result_folder import result_folder
+from halbach_fe.diagnosis.effects.base import Parameter
+from halbach_fe.diagnosis.effects.block_demagnetized import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.summary import amounts
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.storage import read_posterior, write_inference
@@ -200,7 +209,8 @@ def of_shim(given):
 
 def of_tolerance(given):
     found = hf.tolerance(given.magnet, given.session, draws=200, limit_units=100.0)
-    return tolerance.answer(found), [f"{100 * found.share:.3g} ±", "200 magnets"]
+    return tolerance.answer(found), [
+        with_error(100 * found.share, 100 * found.share_sd), "200 magnets"]
 
 
 def of_demagnetization(given):
@@ -316,6 +326,78 @@ def test_the_command_has_the_files_of_the_user(tmp_path):
         str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
 
 
+def test_words_that_stand_for_no_known_path_are_explained():
+    answer = Answer("?", "", "", "", "halbach-fe infer STUDY --measurements MAP -o DIR")
+    said = answer.with_paths({"STUDY": "a.toml"}).to_fill_in
+    assert said == ("In this command MAP is the file of your field map (CSV or HDF5) and DIR is a "
+                    "new folder for the results.")
+    assert "STUDY is your study file" in answer.to_fill_in
+    assert not replace(answer, command="halbach-fe check MAPS").to_fill_in  # the control
+
+
+def test_the_map_behind_a_posterior_is_named(tmp_path, monkeypatch):
+    """The record of the update names it, as long as it is there unchanged."""
+    monkeypatch.chdir(tmp_path)
+    study, map_ = tmp_path / "study.toml", tmp_path / "map.csv"
+    study.write_text("name = 1")
+    map_.write_text("1,2")
+    with result_folder(tmp_path / "inferred", "halbach-fe infer", "a", [study, map_],
+                       {"STUDY": Path("study.toml"), "MAP": map_}):
+        write_text(tmp_path / "inferred" / "posterior.h5", "")
+    arguments = argparse.Namespace(study=study, posterior=tmp_path / "inferred" / "posterior.h5")
+    assert _paths_of(arguments)["MAP"] == map_
+    assert _paths_of(argparse.Namespace(study=study)).get("MAP") is None  # the control
+    map_.write_text("2,1")
+    assert _paths_of(arguments).get("MAP") is None
+
+
+def test_a_reversed_block_is_no_loss_of_200_per_cent(given):
+    """It is said in words by the update, and by the diagnosis of a demagnetized block."""
+    found = replace(given.updated, posterior=replace(
+        given.updated.posterior, mean=given.updated.response.nominal * np.where(
+            np.arange(len(given.updated.response.nominal)) < 3, -0.9, 1.0)))
+    said = inference_answer.answer(found).said
+    assert re.search(r"ring 1, slot 1, which is reversed: .* with 90\.0+\xa0±\xa0\S+\xa0% of its "
+                     "strength", said), said
+    assert "reversed" not in inference_answer.answer(given.updated).said  # the control
+    loss = BlockDemagnetizedEffect.parameters
+    for value, words in ((1.9, "reversed, with 90.0 ± 1.0 % of its strength"),
+                         (0.9, "90.0 ± 1.0 %")):
+        effect = SimpleNamespace(
+            parameters=loss, reported=(np.array([value]), np.array([0.01])),
+            hypothesis=SimpleNamespace(effect=SimpleNamespace(title="a title")))
+        assert amounts(effect)[0].endswith(words)
+
+
+def test_an_amplitude_that_the_readings_say_nothing_of_is_left_out():
+    """The z of a map of a cross-section is 0 ± its prior; one that is small but known is not."""
+    parameters = tuple(Parameter(name, "m", 1e-3) for name in "xyz")
+    effect = SimpleNamespace(
+        parameters=parameters,
+        reported=(np.array([3e-4, 1e-8, 1e-17]), np.array([5e-6, 5e-6, 1e-3])),
+        hypothesis=SimpleNamespace(effect=SimpleNamespace(title="a title")))
+    assert [one.split()[0] for one in amounts(effect)] == ["x", "y"]
+
+
+def test_the_parts_of_a_deviation_add_up(given):
+    """By squares, to what the answer says; an angle in degrees is a part of the length."""
+    found = prior_from_blocks(given.magnet, given.campaign.blocks)
+    assert len(found.nominal) == 3 * len(given.magnet.blocks)
+    for row, size in zip(prior.parts_table(given.magnet, found), (
+            found.gaussian.mean - found.nominal, found.gaussian.sd), strict=True):
+        _, length, *angles, together = row.values()
+        assert len(angles) == 2
+        parts = [float(text.split("= ")[-1].split("\u00a0")[0]) for text in (length, *angles)]
+        whole = float(together.split("\u00a0")[0])
+        assert np.linalg.norm(parts) == pytest.approx(whole, abs=0.01)  # of rounding
+        expected = 100 * np.sqrt(np.mean(size**2) / np.mean(found.nominal**2))
+        assert whole == pytest.approx(expected, abs=0.006)
+        for text in angles:
+            degrees, share = (float(one.split("°")[0].split("\u00a0")[0])
+                              for one in text.split(" = "))
+            assert share == pytest.approx(100 * np.radians(degrees), abs=0.01)
+
+
 def test_paths_that_are_known_are_those_of_the_command_that_runs():
     """A page names its own folder, and its record for machines leaves it open."""
     answer = Answer("?", "", "", "", "halbach-fe shim STUDY --posterior DIR/p.h5 -o DIR")
@@ -397,7 +479,7 @@ def test_blocks_that_share_the_largest_force_are_named(given):
 
 def test_means_that_are_zero_but_for_the_mesh_are_zero(given):
     found = hf.tolerance(given.magnet, given.session, draws=50)
-    rows = {row["n"]: row["|c_n| of the mean"] for row in tolerance.quantile_table(found)}
+    rows = {row["n"]: row["|c_n| of the mean magnet"] for row in tolerance.quantile_table(found)}
     assert rows["2"] == "0"  # forbidden by the symmetry
     assert float(rows["9"]) > 1  # which eight cubes do make
 

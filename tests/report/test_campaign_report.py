@@ -100,7 +100,27 @@ def test_every_answer_is_on_the_page(campaign, capsys):
     assert len(page.sources) == 5  # the magnet, and a figure of each
     assert all(one.startswith("data:image/png;base64,") for one in page.sources)
     assert not {"script", "link", "iframe", "object"} & {tag for tag, *_ in page.elements}
-    assert str(campaign) not in page.text
+    # but for the map of the posterior, which a command names as the user did
+    assert str(campaign) not in page.text.replace(str(campaign / "simulated" / "map.csv"), "")
+
+
+def test_the_map_and_blocks_that_all_results_use_are_named(tmp_path, monkeypatch):
+    """In commands of other chapters too; if there are two maps, none is."""
+    monkeypatch.chdir(tmp_path)
+    results(tmp_path / "field", "solve", answer=Answer(
+        "Which?", "Some.", "Yes.", "Update.", "halbach-fe infer STUDY --measurements MAP -o DIR"))
+    for name, maps in (("one", ["map.csv"]), ("two", ["map.csv", "other.csv"])):
+        folders = [tmp_path / "field"]
+        for number, map_ in enumerate(maps):
+            (tmp_path / map_).write_text(map_)
+            results(tmp_path / f"{name}-{number}", "diagnose")
+            record = tmp_path / f"{name}-{number}" / "run.json"
+            record.write_text(json.dumps(json.loads(record.read_text()) | {
+                "named": {"MAP": map_}}))
+            folders.append(tmp_path / f"{name}-{number}")
+        commands = [answer.command for chapter, _, answer in read_campaign(folders).answered
+                    if chapter.verb == "solve"]
+        assert ("--measurements map.csv" in commands[0]) == (name == "one")
 
 
 def test_the_page_may_be_elsewhere(campaign, tmp_path):

@@ -6,11 +6,24 @@ import pytest
 from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
-from halbach_fe.report.page import SMALL, label_logarithmic, save, units_kept, write_page
+from halbach_fe.report.page import SMALL, figure_of, label_logarithmic, save, units_kept, write_page
+from halbach_fe.report.page_record import WIDEST_IN
 from tests.report.conftest import PATIENCE_MS
 from tests.report.test_page import ANSWER, SEEN
 from tests.support.results import STUDY
 from tests.support.short_dipole import TEXT
+
+PAPER_PX = round(180 / 25.4 * 96)
+"""Width of A4 between the margins of pages; US letter is wider."""
+
+SMALLEST_ON_PAPER_PX = 12
+"""9 pt, the size of footnotes in print."""
+
+SIZES = """() => [...document.querySelectorAll('body *')].filter(
+    one => one.checkVisibility() && !one.closest('svg') && [...one.childNodes].some(
+        child => child.nodeType == 3 && child.textContent.trim()))
+    .map(one => parseFloat(getComputedStyle(one).fontSize))"""
+"""Sizes in px of the texts that are shown, but for those of drawings."""
 
 FOLDED = "<details><summary>More</summary><p id=folded>folded</p></details>"
 
@@ -18,6 +31,18 @@ LINES = """cells => cells.map(cell => {
     const range = document.createRange(); range.selectNodeContents(cell);
     return new Set([...range.getClientRects()].map(one => Math.round(one.top))).size; })"""
 """How many lines the texts of cells have."""
+
+
+def written(folder, *sizes_in):
+    """A page with figures of some sizes in inches."""
+    figures = {}
+    for number, size_in in enumerate(sizes_in or [(6, 4)]):
+        figure = Figure(figsize=size_in)
+        figure.text(0.5, 0.5, "text", fontsize=SMALL)
+        figures[f"{number}.png"] = figure, SEEN
+    write_page(folder / "page.html", "calibration.html.j2", save(figures, folder), STUDY,
+               answer=ANSWER, results={})
+    return folder / "page.html"
 
 
 @pytest.fixture
@@ -38,12 +63,8 @@ def opened(browser):
         context.close()
 
 
-def test_paper_shows_what_is_folded_and_two_pictures_on_a_page(opened, tmp_path):
-    path = tmp_path / "page.html"
-    figure = Figure(figsize=(6, 9))
-    figure.text(0.5, 0.5, "tall", fontsize=SMALL)
-    write_page(path, "calibration.html.j2", save({"one.png": (figure, SEEN)}, tmp_path), STUDY,
-               answer=ANSWER, results={})
+def test_paper_shows_what_is_folded(opened, tmp_path):
+    path = written(tmp_path)
     text = path.read_text()
     path.write_text(text.replace("<h2>Provenance", f"{FOLDED}<h2>Provenance"))
     page = opened(path)
@@ -51,17 +72,44 @@ def test_paper_shows_what_is_folded_and_two_pictures_on_a_page(opened, tmp_path)
     def shown(selector):
         return page.locator(selector).evaluate("one => one.checkVisibility()")
 
-    tall_px = page.locator("img").bounding_box()["height"]
     assert not shown("#folded")
     assert shown("text=The study as it was read")
     page.emulate_media(media="print")
     assert shown("#folded")
     assert not shown("text=The study as it was read")  # the study file has it
-    page_px = (279 - 2 * 15) / 25.4 * 96  # of US letter without margins, the shorter paper
-    height_px = page.locator("img").bounding_box()["height"]
-    assert height_px < page_px / 2 < tall_px
     page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
     assert shown("text=The study as it was read")  # whoever unfolds it has it
+
+
+def test_texts_of_pictures_keep_their_size_on_paper(opened, tmp_path):
+    """The control is wider than `figure_of` makes any."""
+    widest, tall, control = (WIDEST_IN, 3), (5.5, 9), (10, 3)
+    page = opened(written(tmp_path, widest, tall, control), PAPER_PX)
+    page.emulate_media(media="print")
+    scales = [page.locator("img").nth(number).bounding_box()["width"] / 96 / size_in[0]
+              for number, size_in in enumerate((widest, tall, control))]
+    assert scales[:2] == pytest.approx([1, 1], abs=0.01)
+    assert scales[2] < 0.8
+    assert figure_of(3, 10).get_size_inches()[0] == WIDEST_IN
+
+
+def test_a_picture_is_not_pushed_sideways_at_500_px(opened, tmp_path):
+    page = opened(written(tmp_path, (WIDEST_IN, 3), (10, 3)), 500)
+    widths = [page.locator("img").nth(number).bounding_box()["width"] for number in (0, 1)]
+    assert widths[0] <= 500 < widths[1]
+
+
+def test_nothing_on_paper_is_too_small_or_cut(opened, tmp_path):
+    (tmp_path / "study.toml").write_text(TEXT)
+    assert main(["homogeneity", str(tmp_path / "study.toml"), "-o", str(tmp_path / "out"),
+                 "--sphere-m", "0.006", "--degrees", "3", "--json"]) == 0
+    page = opened(tmp_path / "out" / "homogeneity.html", PAPER_PX)
+    page.emulate_media(media="print")
+    assert min(page.evaluate(SIZES)) >= SMALLEST_ON_PAPER_PX
+    assert page.evaluate("document.documentElement.scrollWidth") <= PAPER_PX
+    page.add_style_tag(content="table { font-size: 8.5pt !important; width: 90em; }")
+    assert min(page.evaluate(SIZES)) < SMALLEST_ON_PAPER_PX  # the control
+    assert page.evaluate("document.documentElement.scrollWidth") > PAPER_PX
 
 
 @pytest.mark.parametrize("width_px", [1400, 500])

@@ -103,8 +103,16 @@ def test_texts_of_figures_can_be_read(tmp_path):
     path = tmp_path / "page.html"
     write_page(path, "calibration.html.j2", [picture], parse_study(DIPOLE), answer=ANSWER,
                results={})
-    assert f'style="min-width: {picture.legible_px}px"' in path.read_text()
+    style = f"min-width: {picture.legible_px}px; --width: {picture.width_in}in"
+    assert f'style="{style}"' in path.read_text()
     assert re.search(r'<div class="wide"><img [^>]*></div><figcaption>', path.read_text())
+
+
+def test_figures_are_made_no_wider_than_paper():
+    """All by `figure_of`, but for the matrix of all effects of the sealed cases."""
+    found = {path.name: path.read_text().count("Figure(figsize=")
+             for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
+    assert {name for name, count in found.items() if count} == {"page.py", "sealed_cases.py"}
 
 
 def test_no_text_of_a_figure_is_smaller():
