@@ -57,14 +57,15 @@ DIPOLE: dict[str, Any] = {
 StudyMaker = Callable[..., Study]
 
 LONGEST = [
-    "cli/test_all_keys.py", "synthetic/test_fields.py", "solver/test_oracles.py",
-    "response/test_nonlinear.py", "docs/test_docs.py", "diagnosis/test_sealed_cases.py",
-    "solver/test_azimuthal_modes.py", "diagnosis/test_knee.py", "inference/test_mcmc.py",
-    "synthetic/test_hidden_effects.py", "geometry/test_symmetry.py", "inference/test_infer.py",
+    "cli/test_all_keys.py", "docs/test_docs.py", "response/test_nonlinear.py",
+    "solver/test_oracles.py", "synthetic/test_fields.py", "inference/test_mcmc.py",
+    "solver/test_azimuthal_modes.py", "inference/test_infer.py", "cli/test_cli.py",
+    "cli/test_killed.py", "geometry/test_symmetry.py", "design/test_shimming.py",
+    "design/test_ring_design.py", "diagnosis/test_sealed_cases.py",
     "diagnosis/test_unlisted_causes.py", "design/test_homogeneity_objective.py",
-    "cli/test_cli.py", "response/test_homogeneity.py", "cli/test_killed.py",
+    "synthetic/test_hidden_effects.py",
 ]
-"""Files that take a minute or more of processor time, the longest first."""
+"""Files that take half a minute or more of processor time, the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

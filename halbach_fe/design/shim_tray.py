@@ -365,7 +365,8 @@ class _Search:
 
     The mean square is ``c + 2 sum g_j + sum G_jl + s sum G_jj`` over the chosen j and l.
     ``products`` (m, m) is G and ``gradient`` (m,) is g in ppm^2, for m = places times options, and
-    ``kinds`` (m,) are the numbers of the magnets, of which there are ``counts`` (k,).
+    ``kinds`` (m,) are the numbers of the magnets, of which there are ``counts`` (k,). G is
+    symmetric, and read by rows, which are contiguous in memory.
     """
 
     def __init__(
@@ -373,7 +374,8 @@ class _Search:
         places: int, counts: Ints,
     ) -> None:
         self.products, self.gradient = products, gradient.copy()
-        self.cost = variance * np.diag(products)
+        self.diagonal = np.diag(products).copy()
+        self.cost = variance * self.diagonal
         self.kinds, self.places, self.left = kinds, places, counts.copy()
         self.options = len(kinds) // places
         self.place = np.repeat(np.arange(places), self.options)
@@ -425,13 +427,12 @@ class _Search:
         """Return the change of the mean square by every choice (m,), and by emptying places."""
         own = self.chosen[self.place]
         there = own != EMPTY
-        diagonal = np.diag(self.products)
         empty = np.zeros(self.places)
         full = np.flatnonzero(self.chosen != EMPTY)
         now = self.chosen[full]
-        empty[full] = -2 * self.gradient[now] + diagonal[now] - self.cost[now]
-        change = 2 * self.gradient + diagonal + self.cost + empty[self.place]
-        change[there] -= 2 * self.products[np.flatnonzero(there), own[there]]
+        empty[full] = -2 * self.gradient[now] + self.diagonal[now] - self.cost[now]
+        change = 2 * self.gradient + self.diagonal + self.cost + empty[self.place]
+        change[there] -= 2 * self.products[own[there], np.flatnonzero(there)]
         return change, empty
 
     def _allowed(self) -> NDArray[np.bool_]:
@@ -446,7 +447,7 @@ class _Search:
             if one != EMPTY:
                 self.square += (2 * sign * self.gradient[one] + self.products[one, one]
                                 + sign * self.cost[one])
-                self.gradient += sign * self.products[:, one]
+                self.gradient += sign * self.products[one]
                 self.left[self.kinds[one]] -= sign
         self.chosen[place] = choice
 

@@ -219,10 +219,14 @@ class Condensed:
         square = self._square(field_)
         slope = 2 * self.law.slope(square)
         excess = self.law.coefficient(square) - self.law.limit
-        size = len(field_)
-        return sparse.csr_array(sparse.block_array([[
-            sparse.diags_array(self.weights * (slope * field_[i] * field_[j] + (i == j) * excess))
-            for j in range(size)] for i in range(size)]))
+        size, count = field_.shape
+        # row i m + k has the columns k, m + k, ... in this order: the arrays of a csr_array
+        values = (self.weights * slope * field_)[:, :, np.newaxis] * field_.T
+        values[np.arange(size), :, np.arange(size)] += self.weights * excess
+        columns = np.arange(size * count, dtype=np.int32).reshape(size, count).T
+        starts = size * np.arange(size * count + 1, dtype=np.int32)
+        return sparse.csr_array((values.ravel(), np.tile(columns.ravel(), size), starts),
+                                shape=(size * count, size * count))
 
     def _factorize(self, potential: Floats) -> sparse_linalg.SuperLU:
         """Factorize the tangent S + G^T w ds/dF G, which is symmetric and positive definite."""

@@ -22,6 +22,7 @@ from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import types_of
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.response.resource_estimate import machine_speed
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks
@@ -146,13 +147,16 @@ STUDIES: dict[str, dict[str, Any]] = {
     "iron-ring": changed(
         CLOSED, mesh__meridian_size_m=0.015, mesh__growth=2.0, array__recoil_permeability=1.0,
         iron_ring={"inner_radius_m": 0.09, "outer_radius_m": 0.1, "relative_permeability": 100.0}),
-    "iron-tube": changed(BASE, iron={"bodies": [TUBE], "relative_permeability": 100.0}),
+    "iron-tube": changed(BASE, mesh__meridian_size_m=0.015, iron={
+        "bodies": [TUBE], "relative_permeability": 100.0}),
     "iron-prisms": changed(BASE, array__rings=1, mesh__growth=2.0, iron={
         "bodies": [PRISM], "relative_permeability": 100.0}),
-    "iron-curve": changed(BASE, array__rings=1, iron={"bodies": [TUBE], "curve": {
+    "iron-curve": changed(BASE, array__rings=1, mesh__meridian_size_m=0.015, iron={
+        "bodies": [TUBE], "curve": {
         "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
         "saturation_polarization_T": 2.0}}),
-    "iron-curve-free": changed(free(), iron={"bodies": [TUBE], "curve": {
+    "iron-curve-free": changed(free(), mesh__meridian_size_m=0.015, iron={
+        "bodies": [TUBE], "curve": {
         "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
         "saturation_polarization_T": 2.0}}),
     "flat": FLAT,
@@ -185,7 +189,8 @@ COMMANDS: dict[str, tuple[str, list[str]]] = {
     "prior": ("prior", ["{blocks}"]),
     "demagnetization": ("demagnetization", ["--across", "2"]),
     "export": ("export", ["--format", "blocks"]),
-    "simulate-measurement": ("simulated", []),
+    # coarse, as only keys are tried here
+    "simulate-measurement": ("simulated", ["--element-size", "0.02", "--order", "2"]),
 }
 """Folder and options of every command but `solve`, which makes the map for the others."""
 
@@ -241,8 +246,10 @@ class Case:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(getdp):
-    """Find GetDP once."""
+    """Find GetDP once, and measure once how fast this machine is, which estimates ask for."""
+    speed = machine_speed()
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("halbach_fe.response.resource_estimate.machine_speed", lambda: speed)
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
         yield
 

@@ -196,9 +196,12 @@ def test_a_study_without_a_tray(measured, tmp_path):
 
 
 def test_command(measured, tmp_path, capsys):
+    """A tray of fewer places, which is searched twice."""
     _, _, data, _ = measured
+    ring = {"radius_m": 0.08, "count": 8, "z_m": [-0.09, 0.0, 0.09]}
+    document = DOCUMENT | {"shim_tray": DOCUMENT["shim_tray"] | {"rings": [ring]}}
     path = tmp_path / "study.toml"
-    path.write_text(tomlkit.dumps(DOCUMENT))
+    path.write_text(tomlkit.dumps(document))
     write_map(data, tmp_path / "map.csv")
     inferred, out = tmp_path / "inferred", tmp_path / "tray"
     assert main(["infer", str(path), "-o", str(inferred), "--measurements",
@@ -207,11 +210,11 @@ def test_command(measured, tmp_path, capsys):
                  "--sphere-m", "0.03", "-o", str(out)]
     assert main(arguments) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "magnets in the 80 places of the tray" in said
+    assert "magnets in the 24 places of the tray" in said
     summary = json.loads((out / "shim_tray.json").read_text())
     with (out / "shim_tray.csv").open() as file:
         table = list(csv.DictReader(line for line in file if line[0] != "#"))
-    assert len(table) == summary["places"] == 80
+    assert len(table) == summary["places"] == 24
     assert sum(bool(row["magnet"]) for row in table) == summary["magnets"]
     page = (out / "shim_tray.html").read_text()
     assert "in place of" in page

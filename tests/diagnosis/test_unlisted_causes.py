@@ -10,8 +10,10 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
+from halbach_fe.diagnosis.search import NominalSolver
 from halbach_fe.diagnosis.unknown_cause import are_scattered
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -36,11 +38,19 @@ def small():
             "z_min_m": -0.15, "z_max_m": 0.15, "count": 9}}})
 
 
+@pytest.fixture(scope="module")
+def diagnosed(getdp, tmp_path_factory):
+    """Diagnose maps; signatures of one study on the same points are the same, and solved once."""
+    session = Session(getdp, tmp_path_factory.mktemp("diagnosed"), jobs=2)
+    solver = NominalSolver(session)
+    return lambda *given: diagnose(*given[:2], session, *given[2:], effects=SOME, solver=solver)
+
+
 @pytest.mark.parametrize("seed", UNLISTED)
-def test_an_unlisted_cause_is_unknown(small, session, seed):
+def test_an_unlisted_cause_is_unknown(small, diagnosed, seed):
     data, cause = simulate_unlisted(small, seed, UNLISTED[seed])
     assert cause.rms_over_noise > 1  # else there is nothing to be seen
-    found = diagnose(small, data, session, effects=SOME)
+    found = diagnosed(small, data)
     assert false_names(found) == []
     assert found.unknown is not None
     assert found.unknown.alone
@@ -86,32 +96,31 @@ def test_a_map_of_one_component_has_errors_of_one_sensor():
     assert fit_family(family, evidence).axes == (0,)
 
 
-def test_without_the_competition_false_names_appear(small, session, monkeypatch):
+def test_without_the_competition_false_names_appear(small, diagnosed, monkeypatch):
     """The control that must fail: the catalogue alone explains a cause that it does not have."""
     data, _ = simulate_unlisted(small, 3, UNLISTED[3])
     monkeypatch.setattr(module, "named_effects", lambda *given: given[3])
     monkeypatch.setattr(module, "MAX_ROUNDS", 2)  # it would not come to rest
-    assert false_names(diagnose(small, data, session, effects=SOME))
+    assert false_names(diagnosed(small, data))
 
 
 @pytest.mark.parametrize("names", [("drift",), ("block_missing",), ("arm_sag", "gain_z"), ()])
-def test_effects_of_the_catalogue_keep_their_names(small, session, names):
+def test_effects_of_the_catalogue_keep_their_names(small, diagnosed, names):
     campaign = simulate_campaign(small, 5, hide=[(EFFECTS[name], None) for name in names])
-    found = diagnose(small, campaign.readings, session, campaign.blocks, effects=SOME)
+    found = diagnosed(small, campaign.readings, campaign.blocks)
     named = [set(effect.selection.effects) for effect in found.identified]
     assert len(named) == len(names)
     assert all(any(name in each for each in named) for name in names)
     assert found.unknown is None
 
 
-def test_a_missing_block_beside_an_unlisted_cause(small, session):
+def test_a_missing_block_beside_an_unlisted_cause(small, diagnosed):
     """What nothing of any shape could replace is named beside the unknown."""
     with_block = simulate_campaign(small, 5, hide=[(EFFECTS["block_missing"], None)]).readings
     z = with_block["z_m"].values
     error = np.zeros(with_block["B_T"].shape)
     error[:, 1] = 5e-4 * np.sin(2 * np.pi * z / 0.11 + 1)
-    found = diagnose(small, with_block.assign(B_T=with_block["B_T"] + error), session,
-                     effects=SOME)
+    found = diagnosed(small, with_block.assign(B_T=with_block["B_T"] + error))
     assert [effect.hypothesis.effect.name for effect in found.identified] == ["block_missing"]
     assert found.unknown is not None
     assert not found.unknown.alone

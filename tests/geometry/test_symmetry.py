@@ -16,8 +16,12 @@ IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 
 POINTS = np.vstack([circle(0.05, 5, z, 0.2 + z) for z in (-0.12, 0.03, 0.1)])
 
 
-def fields(study, session):
-    parts = finite_element_part(build_magnet(study), POINTS, session)
+NEAR_AXIS = np.vstack([circle(0.02, 5, z, 0.2 + z) for z in (-0.12, 0.03, 0.1)])
+"""Points that need half of the azimuthal modes."""
+
+
+def fields(study, session, points=POINTS):
+    parts = finite_element_part(build_magnet(study), points, session)
     return np.array(
         [parts.block(number, slice(None)) for number in range(len(build_magnet(study).blocks))])
 
@@ -26,8 +30,8 @@ def fields(study, session):
 def test_modes_reduced_equal_unreduced(short_dipole, session, rings):
     """The half-plane's mesh is its own mirror image, so that only rounding is left."""
     changes = {"array__rings": rings, "iron_ring": IRON, "mesh__meridian_size_m": 0.03}
-    reduced = fields(short_dipole(**changes), session)
-    plain = fields(short_dipole(solver__symmetry=False, **changes), session)
+    reduced = fields(short_dipole(**changes), session, NEAR_AXIS)
+    plain = fields(short_dipole(solver__symmetry=False, **changes), session, NEAR_AXIS)
     assert np.abs(reduced - plain).max() < 1e-12 * np.abs(plain).max()
     # negative control: rings counted from the other end
     mirrored = plain.reshape(rings, 16, *plain.shape[1:])[::-1].reshape(plain.shape)
@@ -90,11 +94,11 @@ def test_blocks_of_other_permeability_are_separate(short_dipole):
 
 
 def test_an_exceptional_ring_in_modes_and_in_3d(short_dipole, session):
-    """One ring of mu_r 1.4: its reaction by two routes, measured 2.2 % apart, and not that of the
-    ordinary array, 69 % away.
+    """One ring of mu_r 1.4: its reaction by two routes, measured 3.2 % apart on this coarse mesh,
+    and not that of the ordinary array, 69 % away.
     """
     changes = {"array__exceptions": [{"ring": 1, "recoil_permeability": 1.4, "remanence_T": 0.9}],
-               "mesh__growth": 1.5}
+               "mesh__growth": 1.8, "mesh__block_size_m": 0.04}
 
     def nominal(**more):
         return finite_element_part(build_magnet(short_dipole(**changes | more)), POINTS, session,
@@ -141,11 +145,12 @@ def test_unique_points(generator):
 
 def test_separate_blocks_react_as_on_a_mesh(short_dipole, session):
     """Gaps between blocks, which no mode can have: moments of the nominal array and of single
-    blocks agree with a 3D mesh up to its error, measured 6 % and 11 % rms.
+    blocks agree with a 3D mesh up to its error, measured 1.9 % and 6.5 % rms. Eight blocks leave
+    half of the narrow gaps to be meshed, and have columns twice as far from one another.
     """
-    changes = {"array__rings": 1, "array__ring_length_m": 0.1,
+    changes = {"array__rings": 1, "array__ring_length_m": 0.1, "array__blocks_per_ring": 8,
                "array__block__angular_gap_deg": 2.0, "array__recoil_permeability": 1.1,
-               "mesh": {"block_size_m": 0.027, "layers_per_ring": 3, "growth": 1.6}}
+               "mesh": {"block_size_m": 0.035, "layers_per_ring": 3, "growth": 1.8}}
     parts = finite_element_part(build_magnet(short_dipole(**changes)), POINTS, session)
     whole = finite_element_part(build_magnet(short_dipole(
         **changes, solver__route="scalar_potential")), POINTS, session)
@@ -153,10 +158,10 @@ def test_separate_blocks_react_as_on_a_mesh(short_dipole, session):
     def rms(field):
         return np.sqrt(np.mean(field**2))
 
-    assert rms(parts.nominal - whole.nominal) < 0.15 * rms(whole.nominal)
-    ours, theirs = (np.array([one.block(number, slice(None)) for number in range(16)])
+    assert rms(parts.nominal - whole.nominal) < 0.06 * rms(whole.nominal)
+    ours, theirs = (np.array([one.block(number, slice(None)) for number in range(8)])
                     for one in (parts, whole))
-    assert rms(ours - theirs) < 0.25 * rms(theirs)
+    assert rms(ours - theirs) < 0.15 * rms(theirs)
     assert rms(ours - np.roll(theirs, 1, axis=0)) > 0.5 * rms(theirs)  # negative control
 
 
@@ -171,5 +176,5 @@ def test_a_turned_block_adds_up_too(short_dipole, session, across):
     study = short_dipole(array__exceptions=[
         {"ring": 1, "slot": 5, "rotation_deg": [0.3, 0.2, 1.0]}], **changes)
     built = response_matrix(build_magnet(study),
-                            observe(study, POINTS, np.ones(POINTS.shape, bool)), session)
+                            observe(study, NEAR_AXIS, np.ones(NEAR_AXIS.shape, bool)), session)
     assert built.superposition_error < (1e-10 if across is None else 2e-2)

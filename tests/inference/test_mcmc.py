@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
+import shutil
+import tomllib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
@@ -14,6 +17,7 @@ import xarray as xr
 from halbach_fe.cli import main
 from halbach_fe.core.errors import OutputError, SamplingError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import mcmc
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import (
     _resume,
@@ -28,12 +32,9 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, mesh_of
-from tests.conftest import DIPOLE, changed, circle
+from tests.conftest import circle
 from tests.oracles import ngsolve_nonlinear
 
-STEEL = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "curve": {
-    "kind": "froehlich_kennelly", "initial_relative_permeability": 1000.0,
-    "saturation_polarization_T": 2.0}}
 SPREAD = 0.02
 STUDY_FILE = """
 name = "steel"
@@ -69,13 +70,29 @@ direction_sd_deg = 1.146
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def models_built_once():
+    """Build and verify the model of a study once for all chains of this file.
+
+    It is the same every time, which `tests/response/test_nonlinear.py` checks; a study by another
+    name has a model of its own.
+    """
+    built, build = {}, mcmc.nonlinear_model
+
+    def once(magnet, *arguments):
+        if magnet.name not in built:
+            built[magnet.name] = build(magnet, *arguments)
+        return built[magnet.name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcmc, "nonlinear_model", once)
+        yield
+
+
 @pytest.fixture(scope="module")
 def campaign(getdp, tmp_path_factory):
     """Study, truth, and the linearized update of a map by NGSolve; blocks 2 % and 1.1 deg off."""
-    study = parse_study(changed(
-        DIPOLE, iron_ring=STEEL, mesh__block_size_m=0.014, observation__components=["x", "y"],
-        noise={"regions": [{"name": "all", "sigma_T": 1e-4}]},
-        prior={"magnitude_sd": SPREAD, "direction_sd_deg": np.degrees(SPREAD)}))
+    study = parse_study(tomllib.loads(STUDY_FILE) | {"name": "campaign"})
     generator = np.random.default_rng(20231)
     nominal = np.array([block.magnetization[:2] for block in build_magnet(study).blocks])
     truth = nominal + SPREAD * np.linalg.norm(nominal[0]) * generator.standard_normal(nominal.shape)
@@ -98,7 +115,20 @@ def room(session, name):
 
 @pytest.fixture(scope="module")
 def found(campaign):
-    return sample_posterior(campaign[3], room(campaign[4], "undisturbed"), 1000)
+    """Chains of 1000 draws; what was stored of them after 750 is kept as chains-750.nc."""
+    folder = room(campaign[4], "undisturbed")
+
+    def keep(text):
+        if text.startswith("750"):
+            shutil.copy(folder.folder / "chains.nc", folder.folder / "chains-750.nc")
+
+    return sample_posterior(campaign[3], folder, 1000, say=keep)
+
+
+def draws_in(path):
+    """Draws (chains, draws, parameters) of a file of chains, with those of the burn-in."""
+    with xr.open_dataset(path, group="posterior", engine="h5netcdf") as stored:
+        return stored["magnetization"].values
 
 
 def test_chains_converge_on_the_truth(campaign, found):
@@ -119,40 +149,49 @@ def test_stored_for_arviz(campaign, found):
     path = campaign[4].folder / "undisturbed" / "chains.nc"
     with xr.open_dataset(path, group="posterior", engine="h5netcdf") as stored:
         assert stored["magnetization"].dims == ("chain", "draw", "parameter")
-        np.testing.assert_array_equal(stored["magnetization"].values[:, 100:], found.draws)
+    np.testing.assert_array_equal(draws_in(path)[:, 100:], found.draws)
 
 
 def test_interrupted_chains_go_on(campaign, found):
     """What an interrupted run stored is used, and the result is that of an undisturbed one, also
     if the chains go on at a time, in processes of their own, to which the model travels.
+
+    Two stored chunks suffice, one before and one after the interruption. They may be too short to
+    have converged, so that the stored draws are compared.
     """
     session = room(campaign[4], "interrupted")
 
     def interrupt(text):
-        if text.startswith("500"):
+        if text.startswith("250"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample_posterior(campaign[3], session, 1000, say=interrupt)
+        sample_posterior(campaign[3], session, 500, say=interrupt)
     said: list[str] = []
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-        again = sample_posterior(campaign[3], session, 1000, say=said.append, mapped=pool.map)
-    assert said[1].startswith("750")
-    np.testing.assert_array_equal(again.draws, found.draws)
+    with (ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool,
+          contextlib.suppress(SamplingError)):
+        sample_posterior(campaign[3], session, 500, say=said.append, mapped=pool.map)
+    assert said[1].startswith("500")
+    undisturbed = draws_in(campaign[4].folder / "undisturbed" / "chains.nc")
+    again = draws_in(session.folder / "chains.nc")
+    np.testing.assert_array_equal(again, undisturbed[:, :500])
+    assert not np.array_equal(again, undisturbed[:, 500:])  # the control
 
 
 def test_longer_chains_go_on_from_shorter_ones_and_other_readings_do_not(campaign, found):
     """Draws are added; a map with other noise starts anew (the control)."""
-    folder = room(campaign[4], "interrupted")
+    session = room(campaign[4], "longer")
+    session.folder.mkdir()
+    shutil.copy(campaign[4].folder / "undisturbed" / "chains.nc", session.folder)
     said: list[str] = []
-    more = sample_posterior(campaign[3], folder, 1250, say=said.append)
-    assert said[1].startswith("1250")
-    np.testing.assert_array_equal(more.draws[:, :875], found.draws[:, 25:])
+    more = sample_posterior(campaign[3], session, 1050, say=said.append)
+    assert said[1].startswith("1050")
+    np.testing.assert_array_equal(more.draws[:, :895], found.draws[:, 5:])
     other = replace(campaign[3], readings=campaign[3].readings + 1e-6)
     said.clear()
     with pytest.raises(SamplingError, match=r"effective samples|do not agree|cannot be judged"):
-        sample_posterior(other, folder, 250, effective=1e9, say=said.append)
-    assert said[1].startswith("250 of 250")
+        sample_posterior(other, session, 50, effective=1e9, say=said.append)
+    assert said[1].startswith("50 of 50")
 
 
 def test_too_few_draws_are_refused(campaign):
@@ -162,16 +201,26 @@ def test_too_few_draws_are_refused(campaign):
         sample_posterior(campaign[3], room(campaign[4], "short"), 3)
 
 
-def test_samples_from_the_command_line(campaign, tmp_path, capsys):
-    """The summary says that the posterior is sampled; short chains leave the linearized one."""
+def test_samples_from_the_command_line(campaign, found, tmp_path, capsys):
+    """The summary says that the posterior is sampled; short chains leave the linearized one.
+
+    The command has the model, the readings and the seed of the chains above, so that it goes on
+    from what is stored of them, and ends where they do.
+    """
     write_map(campaign[2], tmp_path / "map.csv")
     (tmp_path / "study.toml").write_text(STUDY_FILE)
     command = ["infer", str(tmp_path / "study.toml"), "--measurements",
                str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--json", "--samples"]
     assert main([*command, "20"]) == 10
     assert "linearized" in (tmp_path / "out" / "summary.json").read_text()
+    capsys.readouterr()
+    (chains,) = (tmp_path / "out").rglob("chains.nc")
+    shutil.copy(campaign[4].folder / "undisturbed" / "chains-750.nc", chains)
     assert main([*command, "1000"]) == 0
     out = capsys.readouterr()
+    assert "1000 of 1000 draws" in out.err
+    assert "250 of 1000 draws" not in out.err
+    np.testing.assert_array_equal(draws_in(chains)[:, 100:], found.draws)
     assert '"posterior": "samples"' in out.out
     assert "needs the non-linear posterior" not in out.err
     assert (tmp_path / "out" / "sampled.json").exists()

@@ -193,11 +193,12 @@ def whole(dipole: Dipole, block: int, z_min: float, z_max: float, size: float,
 
 def scalar_potential_column(
     dipole: Dipole, mesh: ngs.Mesh, order: int, remanence: tuple[float, float, float],
-    points: np.ndarray, direct: bool = False,
+    points: np.ndarray, direct: bool = False, residual: float = 1e-10,
 ) -> Column:
     """Reaction of the block ``one`` by div(mu_r grad psi) = div B_r: real minus vacuum.
 
-    ``direct`` factorizes, which pays for many sources; conjugate gradients are faster for one.
+    ``direct`` factorizes, which pays for many sources; conjugate gradients, down to a relative
+    ``residual``, are faster for one.
     """
     started = time.monotonic()
     space = ngs.H1(mesh, order=order, dirichlet="far")
@@ -212,7 +213,8 @@ def scalar_potential_column(
         preconditioner = None if direct else ngs.Preconditioner(a, "bddc")
         a.Assemble()
         solvers.append((a, a.mat.Inverse(space.FreeDofs(coupling=True), "sparsecholesky") if direct
-                        else ngs.solvers.CGSolver(a.mat, preconditioner, maxiter=500, tol=1e-10)))
+                        else ngs.solvers.CGSolver(
+                            a.mat, preconditioner, maxiter=500, tol=residual)))
     setup = time.monotonic() - started
     started = time.monotonic()
     source = mesh.MaterialCF({"one": remanence}, default=(0, 0, 0))

@@ -60,9 +60,9 @@ def test_bars_shrink_with_the_mesh(dipole, session):
 def test_dual_formulations_bracket_the_modes(short_dipole, session):
     """In 3D the bar is the difference of the dual formulations; the azimuthal modes, far more
     exact, lie within it nearly everywhere (measured: at all readings of these, at 98 % of others),
-    and it is short beside the reaction (measured 12 %).
+    and it is short beside the reaction (measured 16 % on this coarse mesh).
     """
-    changes = {"mesh": {"block_size_m": 0.03, "layers_per_ring": 3, "growth": 1.5}}
+    changes = {"mesh": {"block_size_m": 0.04, "layers_per_ring": 3, "growth": 1.7}}
     study = short_dipole(solver__route="scalar_potential", **changes)
     points = np.vstack([circle(0.05, 7, z, 0.2 + z) for z in (-0.12, -0.03, 0.0, 0.05, 0.11)])
     observation = observe(study, points, np.ones_like(points, bool))

@@ -52,9 +52,14 @@ def unit_fields(points):
     return np.stack(columns, axis=-1)
 
 
-def random_points(region, generator, count):
-    """Points that fill a region evenly, and points of its surface."""
-    return points_of(region, generator.uniform(-1, 1, (8 * count, 3)), count)
+def even_points(region, generator, count):
+    """Points that fill a region evenly, and points of its surface.
+
+    Halton's points fill it more evenly than random ones, of which as good a mean takes several
+    times as many. magpylib's field of sectors takes most of the time of these tests.
+    """
+    unit = 2 * qmc.Halton(3, seed=generator).random(3 * count) - 1  # half of a cube is its ball
+    return points_of(region, unit, count)
 
 
 def points_of(region, unit, count):
@@ -74,14 +79,16 @@ def points_of(region, unit, count):
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=lambda region: region.text)
-def test_beside_random_points(generator, tmp_path, region):
+def test_beside_evenly_spread_points(generator, tmp_path, region):
     found, magnet_of = known_magnet(generator, tmp_path, region)
     known = found.by_name["posterior"]
-    inner, edge = random_points(region, generator, 3000)
+    inner, edge = even_points(region, generator, 800)
     field = magnet_of.getB(inner)
     size = np.linalg.norm(field, axis=1)
     deviation = 1e6 * (size / size.mean() - 1)
-    # the means over 3000 random points have errors of about 2 % of the rms deviation
+    assert len(inner) == 800
+    # measured of the mean of |B| 0.02 of the rms deviation at most, of the direction 0.03, of the
+    # rms 2.8 %, and 0.9 % of what lies between the extremes
     assert known.mean_T == pytest.approx(size.mean(), rel=7e-8 * known.rms_ppm)
     assert known.rms_ppm == pytest.approx(np.sqrt(np.mean(deviation**2)), rel=0.07)
     assert known.direction == pytest.approx(field.mean(axis=0) / np.linalg.norm(
@@ -117,9 +124,8 @@ def test_mean_squares_of_harmonics_of_high_degree(degree):
                          ids=lambda region: region.text)
 def test_regions_longer_than_the_magnet(generator, tmp_path, region, monkeypatch):
     found, magnet_of = known_magnet(generator, tmp_path, region)
-    # Halton's points fill a region more evenly than random ones: HALTON
-    cube = 2 * qmc.Halton(3, seed=generator).random(12_000) - 1
-    size = np.linalg.norm(magnet_of.getB(next(points_of(region, cube, 5000))), axis=1)
+    # measured 0.8 % of the mean and 0.4 % of the rms
+    size = np.linalg.norm(magnet_of.getB(next(even_points(region, generator, 1500))), axis=1)
     known = found.by_name["posterior"]
     assert known.mean_T == pytest.approx(size.mean(), rel=0.02)
     assert known.rms_ppm == pytest.approx(1e6 * size.std() / size.mean(), rel=0.03)
@@ -185,7 +191,7 @@ def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path):
     magnet = build_magnet(parse_study(tomllib.loads(TEXT)))
     known = homogeneity(magnet, Session.open(tmp_path), Region.sphere(RADIUS_M)).by_name["prior"]
     low, middle, high = known.rms_range_ppm
-    inner, _ = random_points(Region.sphere(RADIUS_M), generator, 1000)
+    inner, _ = even_points(Region.sphere(RADIUS_M), generator, 300)
     units = unit_fields(inner)
     rms, means = [], []
     for _ in range(60):

@@ -74,7 +74,9 @@ def test_separate_blocks_are_verified_by_their_cells(short_dipole, session):
 
 
 def test_a_3d_mesh_gets_the_dual_route(short_dipole, session):
-    study = short_dipole(array__block={"shape": "trapezoid"}, mesh__block_size_m=0.04,
+    """Eight blocks of one ring have every kind of difference, as all arrays in 3D have."""
+    study = short_dipole(array__block={"shape": "trapezoid"}, array__rings=1,
+                         array__blocks_per_ring=8, mesh__block_size_m=0.06, mesh__growth=2.5,
                          solver__route="scalar_potential")
     found = verify(build_magnet(study), session)
     assert found.route == "scalar_potential"

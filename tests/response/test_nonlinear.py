@@ -267,7 +267,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     study = parse_study(changed(
         DIPOLE, **alike(0.0, 8), dimension=3, array__blocks_per_ring=8, array__ring_length_m=0.1,
         iron_ring={**THIN, "outer_radius_m": 0.205}, solver={"route": "scalar_potential"},
-        mesh={"block_size_m": 0.05, "layers_per_ring": 2, "growth": 1.5},
+        mesh={"block_size_m": 0.07, "layers_per_ring": 2, "growth": 1.7},
         open_boundary={"radius_m": 1.0, "half_length_m": 1.0}))
     points = np.vstack([circle(0.06, 8, z, 0.2 + z) for z in (0.0, 0.04, 0.09)])
     session = Session(getdp, tmp_path, jobs=2)
@@ -477,12 +477,12 @@ def test_condensed_engine_against_getdp_at_200_magnetizations(getdp, tmp_path, g
 
     Of both programs warm and cold starts; some per cent about a saturated nominal, and far off:
     blocks of 8e5 A/m in random directions (up to 3.6 T in the iron), and all of them alike. Both
-    solve one discrete problem, so a coarse mesh will do, and a short table, which GetDP goes
-    through at every Gauss point.
+    solve one discrete problem, so a mesh of 41 elements in the iron will do, and a short table,
+    which GetDP goes through at every Gauss point.
     """
     study = parse_study(changed(
         DIPOLE, **alike(20.0), iron_ring={**THIN, "curve": TABLE}, solver={"method": "direct"},
-        mesh={"block_size_m": 0.04, "growth": 2.0}))
+        mesh={"block_size_m": 0.06, "growth": 3.0}))
     session, observation = Session(getdp, tmp_path, jobs=2), observation_of(study)
     model = nonlinear_model(build_magnet(study), observation, session, generator)
     size = np.linalg.norm(model.nominal[:2])

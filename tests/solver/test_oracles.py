@@ -41,7 +41,10 @@ def test_full_array_against_the_vector_potential_in_3d(session, with_iron):
     assert np.linalg.norm(moved - theirs, axis=1).max() > 1e-3 * main_field
 
 
-RINGS = {"iron_ring": IRON, "mesh": {"block_size_m": 0.03, "layers_per_ring": 3, "growth": 1.5}}
+RINGS = {"iron_ring": IRON, "mesh": {"block_size_m": 0.04, "layers_per_ring": 3, "growth": 1.7,
+                                    "meridian_size_m": 0.012}}
+"""As coarse as the caps of the routes allow; smaller elements halve no error here, but take twice
+the time."""
 NUMBER = 21
 POINTS = np.vstack([circle(0.05, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
 
@@ -54,13 +57,15 @@ def column():
     block, dipole = build_magnet(study).blocks[NUMBER], dipole_of(study)
     mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     with ngsolve.TaskManager():
-        return oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), POINTS).reaction
+        # a residual of 1e-6 leaves 1e-6 of the reaction
+        return oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), POINTS,
+                                              residual=1e-6).reaction
 
 
 @pytest.mark.parametrize(("route", "cap"), [
     ("azimuthal_modes", 0.01), ("scalar_potential", 0.03), ("edge_elements", 0.25)])
 def test_a_column_by_every_route_against_ngsolve(short_dipole, session, column, route, cap):
-    """The reaction relative to its rms: measured 0.45 %, 1.4 %, 13 %, of which the first
+    """The reaction relative to its rms: measured 0.45 %, 1.4 %, 17 %, of which the first
     is in part NGSolve's own.
     """
     study = short_dipole(solver__route=route, **RINGS)

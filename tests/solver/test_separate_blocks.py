@@ -42,12 +42,12 @@ def test_many_blocks_are_summed_by_expansions(generator):
 
 
 def test_iron_alone_is_nearly_the_change_by_iron(short_dipole, session):
-    """A tube around cuboids: exact in vacuum, some per cent off with permeable blocks."""
+    """A tube around a ring of cuboids: exact in vacuum, some per cent off with permeable blocks."""
     points = np.vstack([circle(0.05, 6, z) for z in (-0.1, 0.0, 0.06)])
 
     def magnet_with(permeability, **more):
         return build_magnet(short_dipole(
-            array__recoil_permeability=permeability, array__outer_radius_m=0.14,
+            array__recoil_permeability=permeability, array__outer_radius_m=0.14, array__rings=1,
             array__block={"shape": "cuboid", "width_m": 0.03}, **more))
 
     ring = {"iron_ring": {"inner_radius_m": 0.15, "outer_radius_m": 0.16,
