@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import xarray as xr
@@ -235,9 +235,14 @@ class _Estimate:
         """Return the estimate of an update."""
         return replace(self, deviations=deviations, step=deviations - self.deviations)
 
+    @cached_property
+    def own(self) -> Callable[[Floats], Floats]:
+        """The field of the deviations, in T at points (n, 3) in m."""
+        return self.of_deviations.answered(self.deviations)
+
     def field(self, points: Floats) -> Floats:
         """Return B (n, 3) in T at points (n, 3) in m."""
-        return self.nominal(points) + self.of_deviations.field(self.deviations, points)
+        return self.nominal(points) + self.own(points)
 
 
 @dataclass(frozen=True)
@@ -301,26 +306,23 @@ class _Solved:
     def neglected(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> float:
         """Return the standard deviations by which `moved` may be wrong after changes of the terms.
 
-        It is wrong in two parts. The field of the deviations of permeable blocks or beside iron is
-        not that of the same deviations in vacuum, by which it is moved; what is missing is taken to
-        change by the same fraction as what is known. And the matrix of the old places is wrong for
-        what the next update changes, which is taken to be at most what the last one has changed.
-        No combination of the unknowns is wrong by more standard deviations than the norm of the
-        error in units of the noise.
+        It is wrong in two parts. The field of the deviations, by which it is moved, lacks what iron
+        answers; what is missing is taken to change by the same fraction as what is known. And the
+        matrix of the old places is wrong for what the next update changes, which is taken to be at
+        most what the last one has changed. No combination of the unknowns is wrong by more standard
+        deviations than the norm of the error in units of the noise.
         """
-        def at(maps: Sequence[Map], deviations: Floats) -> Floats:
-            return readings_of_field(partial(estimate.of_deviations.field, deviations), maps,
-                                     readings)
-
-        before = at(self.maps, estimate.deviations)
+        before = readings_of_field(estimate.own, self.maps, readings)
         if not before.any():
             return 0.0
         missing = np.asarray(self.response.matrix @ estimate.deviations) - before
         part = np.linalg.norm(missing) / np.linalg.norm(before)
+        moved = readings_of_field(estimate.own, maps, readings) - before
+        step = partial(estimate.of_deviations.field, estimate.step)
+        unmoved = readings_of_field(step, maps, readings) - readings_of_field(
+            step, self.maps, readings)
         noise = readings.noise.sd
-        unmoved = at(maps, estimate.step) - at(self.maps, estimate.step)
-        return float(part * np.linalg.norm((at(maps, estimate.deviations) - before) / noise)
-                     + np.linalg.norm(unmoved / noise))
+        return float(part * np.linalg.norm(moved / noise) + np.linalg.norm(unmoved / noise))
 
     def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
         """Return the response after small changes of the terms.
@@ -328,9 +330,8 @@ class _Solved:
         Its matrix is the same. Its offset contains what the changes do to the readings of the
         magnet as it is estimated.
         """
-        own = partial(estimate.of_deviations.field, estimate.deviations)
         change = (readings_of_field(estimate.field, maps, readings) - self.nominal
-                  - readings_of_field(own, self.maps, readings))
+                  - readings_of_field(estimate.own, self.maps, readings))
         return replace(self.response, offset=self.response.offset + change)
 
 

@@ -1,13 +1,14 @@
 """The field of the deviations of magnetizations from the nominal ones.
 
-It is exact in vacuum. What permeable blocks and iron answer to deviations is neglected: that is a
-few per cent of a field that is small itself, and serves where small shifts of readings are
-computed.
+It is exact in vacuum. What permeable blocks and iron answer to deviations is a few per cent of a
+field that is small itself. It is neglected, but for what blocks answer where that is asked for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import Variations
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.study.materials import MU_0
+
+Field = Callable[[Floats], Floats]
+"""Takes points (n, 3) in m and returns a field (n, 3) in T."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,24 @@ class Deviations:
         if self.variations is not None:
             found = found + self.variations.field(amplitudes, points)
         return found
+
+    def answered(self, deviations: Floats) -> Field:
+        """Return a function of points (n, 3) in m that computes `field` and the answer of permeable
+        blocks to it, with one cell a block as in the response matrix.
+        """
+        blocks = with_magnetizations(
+            self.magnet, deviations[:len(self.magnet.parameter_names)])
+        if self.magnet.dimension == 2 or not any(
+                np.any(block.recoil_tensor != np.eye(3)) for block in blocks):
+            return partial(self.field, deviations)
+        from halbach_fe.solver.moments.solve import solve_moments  # imports numba
+
+        polarized = solve_moments(blocks, cells_per_side=1)
+
+        def field(points: Floats) -> Floats:
+            return self.field(deviations, points) + polarized.reaction(points)
+
+        return field
 
     def columns(self, points: Floats) -> Floats:
         """Return the matrix (3 n, parameters) from deviations to B at points (n, 3) in m, in T.
