@@ -328,8 +328,8 @@ def run(arguments: argparse.Namespace) -> int:
             "smallest_p_of_a_parameter": float(values.min()),
             "model_error_over_noise": case.error_over_noise,
             "as_expected": together > PASS if case.good else together < FAIL}
-    write_calibration(found, DRAWS, results, arguments.output)
     write_text(arguments.output / "calibration.json", json.dumps(results, indent=1) + "\n")
+    write_calibration(found, DRAWS, results, arguments.output)
     common.print_table([{"what": name} | {key: f"{value:.3g}" if isinstance(value, float)
                                           else str(value) for key, value in row.items()}
                         for name, row in results.items()], "Ranks of the truth: uniform?")
