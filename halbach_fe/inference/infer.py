@@ -121,6 +121,7 @@ def infer(
     open_terms = OpenTerms.of(maps)
     total = np.zeros(len(open_terms))
     noises: Noises = {}
+    error: Floats | None = None
     solved: _Solved | None = None
     place: _Place | None = None
     share = 1.0
@@ -152,7 +153,9 @@ def infer(
             matrix = Beside(model.matrix, open_terms.columns(at.field, maps, readings))
             whole_prior = joined(magnet_prior, -total, open_terms.sd)
         residual = readings.values - model.offset
-        errors = readings.noise.with_independent_errors(model.error)
+        # one noise for all updates: what they find is compared by its probability
+        error = model.error if error is None else error
+        errors = readings.noise.with_independent_errors(error)
         update = linear_gaussian.update(
             matrix, residual[training], errors.subset(training), whole_prior,
             np.flatnonzero(training))
@@ -173,7 +176,7 @@ def infer(
         if at_rest and not uncertain:
             break
         if at_rest:  # again, with the noise that positions make in this magnet's gradient
-            uncertain, noises, rounds, place = False, {}, 0, None
+            uncertain, noises, error, rounds, place = False, {}, None, 0, None
             estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
         warnings.warn(

@@ -33,12 +33,8 @@ BY_CHANCE = 0.15
 """Share of a held-out map's readings that may equal those that update the model: more than readings
 at the same points do by chance."""
 
-MOVED_M = 1e-4
-"""Largest move of a reading for which its noise stays the same. The noise of uncertain positions
-is that of the field's gradient, which changes by 1 % over this way if it changes over 10 mm."""
-
-Noises = dict[str, tuple[Floats, NoiseCovariance]]
-"""Points (n, 3) in m and noise of the readings of a map, by its name."""
+Noises = dict[str, NoiseCovariance]
+"""Noise of the readings of a map, by its name."""
 
 
 @dataclass(frozen=True)
@@ -190,12 +186,10 @@ def _read(
         single = len(set(regions)) == 1
         regions = tuple(one.name if single else f"{one.name}: {region}" for region in regions)
     values = observation.read(np.nan_to_num(remove_nonlinear_part(study.instrument, data)))
-    there = noises[one.name][0] if one.name in noises else np.empty((0, 3))
-    if there.shape != observation.points.shape or (
-            np.abs(observation.points - there).max() > MOVED_M):  # sensors apart are more points
-        noises[one.name] = observation.points, reading_noise(
+    if one.name not in noises:
+        noises[one.name] = reading_noise(
             replace(magnet, blocks=tuple(blocks)), observation, data, called)
-    return Readings(observation, values, noises[one.name][1], parts, regions,
+    return Readings(observation, values, noises[one.name], parts, regions,
                     (one.name,) * len(observation))
 
 
