@@ -39,6 +39,9 @@ from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
 
+SLOTS_A_ROW = 8
+"""Largest number of slots in a row of the table of places."""
+
 QUANTILES = (0.01, 0.5, 0.99)
 """Quantiles of the rms of random orders that sort.json states."""
 
@@ -88,6 +91,20 @@ def turn_table(found: SortedBlocks) -> list[dict[str, str]]:
         rows.append({"block": found.table.serial[row], "ring": str(found.table.ring[row]),
                      "slot": str(found.table.slot[row]),
                      "turn": f"{angle:.0f}° about ({axis}) of its own axes"})
+    return rows
+
+
+def place_table(found: SortedBlocks) -> list[dict[str, str]]:
+    """Return the rows of the table of places, each of up to `SLOTS_A_ROW` slots of a ring."""
+    table, rows = found.table, []
+    for ring in np.unique(table.ring).tolist():
+        mine = np.flatnonzero(table.ring == ring)
+        mine = mine[np.argsort(table.slot[mine], kind="stable")]
+        for first in range(0, len(mine), SLOTS_A_ROW):
+            some = mine[first:first + SLOTS_A_ROW]
+            rows.append({"ring": str(ring), "slots": f"{table.slot[some[0]]} to "
+                         f"{table.slot[some[-1]]}" if len(some) > 1 else str(table.slot[some[0]]),
+                         "blocks, slot by slot": ", ".join(table.serial[row] for row in some)})
     return rows
 
 
@@ -152,9 +169,9 @@ def answer(found: SortedBlocks) -> Answer:
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
     return Answer(
         question,
-        f"As blocks.sorted.csv says: {what} then {text(best)} {unit}{sizes}, instead of "
-        f"{text(own)} for the blocks {found.own_order}, and {text(low)} to {text(high)} for 98 % "
-        f"of random orders.{left}{turned}",
+        f"As the table of places and blocks.sorted.csv say: {what} then {text(best)} "
+        f"{unit}{sizes}, instead of {text(own)} for the blocks {found.own_order}, and {text(low)} "
+        f"to {text(high)} for 98 % of random orders.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} adds {text(spread)} {unit}, whatever the "
         f"order{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks.",
@@ -202,8 +219,8 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
             + ", normal (left) and skew (right); bars are two standard deviations")} | figures
     write_page(folder / "sort.html", "sort.html.j2", save(figures, folder), found=found,
                study=found.study, answer=answer(found), rows=order_table(found),
-               in_a_region=bool(found.fields), turned=turn_table(found), title=table_title(found),
-               text=_convention(found))
+               in_a_region=bool(found.fields), turned=turn_table(found), places=place_table(found),
+               title=table_title(found), text=_convention(found))
 
 
 def _convention(found: SortedBlocks) -> str:

@@ -191,6 +191,10 @@ def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings,
     text = (tmp_path / "sort.html").read_text()
     assert said in text
     assert ("as placed in the table" in text) == (said == "random orders")
+    named = ", ".join(row["blocks, slot by slot"] for row in sorting.place_table(found))
+    order = np.lexsort((found.table.slot, found.table.ring)).tolist()
+    assert named.split(", ") == [found.table.serial[row] for row in order]
+    assert "1 to 8" in text
     assert ("every order" in str(sorting.order_table(found))) != (said == "random orders")
     if said == "random orders":
         assert found.best.rms_of_mean < found.random.min()
