@@ -25,7 +25,7 @@ from halbach_fe.report.campaign_remarks import OF_MEASURED, doubts, versions
 from halbach_fe.report.magnet_table import in_one_line
 from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
 from halbach_fe.report.page_record import Picture
-from halbach_fe.report.words import counted
+from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.model import Study
 
 PAGE = "report.html"
@@ -105,17 +105,21 @@ class Campaign:
         """What is known of the magnet, what may be used as it stands, and what is left to do."""
         unsound = list(dict.fromkeys(each for each, _, answer in self.answered if not answer.sound))
         left = [each.label for each in unsound if self.replaced(each) is None]
-        instead = [f"{better.label} instead of {each.label}" for each in unsound
-                   if (better := self.replaced(each)) is not None]
-        said = f"{counted(len(self.chapters), 'result')} of one magnet. " + (
-            f"Not to be trusted as they are: {', '.join(left)}." if left else
-            "The answers may be used as they stand.")
-        if instead:
-            said += f" Use {', '.join(instead)}."
-        said = " ".join([*self._newest(), said])
+        instead = [f"Do not trust folder {each.label}: folder {better.label} takes its place."
+                   for each in unsound if (better := self.replaced(each)) is not None]
+        simulated = [f"folder {one.label}" for one in self.chapters
+                     if one.verb == "simulate-measurement"]
+        said = " ".join([
+            *self._newest(), f"{counted(len(self.chapters), 'result')} of one magnet.",
+            *([f"The map of {in_a_row(simulated)} is simulated, not measured."] if simulated
+              else []), *instead,
+            f"Not to be trusted as they are: {', '.join(f'folder {each}' for each in left)}."
+            if left else "They do not all fit together." if self.doubts else
+            f"{'All others' if instead else 'The answers'} may be used as they stand."])
+        which = "Only those that are not named here" if unsound else "Yes, each of them"
         trust = (
             "No: the results do not all fit together, as is said below." if self.doubts else
-            f"{'Only those that are not named here' if left else 'Yes'}: they are of " + (
+            f"{which}: they are of " + (
                 "versions of the study that follow from each other" if self.versions else
                 "one study") + ", and no file was changed since.")
         last = self._next()

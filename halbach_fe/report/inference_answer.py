@@ -15,8 +15,9 @@ def answer(result: InferenceResult) -> Answer:
     said = f"{_prediction(result)} {_blocks(result)}"
     question = "What is the measured magnet like?"
     if result.disagreement:
-        return Answer(question, said,
-                      f"No. Model and measurement disagree. {result.disagreement}",
+        return Answer(question, "Model and measurement disagree, so that these numbers and their "
+                      f"error bars are not to be used as they stand. {said}",
+                      f"No. {result.disagreement}",
                       "Look for what the study lacks. (Before that, halbach-fe check tests the map "
                       "by itself, and register finds where it lies.)",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)

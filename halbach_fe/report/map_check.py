@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import VIOLATED, MapCheck, Reach
+from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -54,24 +54,22 @@ def answer(check: MapCheck) -> Answer:
             "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
-    noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
-    keys = "that belongs into the study as sigma_T"
-    if check.position_noise_m * 1e6 >= 1:
-        noise += (", and where the field is steep, readings scatter like positions that are "
-                  f"{check.position_noise_m * 1e6:.0f} µm off")
-        keys = "these belong into the study as sigma_T and position_sd_m"
     trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. A map "
              "cannot show everything, though: see below.")
     if _violates(check):
         return Answer(
-            question, f"{verdict(check)} {noise}.", "No: nothing that the probe may plausibly be "
-            "explains this map: do not update a magnet with it.", "Look for rows, axes and units "
+            question, f"{verdict(check)} {_noise(check)}",
+            "No: nothing that the probe may plausibly be explains this map: do not "
+            "update a magnet with it.", "Look for rows, axes and units "
             "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
     if check.structure > REMAINS:
         trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
                  f"correlation of {check.structure:.2f}. Something that this check does not know, "
                  "such as a probe that moves in its holder, is still in the map.")
+    elif check.uneven is not None:
+        trust = ("Yes, that it passes: no magnet is assumed, and the lines that were held out were "
+                 "not fitted. No, as a measure of the noise: what is left is not noise alone.")
     if (reach := check.reach) is not None:
         trust = (f"Only {_where(check, reach)}. " if np.isfinite(reach.limit_m) else
                  "Only roughly. ") + (
@@ -81,10 +79,35 @@ def answer(check: MapCheck) -> Answer:
             "these readings are wrong. An update of the magnet tells which.")
     used = "DIR/oriented_map.csv" if better else "MAP"
     return Answer(
-        question, f"{verdict(check)} {noise}: {keys}.", trust,
+        question, f"{verdict(check)} {_noise(check, keys=True)}", trust,
         "Update the magnet with " + ("oriented_map.csv, which has the right axes and no broken "
                                      "rows." if better else "this map."),
         f"halbach-fe infer STUDY --measurements {used} -o DIR")
+
+
+def _noise(check: MapCheck, keys: bool = False) -> str:
+    """Say what the noise is, with ``keys`` also where the study states it; or why it is unknown."""
+    if check.uneven is not None:
+        (low, high, least), (start, end, most) = check.uneven
+        axis = check.windows[0]
+        return (f"The fit leaves {flux_density(most, 2)} rms at {axis} from {_range(start, end)}, "
+                f"and only {flux_density(least, 2)} at {axis} from {_range(low, high)}. Noise "
+                "would be about the same everywhere: in the first range more than noise is left, "
+                "as where the field varies more between neighbouring readings than the fit "
+                "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
+                "repeatedly at one place.")
+    noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
+    where = "that belongs into the study as sigma_T"
+    if check.position_noise_m >= SCATTERED_M:
+        noise += (", and where the field is steep, readings scatter like positions that are "
+                  f"{check.position_noise_m * 1e6:.0f} µm off")
+        where = "these belong into the study as sigma_T and position_sd_m"
+    return f"{noise}: {where}." if keys else f"{noise}."
+
+
+def _range(low: float, high: float) -> str:
+    """Return the limits of a part of the map in mm."""
+    return f"{1e3 * low:.0f} to {1e3 * high:.0f}\u00a0mm"
 
 
 def sentences(check: MapCheck) -> list[str]:
@@ -117,32 +140,35 @@ BROKEN = {"zero": "all components are zero",
 
 
 def verdict(check: MapCheck) -> str:
-    """Return the answer in a sentence."""
+    """Return the answer in a sentence, which begins with whether the map passes."""
     if check.is_too_coarse:
-        return (f"The map cannot tell: with a spacing of {1e3 * check.spacing_m:.3g} mm the field "
-                "changes more from point to point than its neighbours show: what a field without "
-                "sources leaves of it changes sign from each reading to the next.")
+        return ("Neither passed nor failed. The map cannot tell: with a spacing of "
+                f"{1e3 * check.spacing_m:.3g} mm the field changes more from point to point than "
+                "its neighbours show: what a field without sources leaves of it changes sign from "
+                "each reading to the next.")
     if not check.suffices:
-        return (f"The map cannot tell: {100 * (1 - check.redundancy):.0f}\u00a0% of its readings "
-                "are needed to describe any field in its region. Measure in a volume, with a "
-                "smaller spacing.")
+        return ("Neither passed nor failed. The map cannot tell: "
+                f"{100 * (1 - check.redundancy):.0f}\u00a0% of its readings are needed to describe "
+                "any field in its region. Measure in a volume, with a smaller spacing.")
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
     if share > VIOLATED:
-        return f"The map does not obey div B = 0 and curl B = 0: they leave {size}."
+        return f"Failed. The map does not obey div B = 0 and curl B = 0: they leave {size}."
     wrong = _impossible(check)
     if wrong:
-        return (f"The map does not obey div B = 0 and curl B = 0 with any likely instrument: it "
-                f"would take an impossible one ({wrong[0]}"
+        return ("Failed. The map does not obey div B = 0 and curl B = 0 with any likely "
+                f"instrument: it would take an impossible one ({wrong[0]}"
                 f"{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}), which leaves {size}.")
     if check.reach is not None and np.isfinite(check.reach.limit_m):
-        return (f"The map obeys div B = 0 and curl B = 0 to {flux_density(check.reach.inside_T, 2)}"
-                f" rms on scan lines that were held out {_where(check, check.reach)}, and to "
+        return ("Passed. The map obeys div B = 0 and curl B = 0 to "
+                f"{flux_density(check.reach.inside_T, 2)} rms on scan lines that were held out "
+                f"{_where(check, check.reach)}, and to "
                 f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
                 f"{flux_density(check.size_T)}.")
-    return (f"The map obeys div B = 0 and curl B = 0 to {size}. A model of the magnet can "
-            "explain it better only near edges of the magnet.")
+    return (f"Passed. The map obeys div B = 0 and curl B = 0 to {size}. Expect no model of the "
+            "magnet to predict readings better than that, except close to the edges of blocks, "
+            "where the field varies more than this check can follow.")
 
 
 def _where(check: MapCheck, reach: Reach) -> str:
@@ -231,8 +257,11 @@ def write_map_check(
             "The map: every column as it was measured, and its residual from the field that obeys "
             "Maxwell's equations. Crosses are rows that were left out")),
         "check_readings.png": (_readings(check), (
-            "Residuals in the order of the map: noise is the same everywhere, a probe that moves "
-            "makes steps and waves"))}
+            "Residuals in the order of the map. " + (
+                "Noise alone would be about as large everywhere; here it is not alone"
+                if check.uneven is not None else
+                "Noise is about as large everywhere") + ". A probe that moves makes steps and "
+            "waves"))}
     write_page(folder / "check.html", "map_check.html.j2", save(figures, folder),
                provenance=provenance, check=check, answer=answer(check),
                found=sentences(check), files=", ".join(files),

@@ -349,6 +349,28 @@ def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
     assert answer(replace(CLEAN, structure=0.5)).trust.startswith("Only nearly: ")
 
 
+def test_what_is_no_noise_is_not_recommended_as_such(generator):
+    """A fit that cannot follow the field in the middle leaves more there. The controls: a noise
+    that is the same everywhere, and positions that scatter.
+    """
+    points = 1.5 * GRID  # so near to the magnets that the lines are too far from each other
+    coarse = check_map(field_map(points, source().getB(points)
+                                 + NOISE_T * generator.standard_normal(points.shape)))
+    (low, high, least), (start, end, most) = coarse.uneven
+    assert most > 2 * least
+    assert abs(start + end) < abs(low + high)  # the one with the most is nearer to the middle
+    said = answer(coarse).said
+    assert said.startswith("Passed. ")
+    assert f"at z from {1e3 * start:.0f} to {1e3 * end:.0f}\u00a0mm" in said
+    assert "belong" not in said
+    even = check_map(field_map(GRID, read_by(generator)))
+    assert even.uneven is None
+    assert "that belongs into the study as sigma_T" in answer(even).said
+    scattered = replace(coarse, position_noise_m=5e-5)
+    assert scattered.uneven is None
+    assert "sigma_T and position_sd_m" in answer(scattered).said
+
+
 CLEAN = MapCheck(
     readings=945, points=315, spacing_m=STEP_M, size_T=0.1, orientation=("x", "y", "z"), alike=(),
     rms_as_given_T=np.full(3, NOISE_T), rms_T=np.full(3, NOISE_T), floor_T=np.full(3, NOISE_T),

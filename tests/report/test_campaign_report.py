@@ -91,7 +91,8 @@ def test_every_answer_is_on_the_page(campaign, capsys):
         assert one["answer"] == said["answer"]
         for key in ("question", "said", "trust", "step"):
             assert said["answer"][key] in page.text
-    assert "4 results of one magnet. The answers may be used as they stand." in page.text
+    assert ("4 results of one magnet. The map of folder simulated is simulated, not measured. The "
+            "answers may be used as they stand.") in page.text
     assert "1 ring of 4 sectors" in page.text
     assert [one for one in page.links if one.startswith("#")] == [
         *(f"#part-{number}" for number in (1, 2, 3, 4, 4, 3, 4))]  # contents, next steps
@@ -340,6 +341,7 @@ def test_what_does_not_fit(home, change, said):
     campaign = found_in(home)
     assert any(sentence.startswith(said) for sentence in campaign.doubts)
     assert not campaign.answer.sound
+    assert "may be used as they stand" not in campaign.answer.said
     page = parts_of(hf.campaign_report([one.folder for one in campaign.chapters],
                                        home / "all.html"))
     assert said in page.text
@@ -377,13 +379,15 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     unused_finding(home)
     alone = found_in(home, "field", "inferred").answer
     assert (alone.sound, alone.step) == (False, "Diagnose.")
-    assert "Not to be trusted as they are: inferred." in alone.said
+    assert "Not to be trusted as they are: folder inferred." in alone.said
     results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),
             [home / "diagnosis" / "study.diagnosed.toml", home / "map.csv"])
     campaign = found_in(home, "field", "inferred", "better", "diagnosis")
     assert [one.label for one in campaign.chapters] == ["field", "inferred", "diagnosis", "better"]
-    assert campaign.answer.said.endswith("may be used as they stand. Use better instead of "
-                                         "inferred.")
+    assert campaign.answer.said.endswith("Do not trust folder inferred: folder better takes "
+                                         "its place. All others may be used as they stand.")
+    assert campaign.answer.trust.startswith("Only those that are not named here")
+    assert "simulated" not in campaign.answer.said
     assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
 
 

@@ -47,6 +47,7 @@ def test_the_numbers_are_those_of_the_prediction(campaign, session):
     assert float(value) == pytest.approx(along, abs=0.05)
     assert 0 < float(sd) < 1.5  # the prior's is 1.4 %
     assert "Model and readings agree" in said.trust
+    assert said.said.startswith("The updated magnet predicts")
     assert said.sound
 
 
@@ -59,6 +60,7 @@ def test_another_magnet_is_to_be_diagnosed(campaign, session):
     _, said = answered(campaign, session, array__ring_length_m=0.066)
     assert "halbach-fe diagnose" in said.command
     assert not said.sound
+    assert said.said.startswith("Model and measurement disagree")
     assert "agree:" not in said.trust
 
 
