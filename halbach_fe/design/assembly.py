@@ -32,6 +32,9 @@ MOST_BLOCKS = 20_000
 SAME_DEG = 0.05
 """Directions that differ by less than about this belong to blocks of one kind."""
 
+TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")
+"""Shapes that are the same after half a turn about their x axis."""
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -203,6 +206,26 @@ class Assembly(ShownInNotebook):
     plates: tuple[Plate, ...]
     reasons: tuple[str, ...]
     left_over: int = 0
+
+    @property
+    def ordered_as(self) -> tuple[int, ...]:
+        """For each kind the number of the first kind that is the same block, perhaps its own.
+
+        Blocks of most shapes fit into the same place if they are turned by 180 degrees about their
+        x axis, which reverses the magnetization along y and z.
+        """
+        first: dict[object, int] = {}
+        found = []
+        for kind in self.kinds:
+            steps = np.round(kind.direction / np.radians(SAME_DEG)) + 0.0
+            turned = steps * [1, -1, -1] + 0.0
+            either = [tuple(steps.tolist())]
+            if kind.sizes["shape"] in TURNED_ALIKE:
+                either = sorted([*either, tuple(turned.tolist())])
+            key = (tuple((column, _rounded(value)) for column, value in kind.sizes.items()),
+                   kind.material, round(kind.remanence_T, 6), either[0])
+            found.append(first.setdefault(key, kind.number))
+        return tuple(found)
 
 
 @typed

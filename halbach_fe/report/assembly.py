@@ -28,6 +28,10 @@ def answer(assembly: Assembly) -> Answer:
     said = [f"{counted(len(assembly.blocks), 'block')} of {counted(len(assembly.kinds), 'kind')}"
             + (f" go into {counted(copies, 'plate')} of {counted(len(assembly.plates), 'shape')}."
                if copies else " go without a holder.")]
+    different = len(set(assembly.ordered_as))
+    if different < len(assembly.kinds):
+        said.append(f"To order are {counted(different, 'kind')}: the others are the same blocks, "
+                    "turned upside down.")
     said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
              for reason in assembly.reasons]
     trust = ("Yes, as far as shapes and places of the study are right. Whether the holder bears "
@@ -52,10 +56,17 @@ def answer(assembly: Assembly) -> Answer:
 def kind_rows(assembly: Assembly) -> list[dict[str, str]]:
     """Return a row of text for every kind of blocks."""
     graded = any(kind.material for kind in assembly.kinds)
+    ordered_as = assembly.ordered_as
+    total = {first: sum(kind.count for kind, other in zip(assembly.kinds, ordered_as, strict=True)
+                        if other == first) for first in ordered_as}
+    fewer = len(total) < len(assembly.kinds)
     return [{"kind": str(kind.number), "shape": kind.shape.replace(" × ", "\u00a0×\u00a0"),
              "magnetized": kind.magnetized, "remanence": f"{kind.remanence_T:.4g}\u00a0T",
              **({"grade": kind.material or ""} if graded else {}),
-             "blocks": str(kind.count)} for kind in assembly.kinds]
+             "blocks": str(kind.count),
+             **({"to order": str(total[kind.number]) if first == kind.number else
+                 f"as kind {first}"} if fewer else {})}
+            for kind, first in zip(assembly.kinds, ordered_as, strict=True)]
 
 
 def plate_rows(assembly: Assembly) -> list[dict[str, str]]:

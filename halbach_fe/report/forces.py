@@ -76,9 +76,10 @@ def answer(found: Forces) -> Answer:
     error = float(found.in_place.error_N[worst])
     return Answer(
         question, " ".join([*text, _mass(found)]),
-        f"Yes, to {_newton(error)} by the quadrature. The blocks are those of the study, at rest "
-        "in their places: a block that is 1 % stronger feels 1 % more, and one that comes nearer "
-        "to its neighbours than its place is may feel more.", *plan, sound=error <= ROUGH * size)
+        f"Yes, to {_newton(error)}; that is the error of the integration. The blocks are those of "
+        "the study, at rest in their places: a block that is 1 % stronger feels 1 % more, and one "
+        "that comes nearer to its neighbours than its place is may feel more.", *plan,
+        sound=error <= ROUGH * size)
 
 
 def _as_large(found: Forces, worst: int) -> str:

@@ -92,8 +92,8 @@ def _fit(best: Registration, before: str) -> str:
         best.nominal_rms_T, best.rms_T, best.held_out_nominal_rms_T, best.held_out_rms_T))
     tested = (f"; the lines that were held out are {held_out} and {predicted} off"
               if np.isfinite(best.held_out_rms_T).any() else "")
-    return (f"The {before} is there {fitted} off the readings that were fitted, with updated "
-            f"blocks {updated}{tested}.")
+    return (f"In this pose the {before} is {fitted} off the readings that were fitted, with "
+            f"updated blocks {updated}{tested}.")
 
 
 def sentences(found: Sequence[Registration]) -> list[str]:

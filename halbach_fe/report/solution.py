@@ -49,7 +49,8 @@ def answer(solution: Solution) -> Answer:
     of_blocks = ("That is of the magnet as the study states it: what the tolerances of its blocks "
                  "change is not in it.")
     if error <= ROUNDING * high:
-        return Answer("How strong is the field?", f"{said} In vacuum that is exact.",
+        return Answer("How strong is the field?", f"{said} Of blocks with a recoil permeability "
+                      "of 1, without iron, that is exact.",
                       f"Yes: it is a closed form, without a mesh. {of_blocks}",
                       *_after_an_exact_field(solution))
     sigma = _smallest_noise(solution)
