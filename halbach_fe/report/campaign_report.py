@@ -116,12 +116,12 @@ class Campaign:
             f"Not to be trusted as they are: {', '.join(f'folder {each}' for each in left)}."
             if left else "They do not all fit together." if self.doubts else
             f"{'All others' if instead else 'The answers'} may be used as they stand."])
-        which = "Only those that are not named here" if unsound else "Yes, each of them"
         trust = (
-            "No: the results do not all fit together, as is said below." if self.doubts else
-            f"{which}: they are of " + (
+            "No: they do not all fit together, as is said below." if self.doubts else
+            "Yes: they are of " + (
                 "versions of the study that follow from each other" if self.versions else
-                "one study") + ", and no file was changed since.")
+                "one study") + ", and no file was changed since. How far each can be trusted "
+            "stands with it below.")
         last = self._next()
         return Answer("What is known of this magnet?", said, trust,
                       last.step if last else "Nothing that the results name is left to do.",

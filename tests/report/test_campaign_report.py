@@ -386,7 +386,7 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert [one.label for one in campaign.chapters] == ["field", "inferred", "diagnosis", "better"]
     assert campaign.answer.said.endswith("Do not trust folder inferred: folder better takes "
                                          "its place. All others may be used as they stand.")
-    assert campaign.answer.trust.startswith("Only those that are not named here")
+    assert campaign.answer.trust.startswith("Yes: they are of")
     assert "simulated" not in campaign.answer.said
     assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
 
