@@ -135,7 +135,7 @@ def tray_figure(found: FilledTray) -> Figure:
         return np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360, 1e3 * places[:, 2]
 
     axis.plot(*unrolled(found.places_m), "o", ms=12, mfc="none", mec=PUBLISHED, lw=0.5,
-              label="empty place")
+              label="place")
     names = list(found.left)
     for number, name in enumerate(names):
         mine = [one for one in found.filled if one.magnet.name == name]
@@ -146,7 +146,8 @@ def tray_figure(found: FilledTray) -> Figure:
         colour = COLOURS[number % len(COLOURS)]
         axis.quiver(angle, z, np.sin(turn), np.cos(turn), pivot="mid", color=colour,
                     scale=max(26, 1.1 * columns), width=0.005, label=name)
-    axis.set(xlabel="angle about z in degrees", ylabel="z in mm", xlim=(-10, 360))
+    axis.set(xlabel="angle about z in degrees\narrows: north ↑ away from the axis, "
+             "→ counter-clockwise", ylabel="z in mm", xlim=(-10, 360))
     axis.margins(y=0.2)
     axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(names) + 1, frameon=False)
     return figure
