@@ -65,6 +65,13 @@ class Kind:
     count: int
 
     @property
+    def identity(self) -> tuple[object, ...]:
+        """Sizes, grade and magnetization, rounded to what a supplier can make."""
+        steps = np.round(self.direction / np.radians(SAME_DEG)) + 0.0
+        return (tuple((column, _rounded(value)) for column, value in self.sizes.items()),
+                self.material, tuple(steps.tolist()), round(self.remanence_T, 6))
+
+    @property
     def shape(self) -> str:
         """Shape and size in words, along x, y and z of its own axes."""
         def mm(column: str) -> str:
@@ -217,14 +224,11 @@ class Assembly(ShownInNotebook):
         first: dict[object, int] = {}
         found = []
         for kind in self.kinds:
-            steps = np.round(kind.direction / np.radians(SAME_DEG)) + 0.0
-            turned = steps * [1, -1, -1] + 0.0
-            either = [tuple(steps.tolist())]
+            same = kind
             if kind.sizes["shape"] in TURNED_ALIKE:
-                either = sorted([*either, tuple(turned.tolist())])
-            key = (tuple((column, _rounded(value)) for column, value in kind.sizes.items()),
-                   kind.material, round(kind.remanence_T, 6), either[0])
-            found.append(first.setdefault(key, kind.number))
+                same = replace(kind, direction=kind.direction * [1, -1, -1])
+            number = first.get(same.identity, kind.number)
+            found.append(first.setdefault(kind.identity, number))
         return tuple(found)
 
 
@@ -364,14 +368,11 @@ def _kinds(
                  if column in shapes and values[number] is not None}
         material = table["material"][number] if "material" in table else None
         direction = block.axes.T @ block.easy_axis * np.sign(block.remanence)
-        key = (tuple((column, _rounded(value)) for column, value in sizes.items()), material,
-               tuple((np.round(direction / np.radians(SAME_DEG)) + 0.0).tolist()),
-               round(abs(block.remanence), 6))
-        keys.append(key)
         new = Kind(len(found) + 1, sizes, Prism(block.outline, block.z_min, block.z_max), direction,
                    abs(block.remanence), material, 0)
-        kind = found.get(key, new)
-        found[key] = replace(kind, count=kind.count + 1)
+        keys.append(new.identity)
+        kind = found.get(new.identity, new)
+        found[new.identity] = replace(kind, count=kind.count + 1)
     order = {key: number for number, key in enumerate(found)}
     return tuple(found.values()), [order[key] for key in keys]
 

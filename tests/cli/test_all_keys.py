@@ -147,15 +147,15 @@ STUDIES: dict[str, dict[str, Any]] = {
     "iron-ring": changed(
         CLOSED, mesh__meridian_size_m=0.015, mesh__growth=2.0, array__recoil_permeability=1.0,
         iron_ring={"inner_radius_m": 0.09, "outer_radius_m": 0.1, "relative_permeability": 100.0}),
-    "iron-tube": changed(BASE, mesh__meridian_size_m=0.015, iron={
+    "iron-tube": changed(BASE, iron={
         "bodies": [TUBE], "relative_permeability": 100.0}),
     "iron-prisms": changed(BASE, array__rings=1, mesh__growth=2.0, iron={
         "bodies": [PRISM], "relative_permeability": 100.0}),
-    "iron-curve": changed(BASE, array__rings=1, mesh__meridian_size_m=0.015, iron={
+    "iron-curve": changed(BASE, array__rings=1, iron={
         "bodies": [TUBE], "curve": {
         "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
         "saturation_polarization_T": 2.0}}),
-    "iron-curve-free": changed(free(), mesh__meridian_size_m=0.015, iron={
+    "iron-curve-free": changed(free(), iron={
         "bodies": [TUBE], "curve": {
         "kind": "froehlich_kennelly", "initial_relative_permeability": 200.0,
         "saturation_polarization_T": 2.0}}),

@@ -145,6 +145,27 @@ def test_readings_are_solved_for_where_the_sensors_are(generator, tmp_path, monk
         infer(magnet, maps, Session.open(tmp_path / "control"))
 
 
+def test_changes_of_terms_that_are_too_large_are_halved(generator, tmp_path, monkeypatch):
+    """Derivatives of 0.45 of their size make changes 2.2 times too large.
+
+    Control: taken as they are, each is 1.2 times the one before, until readings lie in blocks.
+    """
+    columns = infer_module.OpenTerms.columns
+    monkeypatch.setattr(infer_module.OpenTerms, "columns",
+                        lambda self, *arguments: 0.45 * columns(self, *arguments))
+    maps, magnet = two_maps(generator), build_magnet(campaign_study())
+    halved = infer(magnet, maps, Session.open(tmp_path / "halved"))
+    assert halved.terms.at_rest
+    found = terms(halved)
+    for name, (turn, _) in POSES.items():
+        for axis, right in zip("xyz", turn.as_rotvec(), strict=True):
+            value, sd = found[f"{name}.rotation_{axis}_rad"]
+            assert value == pytest.approx(right, abs=4 * sd)
+    monkeypatch.setattr(infer_module, "NO_WORSE", np.inf)
+    with pytest.raises(MeasurementError, match="inside magnet"):
+        infer(magnet, maps, Session.open(tmp_path / "control"))
+
+
 def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
     maps = two_maps(generator, mixing=MIXING)
     open_terms = {"crosstalk": 0.02, "gain": 0.003}
