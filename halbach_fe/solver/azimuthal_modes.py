@@ -17,13 +17,14 @@ take minutes to hours, and is more accurate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
@@ -34,6 +35,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,
@@ -431,16 +433,20 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.real_mesh.cell_type)
     solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
 
-    def gradients(located: Located, chosen: NDArray[np.floating]) -> Floats:
-        value, (along_r, along_z) = nodal_operators(case.real_mesh, located, unknowns)
+    def gradients(
+        located: Located, chosen: NDArray[np.floating],
+        operators: Callable[..., tuple[sparse.csr_array, list[sparse.csr_array]]],
+    ) -> Floats:
+        value, (along_r, along_z) = operators(case.real_mesh, located, unknowns)
         r = coordinates(case.real_mesh, located)[:, 0]
         r[r < AXIS_RADIUS * case.magnet.bore_radius] = np.inf  # see _limit_on_axis
         return np.stack([apply_operator(along_r, chosen), apply_operator(value, chosen) / r,
                          apply_operator(along_z, chosen)], axis=2)
 
     probes, places = case.probes
-    compare_printed(gradients(probes, solutions[printed:printed + 1])[0], folder / OUTPUT, places)
-    result = gradients(case.located, solutions)
+    compare_printed(gradients(probes, solutions[printed:printed + 1], nodal_operators)[0],
+                    folder / OUTPUT, places)
+    result = gradients(case.located, solutions, grid_operators)
     return result.reshape(modes, sources, *result.shape[1:])
 
 

@@ -328,8 +328,8 @@ def nodal_operators(
                                         unknowns.functions[1:], (unknowns.edges, unknowns.faces),
                                         strict=True))])
     slopes = _slopes(mesh, located, reference_slopes)
-    return (located.mean @ _sparse(values, index, unknowns.count),
-            [located.mean @ _sparse(slopes[..., axis], index, unknowns.count)
+    return (located.mean @ sparse_operator(values, index, unknowns.count),
+            [located.mean @ sparse_operator(slopes[..., axis], index, unknowns.count)
              for axis in range(slopes.shape[2])])
 
 
@@ -367,11 +367,11 @@ def curl_operators(
         curls.append(np.cross(product, s[row, p]))
         index.append(function[np.abs(unknowns.faces[located.cells])])
     all_curls, all_index = np.concatenate(curls, axis=1), np.concatenate(index, axis=1)
-    return [located.mean @ _sparse(all_curls[..., axis], all_index, unknowns.count)
+    return [located.mean @ sparse_operator(all_curls[..., axis], all_index, unknowns.count)
             for axis in range(3)]
 
 
-def _sparse(values: Floats, columns: Ints, unknowns: int) -> sparse.csr_array:
+def sparse_operator(values: Floats, columns: Ints, unknowns: int) -> sparse.csr_array:
     """Return the operator (n, unknowns) with ``values`` (n, k) in ``columns`` (n, k).
 
     Column -1 marks a function without an unknown, whose coefficient is 0.

@@ -27,6 +27,7 @@ from halbach_fe.solver.azimuthal_modes import unknowns_of
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.dofs import Unknowns, read_matrix, read_solutions, read_unknowns
 from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import Located, coordinates, nodal_operators
 from halbach_fe.solver.iron_grid import IronRectangle, Resolution, grid_lines, iron_cells
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
@@ -286,9 +287,17 @@ def assemble_modes(
 
 
 def points_at(mesh: VerifiedMesh, located: Located, unknowns: Unknowns) -> GaussPoints:
-    """Return the operators at located points, without weights."""
+    """Return the operators at located points in air, without weights."""
+    return _operators(mesh, located, grid_operators(mesh, located, unknowns))
+
+
+def _operators(
+    mesh: VerifiedMesh, located: Located,
+    operators: tuple[sparse.csr_array, list[sparse.csr_array]],
+) -> GaussPoints:
+    """Return operators to value and derivatives at located points, without weights."""
     place = coordinates(mesh, located)
-    value, (along_r, along_z) = nodal_operators(mesh, located, unknowns)
+    value, (along_r, along_z) = operators
     return GaussPoints(place[:, 0], place[:, 1], np.ones(len(place)), value, along_r, along_z)
 
 
@@ -301,7 +310,7 @@ def _gauss_points(mesh: VerifiedMesh, cells: Ints, unknowns: Unknowns) -> GaussP
                       sparse.eye_array(count, format="csr"))
     corners = mesh.points[mesh.cells[cells]]
     area = np.prod(np.ptp(corners, axis=1), axis=1)
-    found = points_at(mesh, located, unknowns)
+    found = _operators(mesh, located, nodal_operators(mesh, located, unknowns))
     return replace(found, weights=found.r * np.outer(
         area, np.outer(weights, weights).ravel() / 4).ravel())
 
