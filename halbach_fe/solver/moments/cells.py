@@ -93,6 +93,20 @@ class Cells:
         weights = np.polynomial.legendre.leggauss(self.divisions)[1] / 2
         return np.concatenate([[0.0], np.cumsum(weights)])
 
+    @cached_property
+    def of_parts(self) -> Floats:
+        """Matrix (q, q) from values at the nodes to those of uniform parts about the nodes.
+
+        Parts have the same moments as dipoles at the nodes: in each direction the integrals of the
+        value times 1, x, ..., x^(g - 1). Parts with the values of their nodes have 13 % less of the
+        second one (g = 2), and the field of a cell would jump where dipoles take their place.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(self.divisions)
+        powers, limits = np.arange(self.divisions)[:, None], 2 * self.cuts - 1
+        of_parts = np.diff(limits**(powers + 1), axis=1) / (powers + 1)
+        along = np.linalg.solve(of_parts, weights * nodes**powers)
+        return np.asarray(np.kron(np.kron(along, along), along))
+
     def mean(self, values: Floats) -> Floats:
         """Return the means (n, 3) over the cells of values (n, q, 3) at their nodes."""
         return np.einsum("nq,nqi->ni", self.weights, values)

@@ -28,6 +28,11 @@ READING_DEGREE = 12
 """Degree of the expansions at points, where an error is not multiplied by chi. In the bore of 96
 cubes the error was 3e-4 of the reaction, and 6e-4 with degree 8."""
 
+COARSE_REACH = 2.5
+"""Distance of points from a cell with 2 nodes per direction, in radii of it, below which they see
+exact parts of it. The field of its dipoles is 3e-5 of its polarization off there, and 5e-4 at 1.7
+radii; with 3 nodes it is 3e-5 off at 1.7."""
+
 TOUCHING, CLOSE = 1.0, 1.4
 """Distances of two cells, in units of the sum of their radii, below which they count as touching or
 close."""
@@ -365,31 +370,37 @@ class Interaction:
             share_out(len(targets)))
         return found
 
+    @property
+    def _reach(self) -> float:
+        """Distance of points from a cell, in radii of it, below which they see its exact parts."""
+        least = COARSE_REACH if self.cells.divisions == 2 else 0.0
+        return max(least, 1 / self.opening if self.opening else np.inf)
+
     def readings(self, points: Floats) -> Floats:
         """Return the field at points (k, 3) in m per polarization of nodes, (k, 3, n, q, 3)."""
         cells = self.cells
         found = np.empty((len(points), 3, *cells.weights.shape, 3))
         weights = cells.weights * cells.volume[:, None]
         in_threads(lambda first, last: near.readings_of_cells(
-            first, last, points, 1 / self.opening, cells.radius, *self.arrays, cells.cuts,
-            cells.nodes, weights, found), share_out(len(points)))
+            first, last, points, self._reach, cells.radius, *self.arrays, cells.cuts,
+            cells.of_parts, cells.nodes, weights, found), share_out(len(points)))
         return found
 
     def field_at(self, points: Floats, polarization: Floats) -> Floats:
         """Return mu_0 H (n, 3) in T at points (n, 3) in m, for a polarization (cells, q, 3) in T.
 
-        Near cells consist of uniformly polarized parts, one about every node.
+        Near cells consist of uniformly polarized parts, one about every node, see `Cells.of_parts`.
         """
         points = np.ascontiguousarray(points, float)
         if not len(points) or not np.any(polarization):
             return np.zeros((len(points), 3))
         targets = Clusters.of(points, np.zeros(len(points)))
-        far, close = self._pairs_with(targets, self.opening)
+        far, close = self._pairs_with(targets, 1 / self._reach)
         found = self._far(far, targets, points[:, None], self.dipoles(polarization),
                           self.reading_degree)[:, 0]
         in_threads(lambda first, last: near.add_of_parts(
             close.starts, close.sources, first, last, *self.arrays, self.cells.cuts, points,
-            polarization, found), close.shares(32))
+            self.cells.of_parts @ polarization, found), close.shares(32))
         return found
 
 

@@ -302,21 +302,30 @@ def far_panel(first: int, last: int, begin: int, nodes: Floats, weights: Floats,
 @compiled
 def readings_of_cells(first: int, last: int, points: Floats, reach: float, radius: Floats,
                       centre: Floats, axes: Floats, vertices: Floats, half: Floats, cuboid: Flags,
-                      cuts: Floats, nodes: Floats, moments: Floats, out: Floats) -> None:
-    """Write the field at points ``first`` to ``last`` per polarization about every node.
+                      cuts: Floats, of_parts: Floats, nodes: Floats, moments: Floats,
+                      out: Floats) -> None:
+    """Write the field at points ``first`` to ``last`` per polarization at every node.
 
     The result (points, 3, cells, q, 3) has the component of the polarization last. Cells within
-    ``reach`` radii of a point consist of exact parts, others of dipoles at the nodes, with
-    ``moments`` (cells, q) in m^3.
+    ``reach`` radii of a point consist of exact parts, with ``of_parts`` (q, q) from polarizations
+    at the nodes to those of the parts; others of dipoles at the nodes, with ``moments`` (cells, q)
+    in m^3.
     """
     quad, each = np.empty((4, 2)), np.empty((nodes.shape[1], 6))
+    parts = np.empty_like(each)
     for t in range(first, last):
         for s in range(len(centre)):
             dx, dy, dz = (points[t, 0] - centre[s, 0], points[t, 1] - centre[s, 1],
                           points[t, 2] - centre[s, 2])
             if dx * dx + dy * dy + dz * dz < (reach * radius[s]) ** 2:
                 _parts_at(axes[s], centre[s], vertices[s], half[s], cuboid[s], cuts,
-                          points[t], quad, each)
+                          points[t], quad, parts)
+                for q in range(len(each)):
+                    for c in range(6):
+                        total = 0.0
+                        for p in range(len(each)):
+                            total += parts[p, c] * of_parts[p, q]
+                        each[q, c] = total
             else:
                 for q in range(nodes.shape[1]):
                     g = dipole_field(points[t, 0] - nodes[s, q, 0], points[t, 1] - nodes[s, q, 1],
