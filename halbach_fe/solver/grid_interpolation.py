@@ -19,12 +19,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.solver.dofs import Unknowns
-from halbach_fe.solver.interpolation import (
-    Located,
-    coordinates,
-    nodal_operators,
-    sparse_operator,
-)
+from halbach_fe.solver.interpolation import Located, coordinates, nodal_operators, sparse_operator
 from halbach_fe.solver.mesh import VerifiedMesh
 
 LINES = 6
