@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             estimate_infer(magnet, observation, common.jobs(arguments)), arguments.json)
     with common.session(arguments, study) as session:
         result = infer(magnet, data, session, blocks, linearized_only=bool(arguments.samples),
-                       validation_map=validation_map)
+                       validation_map=validation_map, say=common.say)
         if arguments.samples:
             from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 

@@ -69,6 +69,7 @@ def infer(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
     blocks: BlockTable | None = None, prior: Gaussian | None = None,
     linearized_only: bool = False, validation_map: xr.Dataset | None = None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> InferenceResult:
     """Update the block magnetizations of a study with a measured map.
 
@@ -90,6 +91,8 @@ def infer(
     validation_map : Dataset, optional
         Another map, which is predicted but does not update the model; see
         `halbach_fe.measurement.observation.study_for_validation_map`.
+    say : callable, optional
+        Takes a line of text about each update, if terms of instruments are estimated.
 
     Returns
     -------
@@ -178,6 +181,10 @@ def infer(
             else:
                 place, share = here, 1.0
             total, maps, at = place.moved(open_terms, share)
+            largest = np.max(np.abs(open_terms.counted @ change) / sd)
+            say(f"update {rounds}, of at most {ROUNDS}: the terms of the instruments change by up "
+                f"to {largest:.2g} standard deviations" + (
+                    f", of which {100 * share:.0f} % are taken" if share < 1 else ""))
         at_rest = share == 1.0 and bool((np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
         if at_rest and not uncertain:
             break

@@ -254,7 +254,7 @@ def _by_moments(
         solved.field(points), None)
     if not columns:
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
-    block = separate_columns(magnet, points, solved.iron)
+    block = separate_columns(magnet, points, solved.iron, session.progress)
     along = nominal
     if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)

@@ -18,6 +18,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachError
+from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.axisymmetric_iron import (
@@ -182,7 +183,7 @@ def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
 
 
 def separate_columns(
-    magnet: Magnet, points: Floats, iron: IronReaction | None
+    magnet: Magnet, points: Floats, iron: IronReaction | None, progress: Progress | None = None
 ) -> Callable[[int, Ints | slice], Floats]:
     """Compute the reaction to every single block at points (n, 3) in m.
 
@@ -199,7 +200,8 @@ def separate_columns(
     from halbach_fe.solver.moments.columns import reaction_columns  # imports numba
 
     blocks = magnet.blocks
-    of_blocks = reaction_columns(blocks, points) if _permeable(blocks) else None
+    of_blocks = reaction_columns(
+        blocks, points, progress=progress) if _permeable(blocks) else None
     of_iron: Floats | None = None
     if iron is not None:
         nodes = iron.nodes(TANGENT_ANGLES)

@@ -154,8 +154,11 @@ def test_changes_of_terms_that_are_too_large_are_halved(generator, tmp_path, mon
     monkeypatch.setattr(infer_module.OpenTerms, "columns",
                         lambda self, *arguments: 0.45 * columns(self, *arguments))
     maps, magnet = two_maps(generator), build_magnet(campaign_study())
-    halved = infer(magnet, maps, Session.open(tmp_path / "halved"))
+    said: list[str] = []
+    halved = infer(magnet, maps, Session.open(tmp_path / "halved"), say=said.append)
     assert halved.terms.at_rest
+    assert said[0].startswith("update 1, of at most 16: the terms of the instruments change by up")
+    assert any("of which 50 % are taken" in line for line in said)
     found = terms(halved)
     for name, (turn, _) in POSES.items():
         for axis, right in zip("xyz", turn.as_rotvec(), strict=True):

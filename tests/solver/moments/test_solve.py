@@ -222,7 +222,10 @@ def test_columns_add_up(generator):
     """
     for gap, per_side, tolerance in ((0.005, 1, 0.01), (0.005, 2, 0.01), (0.03, 1, 0.01)):
         blocks, points = three(gap), around(generator, radius=0.035 + 2 * gap)
-        columns = reaction_columns(blocks, points, per_side)
+        done: list[tuple[int, int]] = []
+        columns = reaction_columns(
+            blocks, points, per_side, lambda some, every: done.append((some, every)))
+        assert done[-1] == (len(points), len(points))
         each = [columns(number, slice(None)) @ (np.array(body.easy_axis) * body.remanence)
                 for number, body in enumerate(blocks)]
         found = solve_moments(blocks, cells_per_side=3).reaction(points)
