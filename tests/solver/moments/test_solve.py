@@ -224,7 +224,7 @@ def test_columns_add_up(generator):
         blocks, points = three(gap), around(generator, radius=0.035 + 2 * gap)
         done: list[tuple[int, int]] = []
         columns = reaction_columns(
-            blocks, points, per_side, lambda some, every: done.append((some, every)))
+            blocks, points, per_side, lambda *counts, into=done: into.append(counts))
         assert done[-1] == (len(points), len(points))
         each = [columns(number, slice(None)) @ (np.array(body.easy_axis) * body.remanence)
                 for number, body in enumerate(blocks)]
