@@ -28,10 +28,10 @@ READING_DEGREE = 12
 """Degree of the expansions at points, where an error is not multiplied by chi. In the bore of 96
 cubes the error was 3e-4 of the reaction, and 6e-4 with degree 8."""
 
-COARSE_REACH = 2.5
+FAR_REACH = 2.5
 """Distance of points from a cell with 2 nodes per direction, in radii of it, below which they see
-exact parts of it. The field of its dipoles is 3e-5 of its polarization off there, and 5e-4 at 1.7
-radii; with 3 nodes it is 3e-5 off at 1.7."""
+exact parts of it, if expansions have `READING_DEGREE`. The field of its dipoles is 3e-5 of its
+polarization off there, and 5e-4 at 1.7 radii; with 3 nodes it is 3e-5 off at 1.7."""
 
 TOUCHING, CLOSE = 1.0, 1.4
 """Distances of two cells, in units of the sum of their radii, below which they count as touching or
@@ -373,8 +373,10 @@ class Interaction:
     @property
     def _reach(self) -> float:
         """Distance of points from a cell, in radii of it, below which they see its exact parts."""
-        least = COARSE_REACH if self.cells.divisions == 2 else 0.0
-        return max(least, 1 / self.opening if self.opening else np.inf)
+        if self.opening == 0:
+            return np.inf
+        exact = self.cells.divisions == 2 and self.reading_degree >= READING_DEGREE
+        return max(FAR_REACH if exact else 0.0, 1 / self.opening)
 
     def readings(self, points: Floats) -> Floats:
         """Return the field at points (k, 3) in m per polarization of nodes, (k, 3, n, q, 3)."""
