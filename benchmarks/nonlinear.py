@@ -18,12 +18,11 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
+from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, vacuum_part
 from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.magnetostatics import RunRequest, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
-from halbach_fe.solver.runs import newton_history
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.model import Study
@@ -71,13 +70,10 @@ def faser(note: Note) -> None:
         session = Session(scales.getdp, Path(name), jobs=2)
         started = time.monotonic()
         parts = finite_element_part(build_magnet(study), points, session, columns=False)
+        stated = reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
         part = parts.nominal
         note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
-             f"Newton's method, {len(newton_history(session.folder)) - 1} steps")
-        started = time.monotonic()
-        stated = reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
-        note("nonlinear.faser_3d_error_bar_seconds", time.monotonic() - started, "s",
-             "the dual formulation, Newton's method again")
+             f"error bars included; route {choose_route(build_magnet(study), points)}")
         note("nonlinear.faser_3d_memory_GiB", own_peak() + 2 * scales.peak, "GiB",
              "peak of this process and of two of GetDP's")
     main_field = float(np.abs(vacuum_part(build_magnet(study), points) + part).max())

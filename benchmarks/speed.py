@@ -23,7 +23,8 @@ ROOT = Path(__file__).parent.parent
 BEFORE = "5c3aed3"
 """The last commit before the compiled field."""
 
-REPEATS = {"exact": 3, "help": 7, "diagnose-small": 1, "diagnose-map": 1}
+REPEATS = {"exact": 3, "help": 7, "diagnose-small": 1, "diagnose-map": 1, "solve": 1,
+           "response": 1}
 
 HIDDEN = "block_displaced=6,5,3e-3,0,0"
 """A block that is displaced in the simulated maps: ring, slot, displacement in m."""
@@ -141,6 +142,17 @@ def _note_diagnosis(
          f"{new['processor_s']:.3g} s; displaced block named: {old['named']:g}, {new['named']:g}")
     note(f"diagnosis.seconds_{name}", new["wall_s"], "s",
          f"wall time; before {old['wall_s']:.3g} s")
+
+
+def solvers(note: Note) -> None:
+    """Note how much faster the response of the FASER dipole is, and its field in saturating iron."""
+    for task, study, figure in (("response", "campaign", "response.speedup"),
+                                ("solve", "iron", "nonlinear.faser_3d_speedup")):
+        old, new = both(task, ROOT / "studies" / "faser" / f"{study}.toml")
+        note(figure, old["processor_s"] / new["processor_s"], "ratio",
+             f"processor time of the code before, commit {BEFORE}: {old['processor_s']:.3g} s; now "
+             f"{new['processor_s']:.3g} s; wall time {old['wall_s']:.3g} s and "
+             f"{new['wall_s']:.3g} s")
 
 
 def run(note: Note) -> None:

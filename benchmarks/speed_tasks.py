@@ -178,9 +178,40 @@ def diagnose_map(folder: Path) -> dict[str, float]:
     return {"named": float(names == ["block_displaced"]), "wall_s": time.perf_counter() - begin}
 
 
+def solve(study: Path) -> dict[str, float]:
+    """Solve a study, error bars included, by the command."""
+    from halbach_fe.cli import main
+
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()):
+        code = main(["solve", str(study), "-o", str(Path(name) / "out"), "--no-cache", "--json"])
+    if code:
+        raise SystemExit(code)
+    return {"wall_s": time.perf_counter() - begin}
+
+
+def response(study: Path) -> dict[str, float]:
+    """Build the response matrix of a study, error bars included."""
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.measurement.observation import observe
+    from halbach_fe.measurement.positions import points_from
+    from halbach_fe.response.matrix import response_matrix
+    from halbach_fe.solver.getdp import find_getdp
+    from halbach_fe.solver.session import Session
+    from halbach_fe.study.reader import read_study
+
+    known = read_study(study)
+    points = points_from(known.observation.positions)
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name:
+        response_matrix(build_magnet(known), observe(known, points, np.ones_like(points, bool)),
+                        Session(find_getdp(), Path(name), jobs=2))
+    return {"wall_s": time.perf_counter() - begin}
+
+
 TASKS: dict[str, Callable[..., dict[str, float]]] = {
     "exact": exact, "help": start, "diagnose-small": partial(diagnose, SECTORS),
-    "diagnose-map": diagnose_map}
+    "diagnose-map": diagnose_map, "solve": solve, "response": response}
 
 
 if __name__ == "__main__":
