@@ -145,7 +145,7 @@ def _note_diagnosis(
 
 
 def solvers(note: Note) -> None:
-    """Note how much faster the response of the FASER dipole is, and its field in saturating iron."""
+    """Note how much faster the response of the FASER dipole is, and its field in thin iron."""
     for task, study, figure in (("response", "campaign", "response.speedup"),
                                 ("solve", "iron", "nonlinear.faser_3d_speedup")):
         old, new = both(task, ROOT / "studies" / "faser" / f"{study}.toml")

@@ -4,7 +4,7 @@ The method of moments gives the polarization that recoil permeability induces in
 azimuthal modes give the reaction of the iron. If a magnet has both, each is solved in turn in the
 field of the other until the polarization of the blocks comes to rest. Recoil permeability is a few
 per cent above 1, so that every turn reduces the change by a factor of some 20 or more. The turns
-take a coarse mesh of the iron: what its error changes in the polarization of the blocks, and thereby
+take a coarse mesh of the iron: what its error changes in the polarization of the blocks, and so
 in the source of the iron on the usual mesh, is of second order in that small number.
 """
 
