@@ -449,7 +449,7 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
 def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     everything = hf.plan(given.magnet, given.session)
     said = plan.answer(everything)
-    few = int(said.said.split("The first ")[1].split()[0])
+    few = int(said.said.split("the first ")[1].split(",")[0])
     assert 0 < few < len(everything.points)
     left = np.exp(-everything.gain / len(everything.parameters))
     assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
@@ -500,3 +500,22 @@ def test_scattered_points_have_maps_and_no_profile(given, scattered):
     study = parse_study(changed(MAGNET, observation__positions=positions))
     update = hf.infer(build_magnet(study), simulate_campaign(study, 3).readings, given.session)
     assert diagnosis_figures.is_scattered(update) == scattered
+
+
+def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tmp_path):
+    """The table has what plan.csv has; blocks and patterns are two quantities with two names."""
+    found = hf.plan(given.magnet, given.session, points=6)
+    plan.write_plan(given.magnet, found, tmp_path)
+    rows = plan.chosen_table(found)
+    stored = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)
+    # 1 µm is the last digit of the table
+    np.testing.assert_allclose([[float(row[f"{axis} in mm"]) for axis in "xyz"] for row in rows],
+                               1e3 * found.points, atol=6e-4)
+    np.testing.assert_allclose(1e3 * stored["x_m"], 1e3 * found.points[:, 0])
+    assert "-0.000" not in str(rows)
+    text = (tmp_path / "plan.html").read_text()
+    assert all(f">{row['x in mm']}<" in text for row in rows)
+    assert "uncertainty that remains" not in text
+    left, of_study = (plan.plan_table(found)[3][key] for key in ("plan", "the study's"))
+    # each is rounded to 0.1 %
+    assert float(left[:-2]) / float(of_study[:-2]) == pytest.approx(found.volume_ratio, abs=3e-3)
