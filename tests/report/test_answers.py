@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tomlkit
 
 import halbach_fe as hf
 from halbach_fe.cli import main
@@ -519,3 +520,29 @@ def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tm
     left, of_study = (plan.plan_table(found)[3][key] for key in ("plan", "the study's"))
     # each is rounded to 0.1 %
     assert float(left[:-2]) / float(of_study[:-2]) == pytest.approx(found.volume_ratio, abs=3e-3)
+
+
+def test_moves_that_the_answer_is_against_are_no_instructions(given, tmp_path):
+    """The titles of table and picture say so, and those of worthwhile moves do not."""
+    found = hf.shim(given.updated, given.session, swaps=1, turns=0)
+    assert found.steps
+    wrong = replace(given.updated, prior_conflict=10 * given.updated.conflict_limit)
+    assert wrong.disagreement
+
+    def that_leave(part):
+        first = replace(found.before, mean=part * found.before.mean, root=part * found.before.root,
+                        error=part * found.before.error)
+        return replace(found, steps=(replace(found.steps[0], after=first),))
+
+    little, worthwhile = that_leave(0.97), that_leave(0.5)
+    for name, moves, result, against in (
+            ("worthwhile", worthwhile, given.updated, False), ("little", little, given.updated,
+                                                               True),
+            ("conflict", worthwhile, wrong, True)):
+        shimming.write_shim(moves, result, tomlkit.dumps(MAGNET), tmp_path / name)
+        text = (tmp_path / name / "shim.html").read_text()
+        assert ("Moves that would be made" in text) == against
+        assert bool(shimming.reason_against(moves, result)) == against
+        assert shimming.answer(moves, result).step.startswith("Make the moves") != against
+    drawn = shimming._moves_figure(found).legends[0].texts
+    assert [text.get_text() for text in drawn] == ["blocks that are exchanged"]
