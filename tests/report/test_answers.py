@@ -173,7 +173,9 @@ def of_prior(given):
 def of_sort(given):
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     size = np.sqrt(np.mean(found.best.sizes**2))
-    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv"]
+    low, high = np.quantile(found.random, [0.025, 0.975])
+    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv",
+                                   f"{low:.3g} to {high:.3g} for 95 % of random orders"]
 
 
 @pytest.mark.filterwarnings("ignore:Every block of study")
