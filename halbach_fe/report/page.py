@@ -237,6 +237,19 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
 
 
+def _inner_radii(magnet: Magnet) -> list[float]:
+    """Return the smallest distance in m of every ring's blocks from the z axis.
+
+    Of a block with flat sides that is the distance of an edge, which no corner has.
+    """
+    t, found = np.linspace(0, 1, 33), dict[int, float]()
+    for block in magnet.blocks:
+        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
+        x, y, _ = block.from_frame(np.column_stack([edges, 0 * edges[:, 0]])).T
+        found[block.ring] = min(float(np.hypot(x, y).min()), found.get(block.ring, np.inf))
+    return list(found.values())
+
+
 def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
     """Draw the positions of readings in the cross-section of the magnet.
 
@@ -257,10 +270,11 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
         axis.grid(alpha=0.3)
-        for z_limits, radii in magnet.ring_sections:
+        for (z_limits, (_, outer)), inner in zip(
+                magnet.ring_sections, _inner_radii(magnet), strict=True):
             axis.add_patch(Rectangle(
-                (1e3 * z_limits[0], 1e3 * radii[0]), 1e3 * (z_limits[1] - z_limits[0]),
-                1e3 * (radii[1] - radii[0]), fill=False, color="#777777", lw=0.6))
+                (1e3 * z_limits[0], 1e3 * inner), 1e3 * (z_limits[1] - z_limits[0]),
+                1e3 * (outer - inner), fill=False, color="#777777", lw=0.6))
     for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                             (others, "x", PRIOR, "held out")):
         if positions is None:
