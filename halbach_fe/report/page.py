@@ -27,7 +27,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, inputs_of_command
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
@@ -83,8 +83,8 @@ def write_page(
 ) -> None:
     """Write a self-contained HTML page from a template of this folder, and page.json beside it.
 
-    The page ends with its provenance: the entries of ``provenance``, the versions of the programs,
-    and the text of the study file as it was read.
+    The page ends with its provenance: the entries of ``provenance``, the files that the command has
+    read, the versions of the programs, and the text of the study file as it was read.
 
     Parameters
     ----------
@@ -103,7 +103,10 @@ def write_page(
     **data
         Variables of the template.
     """
-    provenance = {**(provenance or {}), "programs": programs()}
+    given = dict(provenance or {})
+    read = {name: file for name, file in inputs_of_command().items()
+            if file not in given.values()}
+    provenance = {**given, **read, "programs": programs()}
     text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
                     answer=answer and answer.with_known_paths(), **data)
     write_text(path, text)
