@@ -552,3 +552,11 @@ def test_moves_that_the_answer_is_against_are_no_instructions(given, tmp_path):
         assert shimming.answer(moves, result).step.startswith("Make the moves") != against
     drawn = shimming._moves_figure(found).legends[0].texts
     assert [text.get_text() for text in drawn] == ["blocks that are exchanged"]
+
+
+@pytest.mark.parametrize(("value", "sd", "shown"), [
+    (-253083.2, 35.84, "-253\u202f083 ± 36"), (74090.4, 0.0, "+74\u202f090 ± 0"),
+    (1263.4, 4.34, "+1\u202f263.4 ± 4.3"), (0.0, 1594.2, "0 ± 1\u202f594"),
+    (0.01, 2.71, "0.0 ± 2.7"), (-3.2, 0.012, "-3.200 ± 0.012")])
+def test_harmonics_and_their_errors_end_with_one_digit(value, sd, shown):
+    assert homogeneity._ppm_with_sd(value, sd) == shown
