@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -169,6 +169,11 @@ def with_folder(
         return int(run(arguments))
 
 
+DESCRIPTIONS = {"study": "study file", "held_out": "held-out map", "order": "order of assembly"}
+"""What files of the command line are on pages, by the names of their arguments, where that differs
+from the latter."""
+
+
 def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> None:
     """Take the output folder for this command and study until the end of the run.
 
@@ -177,7 +182,7 @@ def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> 
     written until then name the files of the command line.
     """
     from halbach_fe.core.result_folder import result_folder
-    from halbach_fe.report.answer import known_paths
+    from halbach_fe.report.answer import known_inputs, known_paths
 
     inputs = [value for value in (*vars(arguments).values(),
                                   *getattr(arguments, "listed_maps", {}).values())
@@ -187,6 +192,29 @@ def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> 
         arguments.output, command, study, inputs, named))
     arguments.at_end.enter_context(known_paths({
         word: _from_here(path) for word, path in _paths_of(arguments).items()}))
+    arguments.at_end.enter_context(known_inputs(_described(arguments)))
+
+
+def _described(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return the `digest` of every file that the command reads, by what it is.
+
+    A posterior comes with the files that its update has read, if its folder still tells.
+    """
+    from halbach_fe.core.result_folder import inputs_behind
+
+    files = {DESCRIPTIONS.get(name, name.replace("_", " ")): value
+             for name, value in vars(arguments).items() if isinstance(value, InputFile)}
+    files |= {f"map {name}": file for name, file in getattr(arguments, "listed_maps", {}).items()}
+    found = {}
+    for name, file in files.items():
+        with suppress(OSError):  # whoever reads it says what is wrong
+            found[name] = digest(file)
+    if isinstance(posterior := getattr(arguments, "posterior", None), InputFile) and (
+            behind := inputs_behind(posterior)):
+        found["read for the posterior"] = "; ".join(
+            printable(f"{Path(path).name}, SHA-256 {value}", MAX_QUOTED)
+            for path, value in behind.items())
+    return found
 
 
 def keep_input(output: Path, *inputs: Path) -> None:

@@ -26,8 +26,13 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import multipoles
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.multipoles import answer, multipoles_summary, place_of, write_multipoles
-    from halbach_fe.response.multipoles import text_table
+    from halbach_fe.report.multipoles import (
+        answer,
+        multipole_rows,
+        multipoles_summary,
+        place_of,
+        write_multipoles,
+    )
     from halbach_fe.study.reader import read_study
 
     study, limit = read_study(arguments.study), arguments.limit_units
@@ -44,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(multipoles_summary(study, tables, limit))
     else:
         for model, columns in tables:
-            common.print_table(text_table(**columns), "Multipoles in units of 1e-4, " + (
+            common.print_table(multipole_rows(columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
                 "of the cross-section" if model.z is None else f"on {place_of(model)}"))
         common.say_answer(arguments, answer(tables, limit, found.disagreement),

@@ -34,6 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(plan_summary(plan))
     else:
-        common.print_table(plan_table(plan), "The plan beside the positions of the study")
+        common.print_table(plan_table(plan), "The plan beside the positions of the study (* with "
+                           "equally many positions)")
         common.say_answer(arguments, answer(plan), arguments.output / "plan.html")
     return 0

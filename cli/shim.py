@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.report.shimming import (
         answer,
         move_table,
+        move_title,
         shim_summary,
         table_title,
         value_table,
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(shim_summary(moves, result))
     else:
-        common.print_table(move_table(moves), "Moves")
+        common.print_table(move_table(moves), move_title(moves, result))
         common.print_table(value_table(moves), table_title(moves))
         common.say_answer(arguments, answer(moves, result), arguments.output / "shim.html")
     return 0

@@ -263,6 +263,23 @@ def named_inputs(folder: Path) -> dict[str, Path]:
         if path in record.inputs and _digest(Path(path)) == record.inputs[path]}
 
 
+def inputs_behind(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of what the run has read that wrote a file, by path; not its study.
+
+    It is empty if the record of the file's folder does not have the file as it is.
+    """
+    try:
+        with _regular(path.parent / RECORD) as file:
+            record = _read(file)
+    except (OSError, ValueError):
+        return {}
+    digest = next(iter(_inputs([path]).values()), None)
+    if record is None or digest is None or record.files.get(path.name) != digest:
+        return {}
+    return {name: found for name, found in record.inputs.items()
+            if name != record.named.get("STUDY")}
+
+
 @contextlib.contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
     """Keep other runs out of a folder while the block writes into it.

@@ -449,10 +449,10 @@ class InferenceResult(ShownInNotebook):
             chi2 = sum(score.readings * float(score.chi2_posterior or 0.0)
                        for score in of_part) / count
             if chi2 > max(TOO_FAR, 1 + 5 * np.sqrt(2 / count)):
-                return (f"Held-out readings{words} are {np.sqrt(chi2):.3g} times farther from "
-                        "their predictions than these and the noise allow (chi² per reading is "
-                        f"{decimals(chi2)}): sigma_T is too small, an effect is missing from the "
-                        "model, or these readings are not of this magnet.")
+                return (f"Held-out readings{words} are farther from their predictions than these "
+                        f"and the noise allow (chi² per reading is {decimals(chi2)}, where 1 is "
+                        "expected): sigma_T is too small, an effect is missing from the model, or "
+                        "these readings are not of this magnet.")
         return ""
 
     @property

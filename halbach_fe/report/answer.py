@@ -22,6 +22,27 @@ STANDS_FOR = {
 _NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
 
 
+_INPUTS: ContextVar[Mapping[str, str] | None] = ContextVar("inputs", default=None)
+
+
+@contextmanager
+def known_inputs(inputs: Mapping[str, str]) -> Iterator[None]:
+    """While the block runs, let the provenance of pages have these files.
+
+    They are texts with name and SHA-256, by what the file is.
+    """
+    token = _INPUTS.set(inputs)
+    try:
+        yield
+    finally:
+        _INPUTS.reset(token)
+
+
+def inputs_of_command() -> Mapping[str, str]:
+    """Return what the command that is running has read, see `known_inputs`."""
+    return _INPUTS.get() or {}
+
+
 @contextmanager
 def known_paths(paths: Mapping[str, object]) -> Iterator[None]:
     """While the block runs, let answers of pages name these files, see `Answer.with_paths`."""

@@ -22,8 +22,11 @@ FINDING = ("register", "diagnose")
 OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
 """Commands whose results are of the measured magnet, and should be of such a study."""
 
-MOST_KEYS, MOST_VALUE = 6, 40
-"""Largest numbers of keys that a sentence names, and of characters of a value."""
+MOST_FILES, MOST_KEYS, MOST_VALUE = 6, 3, 40
+"""Largest numbers of files and of keys that a sentence names, and of characters of a value."""
+
+OF_MAPPER = ("instrument", "instrument_sd", "maps")
+"""Tables of the study in which register writes the poses of maps and the probe."""
 
 
 def doubts(chapters: Sequence[Chapter]) -> list[str]:
@@ -40,7 +43,7 @@ def versions(chapters: Sequence[Chapter]) -> list[str]:
 
 def _changed(chapters: Sequence[Chapter]) -> list[str]:
     """Name results that are not as their run has left them."""
-    return [f"Changed since the run in {one.label}: {', '.join(one.changed[:MOST_KEYS])}."
+    return [f"Changed since the run in {one.label}: {', '.join(one.changed[:MOST_FILES])}."
             for one in chapters if one.changed]
 
 
@@ -132,15 +135,22 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, bool]]:
         first = groups[0][0]
         source = next(((other, name) for one in group for other in chapters
                        for name in one.uses(other) if name.endswith(".toml")), None)
-        texts = [f"{key} is {_short(new)} instead of {_short(old)}"
-                 for key, (old, new) in differences(_plain(first), _plain(study)).items()]
+        changed = differences(_plain(first), _plain(study))
+        if source is not None and source[0].verb == "register":
+            # its numbers are on its own page
+            changed = {key: values for key, values in changed.items()
+                       if key.partition(".")[0] not in OF_MAPPER}
+        texts = [_difference(key, old, new) for key, (old, new) in changed.items()]
         more = f" and {len(texts) - MOST_KEYS} more" if len(texts) > MOST_KEYS else ""
         changes = "; ".join(texts[:MOST_KEYS]) + more
         of = f"{_listed(group)} {'is' if len(group) == 1 else 'are'} of"
         if source is not None:
             other, name = source
-            found.append((f"{of} {other.label}/{name}, which {other.record.command} wrote: "
-                          f"{changes}.", True))
+            wrote = f"{of} {other.label}/{name}, which {other.record.command} wrote"
+            if other.verb == "register":
+                wrote += (" with the poses of maps and the errors of the probe that it found"
+                          f"{'. Beside these' if changes else '; nothing else differs'}")
+            found.append((f"{wrote}{f': {changes}' if changes else ''}.", True))
         else:
             same = magnet_description(first) == magnet_description(study)
             found.append((f"{of} another version of the study than {groups[0][1][0].label}: "
@@ -155,12 +165,24 @@ def _plain(study: Study) -> dict[str, Any]:
     return found
 
 
+def _difference(key: str, old: Any, new: Any) -> str:
+    """Say how a key differs between two versions of a study."""
+    if any(isinstance(value, list) and value and isinstance(value[0], dict)
+           for value in (old, new)):
+        before, now = len(old or ()), len(new or ())
+        if before == now:
+            return f"{key} has {counted(now, 'entry', 'entries')}, as before, but not the same"
+        return f"{key} has {counted(now, 'entry', 'entries') if now else 'no entry'}, and " + (
+            f"{before or 'none'} before")
+    if old in (None, []):
+        return f"{key} is {_short(new)}, and was not given before"
+    if new in (None, []):
+        return f"{key} is not given, and was {_short(old)} before"
+    return f"{key} is {_short(new)} instead of {_short(old)}"
+
+
 def _short(value: Any) -> str:
     """Return a value of a key as a short text."""
-    if value is None or value == []:
-        return "not given"
-    if isinstance(value, list) and isinstance(value[0], dict):
-        return counted(len(value), "table")
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list) and all(isinstance(one, float) for one in value):

@@ -90,10 +90,25 @@ class Campaign:
                 if len(paths) == 1 and (path := paths.pop()) is not None}
 
     def continued(self, chapter: Chapter, answer: Answer) -> Chapter | None:
-        """Return the later chapter of the command that an answer names as the next step."""
+        """Return the later chapter of the command that an answer names as the next step.
+
+        A command that names files which ``chapter`` has written is that of results with these
+        files only: a map that was there before blocks were sorted is not of the sorted blocks.
+        """
         verb = re.match("halbach-fe ([a-z-]+)", answer.command)
         later = self.chapters[self.chapters.index(chapter) + 1:]
-        return next((one for one in later if verb and one.verb == verb[1]), None)
+        names = {PurePath(word.strip("'")).name for word in answer.command.split() if "/" in word}
+        own = names & {PurePath(name).name for name in chapter.record.files}
+        return next((one for one in later if verb and one.verb == verb[1] and (
+            not own or one.uses(chapter))), None)
+
+    def done_before(self, chapter: Chapter, answer: Answer) -> Chapter | None:
+        """Return an earlier chapter of the command of an answer, if it read what this one did."""
+        verb = re.match("halbach-fe ([a-z-]+)", answer.command)
+        return next((one for one in self.chapters[:self.chapters.index(chapter)]
+                     if verb and verb[1] == one.verb != chapter.verb
+                     and set(chapter.record.inputs.values()) <= set(one.record.inputs.values())),
+                    None)
 
     def replaced(self, chapter: Chapter) -> Chapter | None:
         """Return a later chapter of the same command, whose answers may all be used."""
@@ -143,12 +158,18 @@ class Campaign:
         It is that of an answer which may not be used; or else of the last one about the measured
         magnet, if there is any. Its command names the folder of that answer.
         """
-        left = [(chapter, answer.with_paths({"DIR": chapter.folder}))
+        left = [(chapter, self._unless_done(chapter, answer.with_paths({"DIR": chapter.folder})))
                 for chapter, _, answer in self.answered if self.continued(chapter, answer) is None]
         unsound = [self._with_what_was_found(chapter, answer) for chapter, answer in left
                    if not answer.sound and self.replaced(chapter) is None]
         measured = [answer for chapter, answer in reversed(left) if chapter.verb in OF_MEASURED]
         return next(iter([*unsound, *measured, *(answer for _, answer in reversed(left))]), None)
+
+    def _unless_done(self, chapter: Chapter, answer: Answer) -> Answer:
+        """Return an answer without the command that an earlier chapter has run already."""
+        earlier = self.done_before(chapter, answer)
+        return answer if earlier is None else replace(
+            answer, step=f"{answer.step} See folder {earlier.label} for that.", command="")
 
     def _with_what_was_found(self, chapter: Chapter, answer: Answer) -> Answer:
         """Return the next step of an answer that may not be used.
@@ -285,6 +306,8 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
     for number, (chapter, page) in enumerate(pages, 1):
         answer, rows = page.said.answer and _with_folder(page.said.answer, chapter), page.said.rows
         later = campaign.continued(chapter, answer) if answer else None
+        earlier = campaign.done_before(chapter, answer) if answer and not later else None
+        done = later or earlier
         files = {name: _link(chapter.folder / name, output) for name in chapter.record.files
                  if (chapter.folder / name).exists()}
         of = (f"{other.label}/{name}" for other in campaign.chapters
@@ -294,7 +317,9 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
             "name": _shown(PurePath(chapter.label) / PurePath(page.path).parent),
             "of": _shown(next(of, "")),
             "command": chapter.record.command, "ended": _date(chapter.record.ended),
-            "answer": answer, "next": later and first[later.label], "picture": page.picture,
+            "answer": answer, "next": done and first[done.label],
+            "where": "above" if earlier else "below",
+            "picture": page.picture,
             "rows": rows[:MOST_ROWS], "all_rows": len(rows), "page": files.get(page.path),
             "files": {_shown(name): address for name, address in files.items()}})
     return found

@@ -101,7 +101,8 @@ def _as_large(found: Forces, worst: int) -> str:
 def _mass(found: Forces) -> str:
     """Return mass and price of all blocks in words."""
     words = f"The blocks weigh {found.mass_kg.sum():.4g} kg"
-    return words + ("." if found.cost is None else f" and cost {found.cost:.4g}.")
+    return words + ("." if found.cost is None else f" and cost {found.cost:.4g} in the currency "
+                    f"of the price, at {found.price_per_kg:g} per kg.")
 
 
 def _newton(size: float) -> str:
@@ -209,6 +210,12 @@ def forces_figure(found: Forces) -> Figure:
     return figure
 
 
+def round_below(size: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that a number reaches."""
+    power = 10.0 ** np.floor(np.log10(size))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= size))
+
+
 def _draw_ring(axis: Axes, found: Forces) -> None:
     """Draw the blocks of the ring with the largest force, coloured, with arrows of their forces."""
     size = found.in_place.magnitude
@@ -239,8 +246,9 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
         arrows = 0.35 * float(np.abs(middles).max() or 1.0) * flat / longest
         drawn = axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1,
                             color=PRIOR, width=0.005, edgecolor=MEASURED, lw=0.3)
-        axis.quiverkey(drawn, 0.2, 0.04, float(np.linalg.norm(arrows, axis=1).max()),
-                       _newton(longest), labelpos="E", coordinates="axes",
+        shown = round_below(longest)
+        axis.quiverkey(drawn, 0.2, 0.04, shown / longest * float(
+            np.linalg.norm(arrows, axis=1).max()), _newton(shown), labelpos="E", coordinates="axes",
                        fontproperties={"size": SMALL})
     axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N",
                          location="bottom", shrink=0.6)

@@ -68,10 +68,12 @@ def answer(found: HomogeneityResult) -> Answer:
     """Say how homogeneous the field of the best known magnet is, and what to do next."""
     name, best = list(found.by_name.items())[-1]
     question = f"How homogeneous is the field in {found.model.region.text}?"
-    text = (f"The mean of |B| is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
-            f"rms and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
-    text += _of_map(found)
     low, middle, high = map(ppm, best.rms_range_ppm)
+    likely = "" if name == "prior" or _cancels(best) or found.disagreement else (
+        f" (95 %: {low} to {high})")
+    text = (f"The mean of |B| is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
+            f"rms{likely} and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
+    text += _of_map(found)
     if _cancels(best):
         return Answer(
             question, f"{text}.", "Only as a property of |B|: the mean of the vector B over this "
@@ -82,7 +84,7 @@ def answer(found: HomogeneityResult) -> Answer:
         return of_a_conflict(question, f"{text}.", found.disagreement)
     if name != "prior":
         return Answer(
-            question, f"{text} (with a probability of 95 %, {low} to {high} ppm rms).",
+            question, f"{text}.",
             f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
             "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
@@ -104,7 +106,7 @@ def _of_map(found: HomogeneityResult) -> str:
     if found.map_misfit > POOR:
         return ""
     return (f"; the readings themselves{' that were held out' if name == HELD_OUT_PART else ''} "
-            f"have {ppm(known.rms_ppm)} ppm rms ({low} to {high})")
+            f"have {ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high})")
 
 
 def _misfit(found: HomogeneityResult) -> str:
@@ -141,9 +143,10 @@ def direction_in_words(unit: Floats, sd_rad: float) -> str:
     """
     main = int(np.argmax(np.abs(unit)))
     off = float(np.arctan2(np.linalg.norm(np.delete(unit, main)), abs(unit[main])))
-    angle = "" if off <= LEAST_OF_SD * sd_rad else f", {decimals(1e3 * off)}\u00a0mrad off it,"
-    return (f"along {'-' if unit[main] < 0 else '+'}{'xyz'[main]}{angle} ± "
-            f"{decimals(1e3 * sd_rad, 2)}\u00a0mrad")
+    axis = f"along {'-' if unit[main] < 0 else '+'}{'xyz'[main]}"
+    if off <= LEAST_OF_SD * sd_rad:
+        return f"{axis} ± {decimals(1e3 * sd_rad, 2)}\u00a0mrad"
+    return f"{axis}, {with_error(1e3 * off, 1e3 * sd_rad)}\u00a0mrad off it"
 
 
 def _cancels(known: Homogeneity) -> bool:
@@ -156,8 +159,8 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
     rows = []
     for name, known in by_name.items():
         ranges = {
-            "rms, 95 % of magnets in ppm": known.rms_range_ppm,
-            "peak to peak, 95 % of magnets in ppm": known.peak_to_peak_range_ppm}
+            "rms, 95 % range in ppm": known.rms_range_ppm,
+            "peak to peak, 95 % range in ppm": known.peak_to_peak_range_ppm}
         rows.append({
             "magnet": name, "mean of |B|": _field(known),
             "direction of the mean B": "none: it cancels"
@@ -183,10 +186,18 @@ def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
         for name, known in shown.items():
             term = known.harmonics[number]
             value = term.ppm if abs(term.ppm) > LEAST_OF_SD * term.sd_ppm else 0.0
-            sign = "+" if value > 0 else ""
-            row[f"{name} in ppm"] = f"{sign}{ppm(value)} ± {ppm(term.sd_ppm)}"
+            row[f"{name} in ppm"] = _ppm_with_sd(value, term.sd_ppm)
         rows.append(row)
     return rows
+
+
+def _ppm_with_sd(value: float, sd: float) -> str:
+    """Return a number of ppm with its sign and standard deviation, both to the same digit."""
+    places = 0 if sd >= 10 or not sd else int(np.clip(1 - np.floor(np.log10(sd)), 0, 3))
+    rounded, spread = (f"{size:,.{places}f}".replace(",", "\u202f")
+                       for size in (abs(value), sd))
+    sign = "" if not float(f"{value:.{places}f}") else "+" if value > 0 else "-"
+    return f"{sign}{rounded} ± {spread}"
 
 
 def plain_homogeneity(known: Homogeneity) -> dict[str, object]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.inference.result import TRAINING, InferenceResult
+from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
@@ -51,9 +51,10 @@ def score_table(result: InferenceResult,
     for score in result.scores:
         row = {
             "region": score.region,
-            "readings": f"{score.readings} {score.part}".replace(" ", "\u00a0"),
-            "before, rms": flux_density(score.rms_error_prior_T),
-            "after, rms": flux_density(score.rms_error_posterior_T),
+            "readings": f"{score.readings} {'of ' * (score.part == HELD_OUT_MAP)}{score.part}"
+            .replace(" ", "\u00a0"),
+            "before, rms": flux_density(score.rms_error_prior_T, zeros=True),
+            "after, rms": flux_density(score.rms_error_posterior_T, zeros=True),
             "after, of the largest reading": relative(score.rms_error_posterior_T / largest)
             if largest else NOTHING,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
@@ -72,7 +73,8 @@ def score_table(result: InferenceResult,
                 float(np.median(published.posterior[inside])))
         rows.append(row)
     if not alone:
-        off = [flux_density(float(np.sqrt(np.mean((result.readings - each.mean)[training] ** 2))))
+        off = [flux_density(float(np.sqrt(np.mean(
+            (result.readings - each.mean)[training] ** 2))), zeros=True)
                for each in (result.prediction_prior, result.prediction_posterior)]
         together = {"region": "together", "readings": f"{training.sum()} {TRAINING}".replace(
             " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],

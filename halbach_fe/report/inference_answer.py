@@ -45,8 +45,8 @@ def _prediction(result: InferenceResult) -> str:
     before, after = (_rms((result.readings - each.mean)[chosen])
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
-        return (f"The updated magnet differs from the readings by {flux_density(after)} rms, "
-                f"before the update {_before(result)} differed by {flux_density(before)}.")
+        return (f"The updated magnet differs from the readings by {_field(after)} rms, "
+                f"before the update {_before(result)} differed by {_field(before)}.")
     expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
     bands = [(score.readings, score.coverage95_posterior) for score in result.scores
              if score.part == part and score.coverage95_posterior is not None]
@@ -54,9 +54,9 @@ def _prediction(result: InferenceResult) -> str:
     of = ("readings of the held-out map" if part == HELD_OUT_MAP
           else "readings that were held out")
     return (f"The updated magnet predicts {chosen.sum()} {of} to "
-            f"{flux_density(after)} rms, where its error bars and the noise allow "
-            f"{flux_density(_rms(expected))}; before the update, {_before(result)} was "
-            f"{flux_density(before)} off. "
+            f"{_field(after)} rms, where its error bars and the noise allow "
+            f"{_field(_rms(expected))}; before the update, {_before(result)} was "
+            f"{_field(before)} off. "
             f"The 95 % band holds {fraction(held)} of them.")
 
 
@@ -85,6 +85,11 @@ def _blocks(result: InferenceResult) -> str:
                 f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")
     return (f"{start} by {'+' if mean[worst] > 0 else ''}"
             f"{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
+
+
+def _field(size: float) -> str:
+    """Return a flux density in T as the table of the page has it."""
+    return flux_density(size, zeros=True)
 
 
 def _rms(values: Floats) -> float:

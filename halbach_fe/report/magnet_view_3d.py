@@ -34,6 +34,9 @@ relative to the arrow."""
 FLAT = 0.2
 """Drawn height of a two-dimensional magnet relative to its outer radius."""
 
+LEGEND = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"}
+"""Place of the names: below the picture, where they hide nothing at any width."""
+
 MOST_POINTS = 10_000
 """Largest number of points of a field map that are drawn; more would make the page slow."""
 
@@ -254,7 +257,7 @@ def magnet_view(
     figure.add_trace(cut_trace(magnet))
     _to_mm(figure)
     figure.update_layout(
-        height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"x": 0, "y": 1},
+        height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend=LEGEND,
         scene={"aspectmode": "data",
                **{f"{axis}axis": {"title": {"text": f"{axis} in mm"}, "nticks": 6}
                   for axis in "xyz"},

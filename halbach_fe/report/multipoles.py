@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
@@ -162,11 +163,25 @@ def answer(
         "halbach-fe shim STUDY --measurements MAP -o DIR")
 
 
+def multipole_rows(magnets: Mapping[str, Multipoles]) -> list[dict[str, str]]:
+    """Return the rows of `text_table`, with |c_n| of the last magnet, which the answer states."""
+    name, known = list(magnets.items())[-1]
+    rows = text_table(**magnets)
+    return [row | {f"|c_n| {name}": (
+        "main" if "main" in row.values() else with_error(float(size), float(sd)))}
+            for row, size, sd in zip(rows, known.sizes, _size_sd(known), strict=True)]
+
+
+def _size_sd(known: Multipoles) -> Floats:
+    """Return standard deviations (k,) of |c_n| in units: rms over normal and skew part."""
+    return np.asarray(np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2))
+
+
 def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     """Describe the last magnet of a table, which is the best known of them, in sentences."""
     model, magnets = table
     known = list(magnets.values())[-1]
-    spread = np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2)
+    spread = _size_sd(known)
     worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
     sd = float(spread[worst])
     where = "" if alone else (
@@ -209,8 +224,8 @@ def write_multipoles(
             "skew (right); bars are two standard deviations")
         for model, magnets in tables}, folder)
     parts = [{"title": _location(model), "reference": reference_text(model),
-              "rows": text_table(**magnets), "picture": picture}
+              "rows": multipole_rows(magnets), "picture": picture}
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
                provenance=provenance, answer=answer(tables, limit, disagreement), parts=parts,
-               rows=text_table(**tables[0][1]))
+               rows=multipole_rows(tables[0][1]))

@@ -27,7 +27,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, inputs_of_command
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
 from halbach_fe.study.model import Study, is_nonlinear
 
@@ -83,8 +83,8 @@ def write_page(
 ) -> None:
     """Write a self-contained HTML page from a template of this folder, and page.json beside it.
 
-    The page ends with its provenance: the entries of ``provenance``, the versions of the programs,
-    and the text of the study file as it was read.
+    The page ends with its provenance: the entries of ``provenance``, the files that the command has
+    read, the versions of the programs, and the text of the study file as it was read.
 
     Parameters
     ----------
@@ -103,7 +103,10 @@ def write_page(
     **data
         Variables of the template.
     """
-    provenance = {**(provenance or {}), "programs": programs()}
+    given = dict(provenance or {})
+    read = {name: file for name, file in inputs_of_command().items()
+            if file not in given.values()}
+    provenance = {**given, **read, "programs": programs()}
     text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
                     answer=answer and answer.with_known_paths(), **data)
     write_text(path, text)
@@ -237,6 +240,19 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
             axis.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=IRON, lw=0.8))
 
 
+def _inner_radii(magnet: Magnet) -> list[float]:
+    """Return the smallest distance in m of every ring's blocks from the z axis.
+
+    Of a block with flat sides that is the distance of an edge, which no corner has.
+    """
+    t, found = np.linspace(0, 1, 33), dict[int, float]()
+    for block in magnet.blocks:
+        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
+        x, y, _ = block.from_frame(np.column_stack([edges, 0 * edges[:, 0]])).T
+        found[block.ring] = min(float(np.hypot(x, y).min()), found.get(block.ring, np.inf))
+    return list(found.values())
+
+
 def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
     """Draw the positions of readings in the cross-section of the magnet.
 
@@ -257,10 +273,11 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
     for axis in right:
         axis.set(xlabel="z in mm", ylabel="distance from the axis in mm")
         axis.grid(alpha=0.3)
-        for z_limits, radii in magnet.ring_sections:
+        for (z_limits, (_, outer)), inner in zip(
+                magnet.ring_sections, _inner_radii(magnet), strict=True):
             axis.add_patch(Rectangle(
-                (1e3 * z_limits[0], 1e3 * radii[0]), 1e3 * (z_limits[1] - z_limits[0]),
-                1e3 * (radii[1] - radii[0]), fill=False, color="#777777", lw=0.6))
+                (1e3 * z_limits[0], 1e3 * inner), 1e3 * (z_limits[1] - z_limits[0]),
+                1e3 * (outer - inner), fill=False, color="#777777", lw=0.6))
     for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                             (others, "x", PRIOR, "held out")):
         if positions is None:

@@ -67,8 +67,7 @@ def _nearly(plan: MeasurementPlan) -> int:
 
     It is that of the deviation of |B|, or of all patterns of blocks in the geometric mean.
     """
-    left = (np.exp(-plan.gain / len(plan.parameters)) if plan.deviation is None
-            else plan.deviation.planned)
+    left = _pattern_sd(plan, plan.gain) if plan.deviation is None else plan.deviation.planned
     return int(np.argmax(left <= NEARLY * left[-1])) + 1
 
 
@@ -85,8 +84,9 @@ def answer(plan: MeasurementPlan) -> Answer:
     points, same = len(plan.points), plan.same_information
     said = f"At the {counted(points, 'position')} of plan.csv. "
     if plan.deviation is None:
-        said += (f"They leave {fraction(left)} of the blocks' prior uncertainty, as many of the "
-                 f"study's positions {fraction(of_study)}. ")
+        said += ("With them the standard deviation of a block's magnetization falls to "
+                 f"{fraction(left)} of the prior's, with as many of the study's positions to "
+                 f"{fraction(of_study)}. ")
     else:
         said += (f"At a point of {plan.deviation.region.text}, the deviation of |B| from its mean "
                  f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms, after as many of "
@@ -95,21 +95,25 @@ def answer(plan: MeasurementPlan) -> Answer:
     everything = points == len(plan.candidates)
     if everything:
         said += ("These are all the candidates, so that the plan only orders "
-                 f"them. The first {_nearly(plan)} leave at most {NEARLY:g} times the uncertainty "
-                 "of all.")
+                 f"them. With the first {_nearly(plan)}, {_what_is_left(plan)} is at most "
+                 f"{NEARLY:g} times that with all of them.")
     else:
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else
-                 f"All {len(plan.baseline)} positions of the study together tell more: plan more "
-                 "points for that.")
+                 f"All {len(plan.baseline)} positions of the study together tell more than these "
+                 f"{points}.")
     return Answer(
         "Where should the magnet be measured?", said,
-        "Yes, as far as the study's prior and noise are right: the readings themselves do not "
-        "matter. Chosen one after another, the positions are nearly the best ones."
+        "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
+        "difference to these numbers. Positions that are chosen one after another, as these are, "
+        "tell nearly as much as the best choice of all at once."
         + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
            else ""),
         "Set plan.points for a shorter plan, or name other places in plan.candidates. Measure "
-        "there, and update the blocks." if everything else "Measure there, and update the blocks.",
+        "there, and update the blocks." if everything else
+        "Measure there, and update the blocks." if same else
+        "Measure there, and update the blocks. Ask for more positions (--points) to learn as much "
+        "as from all of the study's.",
         "halbach-fe infer STUDY --measurements MAP -o DIR")
 
 
@@ -129,38 +133,71 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
             _positions_figure(magnet, plan), "Candidate positions, chosen positions coloured by "
             "the order of choice, and the study's own positions as rings"),
         "plan_information.png": (
-            _pattern_figure(plan), "Uncertainty of all patterns of blocks that remains, in the "
-            "geometric mean, against the number of points, for the plan and for evenly spread "
-            "positions of the study")
+            _pattern_figure(plan), "Standard deviation of a pattern of blocks in per cent of the "
+            "prior's, in the geometric mean over all patterns, against the number of positions, "
+            "for the plan and for evenly spread positions of the study")
         if plan.deviation is None else (
-            _deviation_figure(plan), "Uncertainty of the deviation of |B| in the study's region "
-            "against the number of points, for the plan and for evenly spread positions of the "
-            "study"),
+            _deviation_figure(plan), "Standard deviation of the deviation of |B| in the study's "
+            "region against the number of positions, for the plan and for evenly spread positions "
+            "of the study"),
         "plan_blocks.png": (
-            _block_sd_figure(magnet, plan), "Posterior over prior standard deviation of the "
-            "blocks' magnetizations by slot, for the plan and for equally many positions of the "
+            _block_sd_figure(magnet, plan), "Standard deviation of a block's magnetization in per "
+            "cent of the prior's, by slot, for the plan and for equally many positions of the "
             "study"),
     }, folder)
     write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
-               summary=summary, answer=answer(plan), rows=plan_table(plan))
+               summary=summary, answer=answer(plan), rows=plan_table(plan),
+               chosen=chosen_table(plan))
+
+
+def chosen_table(plan: MeasurementPlan) -> list[dict[str, str]]:
+    """Return rows of text with the chosen positions in mm, in the order of choice.
+
+    The last column is what is left after a position and all before it.
+    """
+    left, title = ((100 * _pattern_sd(plan, plan.gain), "sd of a pattern in % of the prior's")
+                   if plan.deviation is None
+                   else (plan.deviation.planned, "sd of the deviation of |B| in ppm rms"))
+    millimetres = (1e3 * plan.points).round(3) + 0.0  # without a sign where it is 0
+    return [{"order": str(number), "x in mm": f"{x:.3f}", "y in mm": f"{y:.3f}",
+             "z in mm": f"{z:.3f}", title: f"{after:.1f}" if plan.deviation is None else ppm(after)}
+            for number, ((x, y, z), after) in enumerate(
+                zip(millimetres.tolist(), left.tolist(), strict=True), start=1)]
+
+
+def _pattern_sd(plan: MeasurementPlan, gain: Floats) -> Floats:
+    """Return the sd of a pattern of blocks relative to the prior's, of information in nats.
+
+    It is the geometric mean over all patterns, which are the principal axes of the posterior.
+    """
+    return np.asarray(np.exp(-gain / len(plan.parameters)))
+
+
+def _what_is_left(plan: MeasurementPlan) -> str:
+    """Return in words by what `_nearly` counts positions."""
+    return ("the standard deviation of a pattern of blocks (geometric mean over all patterns)"
+            if plan.deviation is None else "the standard deviation of this deviation")
 
 
 def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
     """Return rows of text that compare the plan with the positions of the study."""
     prior, same = _rms(plan.prior_sd), plan.same_information
+    count = min(len(plan.points), len(plan.baseline))
+    patterns = _pattern_sd(plan, np.array([
+        plan.gain[-1], plan.baseline_gain[np.searchsorted(plan.baseline_counts, count)]]))
     return [
         {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
         {"": "positions that tell as much as all of the study's",
          "plan": str(same) if same else str(len(plan.points)) if _is_the_study(plan)
          else f"more than {len(plan.points)}",
          "the study's": str(len(plan.baseline))},
-        {"": "uncertainty that remains of a block, with equally many positions",
+        {"": "sd of a block's magnetization, relative to the prior's (rms over the blocks)*",
          "plan": fraction(_rms(plan.planned_sd) / prior),
          "the study's": fraction(_rms(plan.baseline_sd) / prior)},
-        {"": "mean uncertainty of all patterns of blocks, with equally many", "plan":
-         f"{fraction(plan.volume_ratio)} of the study's", "the study's": ""},
+        {"": "sd of a pattern of blocks, relative to the prior's (geometric mean over all "
+         "patterns)*", "plan": fraction(patterns[0]), "the study's": fraction(patterns[1])},
         *([] if plan.deviation is None else [
-            {"": "uncertainty of the deviation of |B| in ppm rms, with equally many",
+            {"": "sd of the deviation of |B| in ppm rms*",
              "plan": ppm(plan.deviation.planned[-1]), "the study's": ppm(_of_study(plan))}])]
 
 
@@ -212,10 +249,10 @@ def _draw_points(
 
 
 def _pattern_figure(plan: MeasurementPlan) -> Figure:
-    """Draw the geometric mean over all patterns of blocks of the uncertainty that remains."""
+    """Draw the geometric mean over all patterns of blocks of the sd after the readings."""
     def left(gain: Floats) -> Floats:
         """Return that mean in per cent of the prior's, of information in nats."""
-        return np.asarray(100 * np.exp(-gain / len(plan.parameters)))
+        return 100 * _pattern_sd(plan, gain)
 
     figure = figure_of(4)
     axis = figure.subplots()
@@ -224,7 +261,7 @@ def _pattern_figure(plan: MeasurementPlan) -> Figure:
               label="as many positions of the study, evenly spread")
     axis.axhline(left(plan.baseline_gain)[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
-    axis.set(xlabel="points", ylabel="uncertainty that remains in %", xlim=(0, None),
+    axis.set(xlabel="positions", ylabel="sd of a pattern in % of the prior's", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
@@ -242,7 +279,7 @@ def _deviation_figure(plan: MeasurementPlan) -> Figure:
               label="as many positions of the study, evenly spread")
     axis.axhline(plan.deviation.baseline[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
-    axis.set(xlabel="points", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
+    axis.set(xlabel="positions", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
              yscale="log")
     label_logarithmic(axis.yaxis)
     axis.grid(alpha=0.3)
@@ -268,7 +305,7 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
                                     ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
         axis.bar(places + shift, 100 * by_slot(sd) / before, 0.4, color=colour, label=name)
-    axis.set(xlabel="slot", ylabel="uncertainty that remains in %", ylim=(0, None))
+    axis.set(xlabel="slot", ylabel="sd of a block in % of the prior's", ylim=(0, None))
     axis.set_xticks(places[::max(1, len(places) // 16)])
     figure.legend(loc="outside upper center", ncols=2)
     return figure

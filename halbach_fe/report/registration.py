@@ -11,8 +11,10 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import ProbePrior, Registration
-from halbach_fe.inference.registration import axes_of_map, odds, turn_from_axes
+from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
@@ -40,6 +42,24 @@ EQUALLY_GOOD = 0.05
 """Odds from which a second pose is reported as a possible one."""
 
 
+SAME_FIT = 0.01
+"""Difference of residuals, relative to them, up to which two poses are equally far from the
+readings. The fits of a symmetric magnet's two poses ended within 1e-5 of each other."""
+
+SAME_PLACE = 4.0
+"""Distance in standard deviations up to which two poses are the same place but for a symmetry."""
+
+SAME_M, SAME_T = 1e-7, 1e-7
+"""Distance of corners in m, and difference of remanences in T, up to which blocks are equal: more
+than the rounding of any study, and less than any deviation that is given."""
+
+AT_REST = "Yes, the map can be used in this pose."
+NOT_AT_REST = (
+    "No, do not use the map in this pose yet. The search for the best fit has not come to rest: it "
+    "ended while place and turns still changed from step to step, so that the best pose may be "
+    "farther away than the error bars say.")
+
+
 NOMINAL = "nominal magnet"
 UPDATED = "magnet as the maps before have updated it"
 """What the readings are compared with before they update the blocks."""
@@ -50,27 +70,19 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
 
     ``name`` is that of a map that the study lists, so that no option has to say which it is.
     """
-    best, probability = found[0], odds(found)
+    best = found[0]
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
                       axes_of_map(best.instrument).items())
     place = ", ".join(with_error(1e3 * value, 1e3 * sd) for value, sd in zip(
         best.middle_m, best.translation_sd_m, strict=True))
     said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
             "magnet.")
-    trust = []
-    others = [100 * value for value in probability[1:] if value > EQUALLY_GOOD]
-    if others:
-        trust.append(
-            "Only up to a symmetry: the magnet looks the same from "
-            f"{counted(len(others), 'other pose')}, with a probability of "
-            f"{', '.join(f'{value:.0f}' for value in others)} % beside "
-            f"{100 * probability[0]:.0f} % of this one.")
-    if not best.at_rest:
-        trust.append("The fit has not come to rest: its error bars may be too small.")
-    trust.append(_fit(best, before))
+    trust = [*_other_poses(found), _fit(best, before)]
     sound = best.explains and best.at_rest
     maps = "" if name else " --measurements MAP"
-    if not best.explains:
+    if best.explains:
+        trust.insert(0, AT_REST if best.at_rest else NOT_AT_REST)
+    else:
         said = ("This magnet does not explain the map. The least bad answer: "
                 f"{said[0].lower()}{said[1:]}")
         trust.insert(0, (
@@ -82,8 +94,97 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
         " ".join(trust), *(
             ("Update the blocks with the map in this pose.",
              f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR") if sound else
+            ("Do not update the blocks in this pose. Measure lines beside this one, or the "
+             "components of B that are missing, or narrow the search by what is known of the place "
+             "(--across-m, --turn-rad), and register again.",
+             f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
+            if best.explains else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound)
+
+
+def _other_poses(found: Sequence[Registration]) -> list[str]:
+    """Say which other poses are possible, and whether it matters which of them is used."""
+    probability, said = odds(found), []
+    alike, unlike = [], []
+    for each, value in zip(found[1:], probability[1:], strict=True):
+        if value > EQUALLY_GOOD:
+            if _fit_alike(found[0], each):
+                alike.append(each)
+            else:
+                unlike.append(f"{100 * value:.0f}")
+    others, one = counted(len(alike), "other pose"), len(alike) == 1
+    if alike and all(is_symmetric_to(found[0], each) for each in alike):
+        said.append(
+            f"{others} {'predicts' if one else 'predict'} the same readings, because the nominal "
+            "magnet is the same after the turn from one pose to the other: no reading can tell "
+            "them apart. The field that infer finds at the places of the map is the same in all "
+            "of them, so that any may be used. Only the names of blocks are exchanged, which "
+            "matters if you look for one block or give measured blocks (--blocks): then find out "
+            "by a mark on the magnet which pose is the real one.")
+    elif alike:
+        said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
+                    "how the map was measured which one is real.")
+    if unlike:
+        said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out, with a probability "
+                    f"of {', '.join(unlike)} % beside {100 * probability[0]:.0f} % of this one.")
+    return said
+
+
+def _fit_alike(one: Registration, other: Registration) -> bool:
+    """Tell whether two poses are equally probable, and equally far from the readings."""
+    return abs(one.log_evidence - other.log_evidence) < EQUAL_LOG_EVIDENCE and all(
+        np.isclose(np.nanmean(first**2), np.nanmean(second**2), rtol=2 * SAME_FIT)
+        for first, second in ((one.rms_T, other.rms_T), (one.nominal_rms_T, other.nominal_rms_T)))
+
+
+def is_symmetric_to(one: Registration, other: Registration) -> bool:
+    """Tell whether the turn from one pose to another puts every nominal block onto an equal one.
+
+    Such poses predict the same readings, before and after an update. Magnets with permeable bodies
+    or with blocks of uneven magnetization are never said to be symmetric.
+    """
+    magnet = build_magnet(one.study)
+    blocks = magnet.blocks
+    if magnet.iron or magnet.dimension == 2 or any(
+            block.gradient or block.corner_loss for block in blocks):
+        return False
+    first, second = (_axes(each) for each in (one, other))
+    turn = second @ first.T
+    off = np.abs(other.middle_m - turn @ one.middle_m)
+    if (off > SAME_PLACE * np.hypot(np.abs(turn) @ one.translation_sd_m,
+                                    other.translation_sd_m)).any():
+        return False
+    corners = [_corners(block) for block in blocks]
+    moments = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    middles = np.array([each.mean(axis=0) for each in corners])
+    for number, block in enumerate(blocks):
+        there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
+        apart = np.linalg.norm((corners[number] @ turn.T)[:, None] - corners[there], axis=2)
+        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > SAME_M
+                or np.abs(turn @ moments[number] - moments[there]).max() > SAME_T
+                or _permeabilities(block) != _permeabilities(blocks[there])):
+            return False
+    return True
+
+
+def _axes(one: Registration) -> np.ndarray:
+    """Return the rotation by right angles (3, 3) that is nearest to the map's axes."""
+    matrix = np.zeros((3, 3))
+    for number, axis in enumerate(axes_of_map(one.instrument).values()):
+        matrix[COMPONENTS.index(axis[-1]), number] = -1.0 if axis.startswith("-") else 1.0
+    return matrix
+
+
+def _corners(block: MagnetBlock) -> np.ndarray:
+    """Return the corners (n, 3) of a block in m."""
+    return block.from_frame(np.array([
+        (*edge.start, z) for edge in block.outline for z in (block.z_min, block.z_max)]))
+
+
+def _permeabilities(block: MagnetBlock) -> tuple[float, float]:
+    """Return the relative permeabilities of a block."""
+    return block.recoil_permeability, block.recoil_permeability_across
 
 
 def _fit(best: Registration, before: str) -> str:

@@ -46,15 +46,22 @@ def answer(found: Designed) -> Answer:
     if stronger:
         text.append(f"{1e3 * stronger[0].mean_T:.4g} mT are possible with "
                     f"{ppm(stronger[0].peak_to_peak_ppm)} ppm peak to peak.")
+    least = smallest(found)
     return Answer(
         f"Which rings make a homogeneous field in {region}?", " ".join(text),
-        ("Yes, as the best that the search found, which does not prove that there is no better "
-         "one. These are blocks as ordered: their tolerances leave more.")
+        (f"Yes, as the design of the {least} that the search found, which does not prove that "
+         "there is no better one. These are blocks as ordered: their tolerances leave more.")
         if found.reached else "No. What was asked for is excluded by the limits of [design].",
         "See what the tolerances of the blocks leave of it." if found.reached else
         "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
         f"halbach-fe {'homogeneity DIR/' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
         found.reached)
+
+
+def smallest(found: Designed) -> str:
+    """Return in words what makes a design the best one: the objective of the study's [design]."""
+    rms = found.study.design is not None and found.study.design.objective == "rms"
+    return "smallest rms" if rms else "smallest peak to peak"
 
 
 def _count(design: RingDesign) -> str:
@@ -67,7 +74,8 @@ def _count(design: RingDesign) -> str:
 def design_rows(found: Designed) -> list[dict[str, str]]:
     """Return a row of text for every design, by its field."""
     return [{
-        "design": "best" if one is found.best else "", "mean field": f"{1e3 * one.mean_T:.5g} mT",
+        "design": f"best: {smallest(found)}" if one is found.best else "",
+        "mean field": f"{1e3 * one.mean_T:.5g} mT",
         "peak to peak in ppm": ppm(one.peak_to_peak_ppm), "rms in ppm": ppm(one.rms_ppm),
         "blocks": str(one.blocks), "mass": f"{one.mass_kg:.4g} kg"} for one in found.front]
 
@@ -118,7 +126,7 @@ def front_figure(found: Designed) -> Figure:
               label="peak to peak")
     axis.plot(field, [one.rms_ppm for one in found.front], "s--", color=PUBLISHED, label="rms")
     axis.plot(1e3 * found.best.mean_T, found.best.peak_to_peak_ppm, "o", ms=11, color=POSTERIOR,
-              label="the best design")
+              label=f"the best design ({smallest(found)})")
     axis.set(xlabel="mean field in mT", ylabel="deviation in ppm", yscale="log")
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))  # others would touch each other
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
@@ -176,12 +184,14 @@ def write_design(
     with atomic(folder / "rings.csv") as temporary:
         write_csv(columns(found), {"study": found.study.name}, temporary)
     pictures = save({
-        "rings.png": (side_figure(found), "The rings of the best design from the side, with their "
-                      "numbers of blocks, and the region whose field is to be homogeneous"),
+        "rings.png": (side_figure(found), f"The rings of the best design ({smallest(found)}) from "
+                      "the side, with their numbers of blocks, and the region whose field is to be "
+                      "homogeneous"),
         "slices.png": (slices_figure(found.slices, found.best.mean_T),
                        "Deviation of |B| from its mean, in planes through the region's centre"),
         "front.png": (front_figure(found), "What more field costs: designs of larger fields")},
         folder)
     write_page(folder / "design.html", "design.html.j2", pictures, study=found.study,
                provenance=provenance, answer=answer(found), rows=design_rows(found),
-               rings=ring_rows(found), sizes=SIZES, settings=found.study.design)
+               rings=ring_rows(found), sizes=SIZES, smallest=smallest(found),
+               settings=found.study.design)

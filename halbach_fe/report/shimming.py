@@ -30,6 +30,7 @@ from halbach_fe.report.page import (
     SMALL,
     draw_cross_section,
     figure_of,
+    legend_above,
     own_style,
     save,
     write_page,
@@ -41,6 +42,10 @@ from halbach_fe.study.edit_file import write_edited
 
 LITTLE = 0.05
 """Part of the rms below which the gain of all moves together is called hardly worth the work."""
+
+DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
+            "turn": "block that is turned in place", "replace": "block that is replaced"}
+"""Names of the kinds of moves in the picture of all moves."""
 
 
 def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
@@ -65,6 +70,27 @@ def _content(shim: Shim) -> dict[str, object]:
     unit = shim.model.unit
     return {"reference": reference_summary(shim.model, shim.limit),
             "before": plain(shim.before, unit), "after": plain(shim.after, unit)}
+
+
+def move_title(shim: Shim, result: InferenceResult) -> str:
+    """Return the title of `move_table`, which does not ask for moves that the answer is against."""
+    return "Moves that would be made" if reason_against(shim, result) else "Moves"
+
+
+def reason_against(shim: Shim, result: InferenceResult) -> str:
+    """Say why the moves should not be made as they are listed; empty if they should."""
+    if result.disagreement:
+        return ("Do not make these moves yet: they follow from an update that disagrees with its "
+                "map. They are listed as what would be done if it were right.")
+    if _gained(shim) < LITTLE:
+        return ("These moves are hardly worth the work: they are listed as what would be done for "
+                "so small a gain.")
+    return ""
+
+
+def _gained(shim: Shim) -> float:
+    """Return by which part of itself the moves lower the rms."""
+    return 1 - shim.after.rms / shim.before.rms
 
 
 def _unit(shim: Shim) -> str:
@@ -162,10 +188,9 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
     if shim.steps:
         said = (f"{counted(len(shim.steps), 'move')}: {what} expected to fall from {before} to "
                 f"{after} {unit}, including the uncertainty.")
-        gained = 1 - shim.after.rms / shim.before.rms
-        if gained < LITTLE:
-            said += (f" That is {100 * gained:.2g} % for {counted(len(shim.steps), 'move')}: "
-                     "hardly worth the work.")
+        if _gained(shim) < LITTLE:
+            said += (f" That is {100 * _gained(shim):.2g} % for "
+                     f"{counted(len(shim.steps), 'move')}: hardly worth the work.")
     else:
         said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
                 "uncertainty.")
@@ -179,10 +204,13 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",
                       "Find out what the study lacks before any block is moved.",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
+    make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
+            if shim.shimmed_study else "Make the moves in their order, and measure again.")
+    if reason_against(shim, result):
+        make = f"Leave the magnet as it is. If the gain is worth the work after all: {make}"
     return Answer(
         question, said, f"Yes. Model and map agree. {ended}", *(
-            ("Make the moves in their order, measure again, and update study.shimmed.toml."
-             if shim.shimmed_study else "Make the moves in their order, and measure again.",
+            (make,
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
@@ -210,14 +238,14 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
     if shim.steps:
         figures |= {
             "shim_moves.png": (
-                _moves_figure(shim), "Moves with their numbers: lines connect blocks that are "
-                "exchanged, circles mark blocks that are turned in place, squares mark blocks that "
-                "are replaced"),
+                _moves_figure(shim),
+                f"{move_title(shim, result)}, with their numbers in the table"),
             "shim_gain.png": (
                 _gain_figure(shim), f"Root mean square of {_values_text(shim)} after each move, "
                 "including the uncertainty")}
     write_page(folder / "shim.html", "shim.html.j2", save(figures, folder), study=shim.study,
                shim=shim, summary=summary, moves=move_table(shim), answer=answer(shim, result),
+               move_title=move_title(shim, result), against=reason_against(shim, result),
                title=table_title(shim), text=_convention(shim), rows=value_table(shim))
 
 
@@ -258,6 +286,7 @@ def _moves_figure(shim: Shim) -> Figure:
     for number, step in enumerate(shim.steps, start=1):
         slots = [placement.to for placement in step.move.placements]
         _draw_move(axis, where[slots], step, str(number))
+    legend_above(figure, axis, columns=4)
     return figure
 
 
@@ -265,10 +294,11 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
     """Draw a move at the slots (1 to 3, 2) where its blocks go."""
     kind = step.move.kind
     if kind in ("swap", "cycle"):
-        axis.plot(*np.vstack([ends, ends[:1]]).T, "-o", color=POSTERIOR, lw=1.2, ms=5)
+        axis.plot(*np.vstack([ends, ends[:1]]).T, "-o", color=POSTERIOR, lw=1.2, ms=5,
+                  label=DRAWN_AS[kind])
     else:
         axis.plot(*ends.T, "o" if kind == "turn" else "s", mfc="none", ms=11, mew=1.8,
-                  color=SECOND if kind == "turn" else PUBLISHED)
+                  color=SECOND if kind == "turn" else PUBLISHED, label=DRAWN_AS[kind])
     for end in ends:
         axis.annotate(label, end, xytext=(6, 6), textcoords="offset points", fontsize=SMALL,
                       fontweight="bold")

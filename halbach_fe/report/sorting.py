@@ -42,8 +42,9 @@ T = TypeVar("T")
 SLOTS_A_ROW = 8
 """Largest number of slots in a row of the table of places."""
 
-QUANTILES = (0.01, 0.5, 0.99)
-"""Quantiles of the rms of random orders that sort.json states."""
+QUANTILES = (0.025, 0.5, 0.975)
+"""Quantiles of the rms of random orders that sort.json states: the outer ones hold 95 % of them, as
+all ranges of the page do."""
 
 
 def sort_summary(found: SortedBlocks, limit: float | None) -> dict[str, object]:
@@ -171,7 +172,7 @@ def answer(found: SortedBlocks) -> Answer:
         question,
         f"As the table of places and blocks.sorted.csv say: {what} then {text(best)} "
         f"{unit}{sizes}, instead of {text(own)} for the blocks {found.own_order}, and {text(low)} "
-        f"to {text(high)} for 98 % of random orders.{left}{turned}",
+        f"to {text(high)} for 95 % of random orders.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} adds {text(spread)} {unit}, whatever the "
         f"order{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks.",
@@ -226,7 +227,8 @@ def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None
 def _convention(found: SortedBlocks) -> str:
     """Return sentences about the table of the page."""
     if isinstance(found.model, DeviationModel):
-        return f"{SIZES} Ranges contain the uncertainty of the measured blocks."
+        return (f"{SIZES} Ranges hold 95 % of the magnets that the uncertainty of the measured "
+                "blocks allows.")
     return (f"{reference_text(found.model)} ± is the standard deviation, including the error of "
             f"the solver. Main multipole of {'the sorted' if _chose(found) else 'these'} blocks: "
             f"{main_in_words(found.model, found.best)}.")

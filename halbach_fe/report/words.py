@@ -11,8 +11,9 @@ from halbach_fe.diagnosis.summary import EMPTY_CELL, block_in_words
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.study.model import Study
 
-SMALL_T, LARGE_T = 1e-4, 1.0
-"""Flux density below which texts and tables give it in µT, and from which they give it in T."""
+SMALL_T, LARGE_T = 1e-3, 1.0
+"""Flux density below which texts and tables give it in µT, and from which they give it in T. A
+residual of 120 µT stands beside one of 5 µT without a change of unit."""
 
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
@@ -32,13 +33,19 @@ BAYES_FACTOR_IN_WORDS = ("The Bayes factor of an effect says how many times as p
                          "readings are with it as without it.")
 
 
-def flux_density(value: float, digits: int = 3) -> str:
-    """Format a flux density in T as mT, or as T or µT if it is large or small."""
+def flux_density(value: float, digits: int = 3, zeros: bool = False) -> str:
+    """Format a flux density in T as mT, or as T or µT if it is large or small.
+
+    With ``zeros`` the last digits are there if they are 0 too, as beside numbers that have them.
+    """
     if np.isnan(value):
         return EMPTY_CELL
     size, unit = ((value, "T") if abs(value) >= LARGE_T else (1e3 * value, "mT")
                   if abs(value) >= SMALL_T or not value else (1e6 * value, "µT"))
-    return f"{decimals(size, digits)}\u00a0{unit}"
+    text = decimals(size, digits)
+    if zeros and text != "0":
+        text = f"{size:#.{digits}g}".rstrip(".") if abs(size) < 10**digits else text
+    return f"{text}\u00a0{unit}"
 
 
 def with_error(value: float, sd: float) -> str:

@@ -246,7 +246,7 @@ def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "model-free floor" in shown
     assert "42.5\u00a0µT" in shown
-    assert "0.15\u00a0mT" in shown
+    assert "150\u00a0µT" in shown
     found = json.loads((out / "diagnosis.json").read_text())
     assert found["floor_T"] == {"Bx": 4.25e-5, "By": 1.5e-4, "Bz": 2e-5}
     assert "model-free floor" in (out / "diagnosis.html").read_text()

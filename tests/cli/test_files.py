@@ -136,6 +136,31 @@ def test_provenance_of_what_was_read(study, measured, tmp_path, monkeypatch, suf
     assert hashlib.sha256(b"changed").hexdigest() not in shown
 
 
+def provenance_of(folder):
+    return json.loads((folder / "page.json").read_text())["provenance"]
+
+
+def test_pages_name_the_maps_that_they_are_of(study, measured, tmp_path):
+    """Each with its SHA-256, also behind a posterior; a copy of one does not know its map."""
+    def said(path):
+        return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+    with_map = [str(study), "--measurements", str(measured)]
+    for verb in ("infer", "shim", "diagnose"):
+        assert main([verb, *with_map, "-o", str(tmp_path / verb), "--json"]) == 0
+        found = provenance_of(tmp_path / verb)
+        assert (found["study file"], found["measurements"]) == (said(study), said(measured))
+    posterior = tmp_path / "infer" / "posterior.h5"
+    copied = tmp_path / "copy.h5"
+    copied.write_bytes(posterior.read_bytes())
+    for file, known in ((posterior, said(measured)), (copied, None)):
+        assert main(["multipoles", str(study), "--posterior", str(file), "-o",
+                     str(tmp_path / "multipoles"), "--json"]) == 0
+        found = provenance_of(tmp_path / "multipoles")
+        assert found["posterior"] == said(file)
+        assert found.get("read for the posterior") == known
+
+
 def test_stale_results_go_even_if_nobody_reads_what_is_printed(tmp_path):
     """A closed pipe ends a run after its files were written."""
     (tmp_path / "study.toml").write_text(STUDY)

@@ -15,6 +15,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.forces import round_below
 from halbach_fe.report.result_files import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
@@ -302,6 +303,12 @@ def test_uncertain_forces_are_said_to_be(tmp_path, monkeypatch):
         found_of(free_blocks([[0, 0, 0, 0, 0, 1.0], [0, 0, SIDE_M, 0, 0, 1.0]]), tmp_path)
 
 
+@pytest.mark.parametrize(("size", "shown"), [
+    (1.22, 1.0), (2.0, 2.0), (4.99, 2.0), (0.0071, 0.005), (12345.0, 10000.0)])
+def test_the_arrow_of_the_key_has_a_round_size(size, shown):
+    assert round_below(size) == pytest.approx(shown)
+
+
 def test_command(tmp_path, capsys):
     path = tmp_path / "study.toml"
     path.write_text(tomlkit.dumps(cuboids.DOCUMENT))
@@ -310,7 +317,7 @@ def test_command(tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert "The largest force is" in said
     assert "(as heavy as" in said
-    assert "and cost" in said
+    assert "in the currency of the price, at 80 per kg" in said
     header, *rows = [line for line in (out / "forces.csv").read_text().splitlines()
                      if not line.startswith("#")]
     assert len(rows) == 36

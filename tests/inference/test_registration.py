@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +25,13 @@ from halbach_fe.inference.registration import (
     turn_from_axes,
 )
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.report.registration import place_table
+from halbach_fe.report.registration import (
+    AT_REST,
+    NOT_AT_REST,
+    answer,
+    is_symmetric_to,
+    place_table,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
@@ -82,6 +89,28 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     value, sd = rows[0]["z in mm"].split("\u00a0±\u00a0")
     assert float(value) == pytest.approx(1e3 * found[0].middle_m[2], abs=float(sd))
     assert float(sd) == pytest.approx(1e3 * found[0].translation_sd_m[2], rel=0.06)  # 2 digits
+    best, other = found[:2]
+    assert is_symmetric_to(best, other)
+    # that they fit alike is pretended here: noise tells the two fits of this map apart
+    twin = replace(other, log_evidence=best.log_evidence, rms_T=best.rms_T,
+                   nominal_rms_T=best.nominal_rms_T)
+    said = answer([best, twin])
+    assert said.trust.startswith(AT_REST)
+    assert "1 other pose predicts the same readings" in said.trust
+    # negative controls: one block is stronger, the other pose is elsewhere, another fit is better
+    uneven = replace(best, study=parse_study(tomllib.loads(
+        TEXT + "\n[[array.exceptions]]\nring = 1\nslot = 2\nremanence_T = 1.25\n")))
+    assert not is_symmetric_to(uneven, other)
+    assert "predicts the same" not in answer([uneven, twin]).trust
+    assert "fits these readings equally well" in answer([uneven, twin]).trust
+    moved = replace(other, middle_m=other.middle_m + np.array([0, 0, 0.01]))
+    assert not is_symmetric_to(best, moved)
+    nearly = replace(twin, log_evidence=best.log_evidence - 1)
+    assert "1 other pose cannot be ruled out" in answer([best, nearly]).trust
+    # and a fit that has not come to rest is not to be used
+    restless = answer([replace(best, at_rest=False)])
+    assert restless.trust.startswith(NOT_AT_REST)
+    assert "register" in restless.command
 
 
 def test_a_mirrored_magnet_is_refused(magnet, generator, tmp_path):

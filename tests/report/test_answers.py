@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tomlkit
 
 import halbach_fe as hf
 from halbach_fe.cli import main
@@ -140,7 +141,11 @@ def test_a_field_that_cancels_has_no_direction(given):
 def of_multipoles(given):
     tables = hf.multipoles(given.magnet, given.session).tables
     known = [magnets["prior"] for _, magnets in tables]
+    # the largest one that the answer states is in the table
+    largest = [max(multipoles.multipole_rows(magnets), key=lambda row: float(
+        row["|c_n| prior"].split("\u00a0")[0]))["|c_n| prior"] for _, magnets in tables]
     return multipoles.answer(tables, 50.0), [
+        *(f"{size} units" for size in largest),
         *(with_error(1e3 * one.main, 1e3 * one.main_sd) for one in known), "within 50 units",
         "as ordered"]
 
@@ -172,7 +177,9 @@ def of_prior(given):
 def of_sort(given):
     found = hf.sort(given.magnet, given.campaign.blocks, given.session)
     size = np.sqrt(np.mean(found.best.sizes**2))
-    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv"]
+    low, high = np.quantile(found.random, [0.025, 0.975])
+    return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv",
+                                   f"{low:.3g} to {high:.3g} for 95 % of random orders"]
 
 
 @pytest.mark.filterwarnings("ignore:Every block of study")
@@ -449,7 +456,7 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
 def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     everything = hf.plan(given.magnet, given.session)
     said = plan.answer(everything)
-    few = int(said.said.split("The first ")[1].split()[0])
+    few = int(said.said.split("the first ")[1].split(",")[0])
     assert 0 < few < len(everything.points)
     left = np.exp(-everything.gain / len(everything.parameters))
     assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
@@ -500,3 +507,56 @@ def test_scattered_points_have_maps_and_no_profile(given, scattered):
     study = parse_study(changed(MAGNET, observation__positions=positions))
     update = hf.infer(build_magnet(study), simulate_campaign(study, 3).readings, given.session)
     assert diagnosis_figures.is_scattered(update) == scattered
+
+
+def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tmp_path):
+    """The table has what plan.csv has; blocks and patterns are two quantities with two names."""
+    found = hf.plan(given.magnet, given.session, points=6)
+    plan.write_plan(given.magnet, found, tmp_path)
+    rows = plan.chosen_table(found)
+    stored = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)
+    # 1 µm is the last digit of the table
+    np.testing.assert_allclose([[float(row[f"{axis} in mm"]) for axis in "xyz"] for row in rows],
+                               1e3 * found.points, atol=6e-4)
+    np.testing.assert_allclose(1e3 * stored["x_m"], 1e3 * found.points[:, 0])
+    assert "-0.000" not in str(rows)
+    text = (tmp_path / "plan.html").read_text()
+    assert all(f">{row['x in mm']}<" in text for row in rows)
+    assert "uncertainty that remains" not in text
+    left, of_study = (plan.plan_table(found)[3][key] for key in ("plan", "the study's"))
+    # each is rounded to 0.1 %
+    assert float(left[:-2]) / float(of_study[:-2]) == pytest.approx(found.volume_ratio, abs=3e-3)
+
+
+def test_moves_that_the_answer_is_against_are_no_instructions(given, tmp_path):
+    """The titles of table and picture say so, and those of worthwhile moves do not."""
+    found = hf.shim(given.updated, given.session, swaps=1, turns=0)
+    assert found.steps
+    wrong = replace(given.updated, prior_conflict=10 * given.updated.conflict_limit)
+    assert wrong.disagreement
+
+    def that_leave(part):
+        first = replace(found.before, mean=part * found.before.mean, root=part * found.before.root,
+                        error=part * found.before.error)
+        return replace(found, steps=(replace(found.steps[0], after=first),))
+
+    little, worthwhile = that_leave(0.97), that_leave(0.5)
+    for name, moves, result, against in (
+            ("worthwhile", worthwhile, given.updated, False), ("little", little, given.updated,
+                                                               True),
+            ("conflict", worthwhile, wrong, True)):
+        shimming.write_shim(moves, result, tomlkit.dumps(MAGNET), tmp_path / name)
+        text = (tmp_path / name / "shim.html").read_text()
+        assert ("Moves that would be made" in text) == against
+        assert bool(shimming.reason_against(moves, result)) == against
+        assert shimming.answer(moves, result).step.startswith("Make the moves") != against
+    drawn = shimming._moves_figure(found).legends[0].texts
+    assert [text.get_text() for text in drawn] == ["blocks that are exchanged"]
+
+
+@pytest.mark.parametrize(("value", "sd", "shown"), [
+    (-253083.2, 35.84, "-253\u202f083 ± 36"), (74090.4, 0.0, "+74\u202f090 ± 0"),
+    (1263.4, 4.34, "+1\u202f263.4 ± 4.3"), (0.0, 1594.2, "0 ± 1\u202f594"),
+    (0.01, 2.71, "0.0 ± 2.7"), (-3.2, 0.012, "-3.200 ± 0.012")])
+def test_harmonics_and_their_errors_end_with_one_digit(value, sd, shown):
+    assert homogeneity._ppm_with_sd(value, sd) == shown

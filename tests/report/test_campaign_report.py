@@ -20,7 +20,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
-from halbach_fe.report.campaign_report import read_campaign
+from halbach_fe.report.campaign_report import _parts, read_campaign
 from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from halbach_fe.report.result_files import OWNERS
@@ -200,8 +200,8 @@ def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
         [found / "study.diagnosed.toml"])
     page = parts_of(hf.campaign_report([first, after, found], tmp_path / "all.html"))
     assert ("better is of diagnosis/study.diagnosed.toml, which halbach-fe diagnose wrote: "
-            "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions is 1 table instead of "
-            "not given.") in page.text
+            "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions has 1 entry, and none "
+            "before.") in page.text
     assert re.findall(r"folder (\w+),", page.text) == [
         "field", "diagnosis", "better"]
     with pytest.raises(hf.HalbachError, match="of one magnet"):
@@ -359,6 +359,64 @@ def test_other_settings_are_said_but_no_doubt(home):
     assert campaign.doubts == []
     assert campaign.versions == ["inferred and ppm are of another version of the study than field: "
                                  "mesh.block_size_m is 0.02 instead of 0.01."]
+
+
+def test_the_study_of_register_is_said_in_words(home):
+    """Poses and errors of the probe are what it writes; what else differs is said, but not all."""
+    results(home / "registered", "register", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.registered.toml"])
+    registered = [home / "registered" / "study.registered.toml", home / "map.csv"]
+    found = {"instrument": {"translation_m": [1e-3, 0, 0], "gain": [0.01, 0, 0]}}
+    results(home / "better", "infer", another(**found), registered)
+    of = ("better is of registered/study.registered.toml, which halbach-fe register wrote with the "
+          "poses of maps and the errors of the probe that it found")
+    assert found_in(home, "field", "registered", "better").versions == [
+        f"{of}; nothing else differs."]
+    results(home / "better", "infer", another(
+        **found, mesh__block_size_m=0.01, prior__magnitude_sd=0.02, prior__direction_sd_deg=2.0,
+        array__remanence_T=1.2), registered)
+    said, = found_in(home, "field", "registered", "better").versions
+    assert said.startswith(f"{of}. Beside these: ")
+    assert said.count(" instead of ") == 3
+    assert said.endswith(" and 1 more.")
+    assert "instrument." not in said
+    # a control: the same numbers from a diagnosis are named
+    results(home / "diagnosed", "diagnose", reads=[home / "study.toml"],
+            files=["study.diagnosed.toml"])
+    results(home / "better", "infer", another(**found),
+            [home / "diagnosed" / "study.diagnosed.toml", home / "map.csv"])
+    assert "instrument.translation_m is" in found_in(home, "field", "diagnosed",
+                                                     "better").versions[0]
+
+
+def test_the_next_step_is_not_one_that_is_done_or_was_before(home):
+    """An update with a map of the unsorted blocks does not follow sorting."""
+    sort = Answer("Which block?", "These.", "Yes.", "Assemble.",
+                  "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.csv -o DIR")
+    study, readings = home / "study.toml", home / "map.csv"
+    results(home / "sorted", "sort", reads=[study], files=["blocks.csv"], answer=sort)
+
+    def part_of(label):
+        campaign = found_in(home)
+        return next(part for part in _parts(campaign, home / "all.html") if part["name"] == label)
+
+    assert part_of("sorted")["next"] is None
+    results(home / "inferred", "infer", reads=[study, readings, home / "sorted" / "blocks.csv"],
+            files=["posterior.h5"])
+    assert part_of("sorted")["where"] == "below"
+    posterior = home / "inferred" / "posterior.h5"
+    results(home / "ppm", "homogeneity", reads=[study, posterior])
+    results(home / "tray", "shim-tray", reads=[study, posterior], answer=Answer(
+        "Which?", "Some.", "Yes.", "Look.", "halbach-fe homogeneity STUDY -o DIR"))
+    assert part_of("tray")["where"] == "above"
+    assert part_of("tray")["next"] == part_of("ppm")["number"]
+    last = found_in(home).answer
+    assert (last.step, last.command) == ("Look. See folder ppm for that.", "")
+    # a control: another posterior was read there
+    (home / "other.h5").write_text("another")
+    results(home / "tray", "shim-tray", reads=[study, home / "other.h5"], answer=Answer(
+        "Which?", "Some.", "Yes.", "Look.", "halbach-fe homogeneity STUDY -o DIR"))
+    assert part_of("tray")["next"] is None
 
 
 def test_the_next_command_names_the_folder_of_its_answer(home):

@@ -9,8 +9,10 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.report.inference import score_table
 from halbach_fe.report.inference_answer import answer
+from halbach_fe.report.words import flux_density
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import changed
@@ -34,7 +36,7 @@ def test_the_numbers_are_those_of_the_prediction(campaign, session):
     unseen = result.held_out
     off = 1e6 * np.sqrt(np.mean((result.readings - result.prediction_posterior.mean)[unseen]**2))
     assert f"predicts {unseen.sum()} readings that were held out" in said.said
-    assert f"to {off:.3g}\u00a0µT rms" in said.said
+    assert f"to {off:#.3g}\u00a0µT rms".replace(".\u00a0", "\u00a0") in said.said
     # 5 % of some hundred readings: 95 ± 3 %
     (share,) = re.findall(r"holds ([\d.]+)", said.said)
     assert 85 < float(share) <= 100
@@ -79,3 +81,16 @@ def test_the_table_has_the_chi2_of_the_answer(campaign, session):
         assert f"{np.mean(left**2):.3g}" != value
         assert last["readings"] == f"{len(left)}\u00a0training"
         assert last["chi²/reading, after"] == "–"
+
+
+def test_answer_and_table_have_the_same_numbers(campaign, session):
+    """With the same unit and digits; numbers that end with 0 too."""
+    result, said = answered(campaign, session)
+    part = HELD_OUT if result.held_out.any() else "training"
+    row = next(row for row in score_table(result) if part in row["readings"].replace("\u00a0", " "))
+    for column in ("before, rms", "after, rms"):
+        assert row[column] in said.said
+    assert flux_density(1.1e-3, zeros=True) == "1.10\u00a0mT"
+    assert flux_density(1.1e-4, zeros=True) == "110\u00a0µT"
+    assert flux_density(0.0, zeros=True) == "0\u00a0mT"
+    assert flux_density(6.1e-6) == "6.1\u00a0µT"

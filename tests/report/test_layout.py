@@ -152,3 +152,20 @@ def test_logarithmic_axes_have_numbers():
         label_logarithmic(axis.yaxis)
         found = [float(label) for label in labels() if label]
         assert any(limits[0] <= value <= limits[1] for value in found)
+
+
+def test_what_is_cut_fades_at_that_edge(opened, tmp_path):
+    """However little is cut; scrolled to the end it is the other edge. The control fits."""
+    page = opened(written(tmp_path), 500)
+    page.evaluate("""document.querySelector('.wide').innerHTML =
+        '<div id=inside style="width: 100%; height: 9px"></div>'""")
+
+    def faded(width):
+        page.evaluate(f"document.querySelector('#inside').style.width = '{width}'")
+        page.wait_for_timeout(200)  # of some frames
+        return page.evaluate("getComputedStyle(document.querySelector('.wide')).maskImage")
+
+    assert faded("100%") == "none"
+    assert faded("calc(100% + 8px)").startswith("linear-gradient(to left, rgba(0, 0, 0, 0.0")
+    page.evaluate("document.querySelector('.wide').scrollLeft = 99")
+    assert faded("calc(100% + 8px)").startswith("linear-gradient(to right, rgba(0, 0, 0, 0.0")

@@ -116,6 +116,21 @@ def test_the_field_and_residuals_are_shown_when_asked_for(page):
     assert len(set(texts)) == 12
 
 
+@pytest.mark.parametrize("width", [500, 1400])
+def test_names_hide_nothing(page, width):
+    """They are below the picture of the magnet, on wide and on narrow screens."""
+    study = study_of("quadrupole")
+    shown = page(magnet_view(build_magnet(study), known_of(study)))
+    shown.set_viewport_size({"width": width, "height": 1000})
+    shown.wait_for_timeout(1000)
+    scene, names = (shown.locator(f"#magnet-view {one}").first.bounding_box()
+                    for one in (".gl-container canvas, .svg-container canvas", ".legend"))
+    assert names["height"] > 10
+    assert names["y"] >= scene["y"] + scene["height"] - 1  # a px of rounding
+    assert names["x"] >= 0
+    assert names["x"] + names["width"] <= width
+
+
 @pytest.mark.parametrize("name", STUDIES)
 def test_studies_are_shown(page, name):
     study = study_of(name)

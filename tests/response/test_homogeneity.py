@@ -228,7 +228,7 @@ def test_a_page_of_a_distribution_of_any_name(generator, tmp_path):
     named = replace(found, by_name={"guess": found.by_name["posterior"]},
                     distributions={"guess": found.distributions["posterior"]})
     page = write_report(named, tmp_path / "page").read_text()
-    assert "with a probability of 95\u00a0%" in page
+    assert "(95\u00a0%: " in page
     assert "as ordered" not in page
 
 
