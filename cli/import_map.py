@@ -14,6 +14,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
+from halbach_fe.measurement.calibration import HEADER, read_calibration
 from halbach_fe.measurement.field_map import points_of, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
@@ -26,6 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=common.path, required=True, metavar="MAP",
                         help="map to write: .csv, .h5 or .vtu")
     add_format_arguments(parser)
+    parser.add_argument("--calibration", type=common.input_file, metavar="TABLE",
+                        help="CSV file with the errors of the probe's sensors against a reference, "
+                        "by which the readings are corrected; its header is like "
+                        f"{HEADER.replace('%', '%%')}")
     common.add_json_argument(parser)
 
 
@@ -33,8 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Read the file, convert it, write the map, and print how the file was understood."""
     imported = import_map(arguments.file, declared_format(arguments), arguments.format)
     common.keep_input(arguments.output, arguments.file)
-    write_map(imported.data, arguments.output)
-    properties = summary(imported)
+    data, properties = imported.data, summary(imported)
+    if arguments.calibration:
+        data = read_calibration(arguments.calibration).corrected(data, arguments.file.name)
+        properties["largest_correction_T"] = float(
+            np.nanmax(np.abs(data["B_T"].values - imported.data["B_T"].values)))
+    write_map(data, arguments.output)
     if arguments.json:
         common.print_json(properties | {"map": str(arguments.output)})
     else:

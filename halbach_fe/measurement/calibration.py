@@ -1,0 +1,125 @@
+"""Calibration of a three-axis probe against a reference: the error of each sensor over the field.
+
+Makers of probes deliver a table with two columns for each sensor: fields, and the error of the
+reading in per cent of it, positive where the sensor reads too much. Readings are corrected before
+the axes of the probe are turned into those of the magnet, by linear interpolation.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, must_be, printable
+from halbach_fe.core.files import file_bytes
+from halbach_fe.measurement.formats.units import in_si, unit_symbol
+from halbach_fe.measurement.tables import csv_table, finite
+from halbach_fe.study.types import COMPONENTS
+
+HEADER = "Bx (T),%err Bx,By (T),%err By,Bz (T),%err Bz"
+"""Header of a table; a sensor that the map does not have may be missing."""
+
+BEYOND = 0.05
+"""Part of a table's range by which readings may exceed it; they have the error of its end."""
+
+LARGEST_PERCENT = 50.0
+"""Errors above this are no calibration, but another column or unit."""
+
+MAX_NAME = 80
+"""Largest number of characters of a file's or column's name in a message."""
+
+_FIELD = re.compile(r"B([xyz])\s*(?:_|\(|\[)\s*(\w+)\s*[)\]]?", re.IGNORECASE)
+_ERROR = re.compile(r"%\s*err\w*\s*B([xyz])|B([xyz])_error_percent", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The errors of a probe's sensors.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file.
+    sensors : dict of str to (ndarray, ndarray)
+        For x, y and z: fields in T, ascending, and relative errors of the reading there.
+    """
+
+    name: str
+    sensors: dict[str, tuple[Floats, Floats]]
+
+    def corrected(self, data: xr.Dataset, where: str) -> xr.Dataset:
+        """Return a map, in T along the axes of the probe, with its readings corrected.
+
+        Raises
+        ------
+        MeasurementError
+            If the table lacks a sensor that the map has, or its range.
+        """
+        field = np.array(data["B_T"].values, float)
+        for number, axis in enumerate(COMPONENTS):
+            shown = field[:, number]
+            if np.isnan(shown).all():
+                continue
+            if axis not in self.sensors:
+                raise MeasurementError(must_be(
+                    "columns", self.name, f"those of every sensor of {where}, as B{axis}",
+                    f"those of {', '.join('B' + name for name in self.sensors) or 'none'}",
+                    f"A header is {HEADER}."))
+            at, error = self.sensors[axis]
+            low, high = at[0] - BEYOND * np.ptp(at), at[-1] + BEYOND * np.ptp(at)
+            if np.nanmin(shown) < low or np.nanmax(shown) > high:
+                raise MeasurementError(must_be(
+                    f"fields of B{axis}", self.name,
+                    f"from {np.nanmin(shown):.4g} to {np.nanmax(shown):.4g} T, as in {where}",
+                    f"{at[0]:.4g} to {at[-1]:.4g} T",
+                    "Use a calibration with that range, or check the unit of the map."))
+            field[:, number] = shown / (1 + np.interp(shown, at, error))
+        return data.assign(B_T=(data["B_T"].dims, field, data["B_T"].attrs)).assign_attrs(
+            calibrated_by=self.name)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a table of calibration from a CSV file, with a header such as `HEADER`.
+
+    Raises
+    ------
+    MeasurementError
+        If the file is no such table.
+    """
+    where = printable(path.name, MAX_NAME)
+    _, header, rows = csv_table(file_bytes(path, where), where, f"A header is {HEADER}.")
+    fields, errors = {}, {}
+    for number, name in enumerate(header):
+        if found := _ERROR.fullmatch(name.strip()):
+            errors[(found[1] or found[2]).lower()] = number
+        elif (found := _FIELD.fullmatch(name.strip())) and (unit := unit_symbol(found[2])):
+            fields[found[1].lower()] = number, unit
+        else:
+            raise MeasurementError(must_be("column", where, f"one of a header like {HEADER}",
+                                           printable(name, MAX_NAME), "Rename or remove it."))
+    if not fields or fields.keys() != errors.keys():
+        raise MeasurementError(must_be(
+            "columns", where, "a field and an error for every sensor", ", ".join(header),
+            f"A header is {HEADER}."))
+    values = np.array([[finite(cell, f"column {name} on line {line}", where)
+                        for name, cell in zip(header, cells, strict=True)]
+                       for line, cells in rows])
+    sensors = {}
+    for axis, (column, unit) in fields.items():
+        order = np.argsort(values[:, column])
+        at, error = in_si(values[order, column], unit), values[order, errors[axis]]
+        if len(at) < 2 or not np.diff(at).min() > 0:
+            raise MeasurementError(must_be(
+                f"fields of B{axis}", where, "two or more different values", "repeated values"
+                if len(at) > 1 else "a single one"))
+        if np.abs(error).max() > LARGEST_PERCENT:
+            raise MeasurementError(must_be(
+                f"errors of B{axis}", where, f"at most {LARGEST_PERCENT:g} %",
+                f"{error[np.abs(error).argmax()]:g} %", "Is this column in per cent?"))
+        sensors[axis] = at, error / 100
+    return Calibration(where, sensors)

@@ -1,0 +1,82 @@
+"""A map is corrected by the calibration of its probe; what is no calibration is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.measurement.calibration import HEADER, read_calibration
+from halbach_fe.measurement.field_map import field_map, read_map
+
+ERRORS = {"x": [0.3, -0.1, 0.2], "y": [0.0, 0.05, -0.4], "z": [0.1, 0.1, 0.1]}
+FIELDS = [-1.5, 0.0, 1.5]
+
+
+def table(path, fields=FIELDS, axes="xyz", header=None, factor=1.0):
+    names = header or ",".join(f"B{axis} (T),%err B{axis}" for axis in axes)
+    rows = [",".join(f"{factor * at},{ERRORS[axis][number]}" for axis in axes)
+            for number, at in enumerate(fields)]
+    path.write_text("\n".join([names, *rows]) + "\n")
+    return path
+
+
+def shown(field):
+    """What sensors with these errors show of a field (n, 3): found here by iteration."""
+    found = field.copy()
+    for _ in range(30):
+        error = np.column_stack([np.interp(found[:, number], FIELDS, ERRORS[axis])
+                                 for number, axis in enumerate("xyz")]) / 100
+        found = field * (1 + error)
+    return found
+
+
+@pytest.mark.parametrize("unit", ["T", "mT"])
+def test_readings_are_corrected(tmp_path, generator, unit):
+    """Control: uncorrected, they are up to 4 mT off."""
+    field = generator.uniform(-1.45, 1.45, (50, 3))
+    data = field_map(generator.uniform(-0.1, 0.1, (50, 3)), shown(field))
+    path = table(tmp_path / "probe.csv", factor=1.0 if unit == "T" else 1e3,
+                 header=HEADER.replace("(T)", f"({unit})"))
+    corrected = read_calibration(path).corrected(data, "map.csv")
+    np.testing.assert_allclose(corrected["B_T"].values, field, atol=1e-12)
+    assert np.abs(data["B_T"].values - field).max() > 2e-3
+    assert corrected.attrs["calibrated_by"] == "probe.csv"
+
+
+def test_the_command_corrects_before_it_writes(tmp_path, capsys):
+    (tmp_path / "stage.csv").write_text(
+        "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n0,0,0,0.75,-0.75,0.0\n1,0,0,1.5,1.5,1.5\n")
+    probe = table(tmp_path / "probe.csv")
+    assert main(["import-map", str(tmp_path / "stage.csv"), "-o", str(tmp_path / "map.csv"),
+                 "--calibration", str(probe)]) == 0
+    assert "largest_correction_T" in capsys.readouterr().out
+    found = read_map(tmp_path / "map.csv")["B_T"].values
+    np.testing.assert_allclose(
+        found[0], [0.75 / 1.0005, -0.75 / 1.00025, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(found[1], [1.5 / 1.002, 1.5 / 0.996, 1.5 / 1.001], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("changes", "sentence"), [
+    ({"axes": "xy"}, "columns of probe.csv must be those of every sensor"),
+    ({"fields": [-1.0, 0.0, 1.0]}, "fields of Bx of probe.csv must be from -1.4 to 1.4 T"),
+    ({"header": "Bx (T),%err Bx,By (T),%err By,Bz (T),remark"}, "one of a header like"),
+    ({"header": "Bx (T),%err By,By (T),%err Bz,Bz (T),%err Bx "}, None),
+    ({"header": "Bx (lb),%err Bx,By (T),%err By,Bz (T),%err Bz"}, "one of a header like"),
+    ({"fields": [-1.5, 1.5, 1.5]}, "two or more different values"),
+    ({"fields": [-1.5, "?", 1.5]}, "finite number"),
+])
+def test_what_is_no_calibration_is_refused(tmp_path, changes, sentence):
+    data = field_map(np.outer([0.0, 0.1], np.ones(3)), np.array([[-1.4] * 3, [1.4] * 3]))
+    path = tmp_path / "probe.csv"
+    if "?" in changes.get("fields", ()):
+        table(path)
+        path.write_text(path.read_text().replace("0.0,-0.1", "?,-0.1"))
+    else:
+        table(path, **changes)
+    if sentence is None:  # columns may have any order
+        read_calibration(path).corrected(data, "map.csv")
+        return
+    with pytest.raises(MeasurementError, match=sentence):
+        read_calibration(path).corrected(data, "map.csv")
