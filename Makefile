@@ -74,10 +74,13 @@ study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrup
 study-emphatic: results/emphatic/measured.html
 study-mri4all: results/mri4all/measured.html
 
-results/emphatic/body.csv: studies/emphatic/measured/body_scan.csv | setup
-	.venv/bin/halbach-fe import-map $< -o $@ --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
-results/emphatic/fringe.csv: studies/emphatic/measured/small_aperture_fringe.csv | setup
-	.venv/bin/halbach-fe import-map $< -o $@ --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],-"
+EMPHATIC_PROBE := studies/emphatic/measured/probe_calibration.csv
+results/emphatic/body.csv: studies/emphatic/measured/body_scan.csv $(EMPHATIC_PROBE) | setup
+	.venv/bin/halbach-fe import-map $< -o $@ --calibration $(EMPHATIC_PROBE) \
+	    --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],t[s],-"
+results/emphatic/fringe.csv: studies/emphatic/measured/small_aperture_fringe.csv $(EMPHATIC_PROBE) | setup
+	.venv/bin/halbach-fe import-map $< -o $@ --calibration $(EMPHATIC_PROBE) \
+	    --columns "x[inch],y[inch],z[inch],-,Bx[T],By[T],Bz[T],-"
 results/emphatic/%/check.html: results/emphatic/%.csv
 	.venv/bin/halbach-fe check $< -o $(@D)
 results/mri4all/map.csv: studies/mri4all/measured/cube_10cm_11_steps.csv | setup

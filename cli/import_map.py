@@ -38,12 +38,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Read the file, convert it, write the map, and print how the file was understood."""
     imported = import_map(arguments.file, declared_format(arguments), arguments.format)
     common.keep_input(arguments.output, arguments.file)
-    data, properties = imported.data, summary(imported)
+    corrections = {}
     if arguments.calibration:
-        data = read_calibration(arguments.calibration).corrected(data, arguments.file.name)
-        properties["largest_correction_T"] = float(
-            np.nanmax(np.abs(data["B_T"].values - imported.data["B_T"].values)))
-    write_map(data, arguments.output)
+        before, imported = imported.data["B_T"].values, imported.with_data(
+            read_calibration(arguments.calibration).corrected(
+                imported.data, arguments.file.name))
+        corrections["largest_correction_T"] = float(
+            np.nanmax(np.abs(imported.data["B_T"].values - before)))
+    write_map(imported.data, arguments.output)
+    properties = summary(imported) | corrections
     if arguments.json:
         common.print_json(properties | {"map": str(arguments.output)})
     else:

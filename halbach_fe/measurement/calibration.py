@@ -7,6 +7,7 @@ the axes of the probe are turned into those of the magnet, by linear interpolati
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,13 +44,14 @@ class Calibration:
 
     Attributes
     ----------
-    name : str
-        Name of the file.
+    name, sha256 : str
+        Name of the file, and digest of its content.
     sensors : dict of str to (ndarray, ndarray)
         For x, y and z: fields in T, ascending, and relative errors of the reading there.
     """
 
     name: str
+    sha256: str
     sensors: dict[str, tuple[Floats, Floats]]
 
     def corrected(self, data: xr.Dataset, where: str) -> xr.Dataset:
@@ -80,7 +82,7 @@ class Calibration:
                     "Use a calibration with that range, or check the unit of the map."))
             field[:, number] = shown / (1 + np.interp(shown, at, error))
         return data.assign(B_T=(data["B_T"].dims, field, data["B_T"].attrs)).assign_attrs(
-            calibrated_by=self.name)
+            calibrated_by=self.name, calibration_sha256=self.sha256)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -92,7 +94,8 @@ def read_calibration(path: Path) -> Calibration:
         If the file is no such table.
     """
     where = printable(path.name, MAX_NAME)
-    _, header, rows = csv_table(file_bytes(path, where), where, f"A header is {HEADER}.")
+    raw = file_bytes(path, where)
+    _, header, rows = csv_table(raw, where, f"A header is {HEADER}.")
     fields, errors = {}, {}
     for number, name in enumerate(header):
         if found := _ERROR.fullmatch(name.strip()):
@@ -122,4 +125,4 @@ def read_calibration(path: Path) -> Calibration:
                 f"errors of B{axis}", where, f"at most {LARGEST_PERCENT:g} %",
                 f"{error[np.abs(error).argmax()]:g} %", "Is this column in per cent?"))
         sensors[axis] = at, error / 100
-    return Calibration(where, sensors)
+    return Calibration(where, hashlib.sha256(raw).hexdigest(), sensors)

@@ -51,7 +51,9 @@ def test_the_command_corrects_before_it_writes(tmp_path, capsys):
     probe = table(tmp_path / "probe.csv")
     assert main(["import-map", str(tmp_path / "stage.csv"), "-o", str(tmp_path / "map.csv"),
                  "--calibration", str(probe)]) == 0
-    assert "largest_correction_T" in capsys.readouterr().out
+    shown_text = capsys.readouterr().out
+    assert "largest_correction_T" in shown_text
+    assert "1.49701" in shown_text  # 1.5 / 1.002: the largest Bx that is written
     found = read_map(tmp_path / "map.csv")["B_T"].values
     np.testing.assert_allclose(
         found[0], [0.75 / 1.0005, -0.75 / 1.00025, 0.0], rtol=1e-12)

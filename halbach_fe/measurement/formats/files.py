@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import xarray as xr
@@ -45,6 +45,10 @@ class ImportedFile:
     def data(self) -> xr.Dataset:
         """The map, in m and T along the magnet's axes."""
         return self.imported.data
+
+    def with_data(self, data: xr.Dataset) -> ImportedFile:
+        """Return the same file with another map."""
+        return replace(self, imported=replace(self.imported, data=data))
 
 
 def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> ImportedFile:
