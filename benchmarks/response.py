@@ -154,6 +154,7 @@ def symmetry(study: Study, folder: Path, note: Note) -> None:
     """Two rings of trapezoids on a 3D mesh, every column solved against those by symmetry."""
     document = changed(
         study.model_dump(exclude_none=True), iron_ring=None, array__rings=2,
+        solver__route="scalar_potential",
         array__block={"shape": "trapezoid", "side_gap_m": 0.001}, mesh__block_size_m=0.04,
         mesh__bore_size_m=0.05, mesh__growth=2.0, mesh__layers_per_ring=2,
         observation__positions={"kind": "circles", "radius_m": 0.06, "angles": 12,

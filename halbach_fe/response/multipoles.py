@@ -28,6 +28,7 @@ from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -337,7 +338,7 @@ def unwanted_orders(
 
 
 def circle_models(
-    magnet: Magnet, observation: Observation, model: Response
+    magnet: Magnet, observation: Observation, model: Response, whole: bool = False
 ) -> list[MultipoleModel]:
     """Return the multipoles on the circles that a study reads, without a further solve.
 
@@ -346,10 +347,12 @@ def circle_models(
     study reads no full circles, or if its instrument changes the readings.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
-    also contains (aliases with) order m - n. `multipole_models` uses as many angles as are needed
-    to avoid this.
+    also contains (aliases with) order m - n, which the blocks' field in vacuum tells: it is
+    subtracted. What permeable blocks and iron make of order m - n is neglected, some per cent of
+    it. ``whole`` tells that the only parameter is the strength of the nominal magnet.
     """
     main, models = magnet.array.multipole_order, []
+    deviations = Deviations.of(magnet)
     circles = _read_circles(magnet, observation)
     for radius in sorted({radius for radius, _, _ in circles}):
         own = sorted((z, analysis) for other, z, analysis in circles if other == radius)
@@ -357,8 +360,17 @@ def circle_models(
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        reference, fixed = (_complexes(_seen(middle, values))[main - 1:main]
-                            for values in (model.matrix, model.offset))
+        z_middle = min((z for z, _ in own), key=abs)
+
+        def orders_of(
+            z: float, analysis: sparse.csr_array, of_radius: float = radius
+        ) -> Complexes:
+            """Return the orders (K, parameters) of a circle in T, without aliases."""
+            seen = _complexes(_seen(analysis, model.matrix))
+            return seen - _aliases(deviations, observation, of_radius, z, len(seen), whole)
+
+        reference = orders_of(z_middle, middle)[main - 1:main]
+        fixed = _complexes(_seen(middle, model.offset))[main - 1:main]
         try:
             turn = _turn(magnet, reference[0], model)
         except StudyError:
@@ -366,8 +378,8 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix, offset = (_complexes(_seen(analysis, values))[:len(orders)]
-                              for values in (model.matrix, model.offset))
+            matrix = orders_of(z, analysis)[:len(orders)]
+            offset = _complexes(_seen(analysis, model.offset))[:len(orders)]
             models.append(MultipoleModel(
                 orders, main, radius, z if magnet.dimension == 3 else None, False,
                 phases[:, None] * np.vstack([reference, matrix]),
@@ -401,7 +413,38 @@ def solved_circles(
     # a model with a single parameter, the strength of the whole magnet
     whole = Response(readings[:, None], ("strength",), np.ones(1), 0 * readings, errors, 0.0)
     exact = Gaussian(np.ones(1), np.zeros((1, 1)))
-    return [(model, model.of(exact)) for model in circle_models(bare, observation, whole)]
+    return [(model, model.of(exact)) for model in circle_models(
+        bare, observation, whole, whole=True)]
+
+
+def _aliases(
+    deviations: Deviations, observation: Observation, radius: float, z: float, orders: int,
+    whole: bool,
+) -> Complexes:
+    """Return what the angles of a circle mistake for its orders 1 ... K, in vacuum.
+
+    The result is (K, parameters) in T per parameter, or (K, 1) for the whole nominal magnet. It is
+    the difference of the sums over the circle's own angles and over a multiple of them.
+    """
+    magnet, points = deviations.magnet, observation.points
+    here = points[(np.abs(np.hypot(points[:, 0], points[:, 1]) - radius) < SAME_CIRCLE_M)
+                  & (np.abs(points[:, 2] - z) < SAME_CIRCLE_M)]
+    own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / SAME_ANGLE)))
+    decay = min(radius / magnet.bore_radius, SLOWEST_DECAY)
+    needed = orders + int(np.ceil(np.log(ALIAS_LEFT) / np.log(decay)))
+    times = max(1, int(np.ceil(needed / own)))
+    angle = np.arctan2(here[0, 1], here[0, 0]) + 2 * np.pi * np.arange(times * own) / (times * own)
+    direction = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    places = radius * direction
+    places[:, 2] = z
+    columns = deviations.columns(places).reshape(len(places), 3, -1)
+    if whole:
+        nominal = np.zeros(columns.shape[2])
+        nominal[:len(magnet.nominal_magnetization)] = magnet.nominal_magnetization
+        columns = (columns @ nominal)[..., None]
+    radial = np.einsum("ni,nip->np", direction, columns)
+    wave = np.exp(-1j * np.outer(np.arange(1, orders + 1), angle)) * 2j  # B_n + i A_n
+    return np.asarray(wave[:, ::times] @ radial[::times] / own - wave @ radial / len(angle))
 
 
 def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:
@@ -549,6 +592,14 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
     return Observation(points, total, total, points, labels[:2 * highest],
                        positions[:2 * highest])
 
+
+ALIAS_LEFT, SLOWEST_DECAY = 1e-6, 0.95
+"""Orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
+first; where circles are near the blocks or outside of the bore, the second is their decay."""
+
+SAME_CIRCLE_M, SAME_ANGLE = 1e-6, 1e-6
+"""Distance in m of radius and z up to which points are on one circle, and angle in rad up to which
+points on it are one."""
 
 MAIN_UNITS = 9000.0
 """Size of a multipole that can only be the main one, in units of it; its axes turn by little."""

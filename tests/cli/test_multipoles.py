@@ -154,10 +154,11 @@ def test_multipoles_of_the_nominal_magnet(made, tmp_path, capsys):
     radial = data["B_T"].values[:, 0] * np.cos(angle) + data["B_T"].values[:, 1] * np.sin(angle)
     coefficients = np.array([2 * np.mean(radial * (np.sin(n * angle) + 1j * np.cos(n * angle)))
                              for n in range(1, 6)])
-    assert table["main"][0] == pytest.approx(abs(coefficients[0]), rel=1e-9)
+    # the table has no aliases, of order 32 - n: 2e-6 in the main one, 0.2 units in b3
+    assert table["main"][0] == pytest.approx(abs(coefficients[0]), rel=1e-5)
     sizes = np.hypot(table["b_units"], table["a_units"])[:5]
     np.testing.assert_allclose(sizes, UNITS * np.abs(coefficients) / abs(coefficients[0]),
-                               atol=1e-6)
+                               atol=0.3)
     assert (table["b_sd_units"] == 0).all()
     assert "multipoles.csv" in page(tmp_path / "report.html")
     permeable = tmp_path / "permeable.toml"
