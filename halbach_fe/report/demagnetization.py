@@ -83,8 +83,8 @@ def answer(found: DemagnetizationMap) -> Answer:
                  if is_nonlinear(found.study) else "")
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"At {temperature:g} °C, {start}. The smallest margin is "
-        f"{1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
+        f"{'No: at' if lost > 0 else 'Yes: at'} {temperature:g} °C, {start}. The smallest margin "
+        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (--across makes "
         f"cells smaller); shares of the volume hardly depend on that.{nonlinear}",
