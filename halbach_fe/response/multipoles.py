@@ -424,11 +424,12 @@ def _aliases(
     """Return what the angles of a circle mistake for its orders 1 ... K, in vacuum.
 
     The result is (K, parameters) in T per parameter, or (K, 1) for the whole nominal magnet. It is
-    the difference of the sums over the circle's own angles and over a multiple of them.
+    the difference of the sums over the circle's own angles and over a multiple of them. A circle
+    that the mapper has displaced counts as if it were where the map says.
     """
-    magnet, points = deviations.magnet, observation.points
-    here = points[(np.abs(np.hypot(points[:, 0], points[:, 1]) - radius) < SAME_CIRCLE_M)
-                  & (np.abs(points[:, 2] - z) < SAME_CIRCLE_M)]
+    magnet, points = deviations.magnet, observation.map_points
+    here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=SAME_RADIUS)
+                  & np.isclose(points[:, 2], z, atol=SAME_HEIGHT_M)]
     own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / SAME_ANGLE)))
     decay = min(radius / magnet.bore_radius, SLOWEST_DECAY)
     needed = orders + int(np.ceil(np.log(ALIAS_LEFT) / np.log(decay)))
@@ -597,9 +598,9 @@ ALIAS_LEFT, SLOWEST_DECAY = 1e-6, 0.95
 """Orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
 first; where circles are near the blocks or outside of the bore, the second is their decay."""
 
-SAME_CIRCLE_M, SAME_ANGLE = 1e-6, 1e-6
-"""Distance in m of radius and z up to which points are on one circle, and angle in rad up to which
-points on it are one."""
+SAME_RADIUS, SAME_HEIGHT_M, SAME_ANGLE = 2e-6, 1e-6, 1e-6
+"""Relative difference of radii, and difference of z in m, up to which points are on one circle, and
+angle in rad up to which points on it are one."""
 
 MAIN_UNITS = 9000.0
 """Size of a multipole that can only be the main one, in units of it; its axes turn by little."""
