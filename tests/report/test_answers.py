@@ -227,7 +227,7 @@ def of_tolerance(given):
 def of_demagnetization(given):
     found = hf.demagnetization(given.magnet, given.session, across=2)
     return demagnetization.answer(found), [
-        f"{1e-3 * found.margin.min():+.0f} kA/m", "At 60 °C", "ring "]
+        f"{1e-3 * found.margin.min():+.0f} kA/m", "Yes: at 60 °C", "ring "]
 
 
 def of_simulate(given):
