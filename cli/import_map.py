@@ -14,6 +14,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
+from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.calibration import HEADER, read_calibration
 from halbach_fe.measurement.field_map import points_of, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
@@ -37,9 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read the file, convert it, write the map, and print how the file was understood."""
     imported = import_map(arguments.file, declared_format(arguments), arguments.format)
-    common.keep_input(arguments.output, arguments.file)
+    common.keep_input(arguments.output, arguments.file, *(
+        [arguments.calibration] if arguments.calibration else []))
     corrections = {}
     if arguments.calibration:
+        if imported.imported.cylindrical:
+            raise MeasurementError(must_be(
+                "--calibration", arguments.file.name, "beside Bx, By and Bz as the sensors read "
+                "them", "beside Br and Bphi", "Import the readings of the three sensors."))
         before, imported = imported.data["B_T"].values, imported.with_data(
             read_calibration(arguments.calibration).corrected(
                 imported.data, arguments.file.name))

@@ -105,9 +105,9 @@ def read_calibration(path: Path) -> Calibration:
         else:
             raise MeasurementError(must_be("column", where, f"one of a header like {HEADER}",
                                            printable(name, MAX_NAME), "Rename or remove it."))
-    if not fields or fields.keys() != errors.keys():
+    if not fields or fields.keys() != errors.keys() or len(fields) + len(errors) < len(header):
         raise MeasurementError(must_be(
-            "columns", where, "a field and an error for every sensor", ", ".join(header),
+            "columns", where, "one field and one error for every sensor", ", ".join(header),
             f"A header is {HEADER}."))
     values = np.array([[finite(cell, f"column {name} on line {line}", where)
                         for name, cell in zip(header, cells, strict=True)]

@@ -360,16 +360,10 @@ def circle_models(
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        z_middle = min((z for z, _ in own), key=abs)
-
-        def orders_of(
-            z: float, analysis: sparse.csr_array, of_radius: float = radius
-        ) -> Complexes:
-            """Return the orders (K, parameters) of a circle in T, without aliases."""
-            seen = _complexes(_seen(analysis, model.matrix))
-            return seen - _aliases(deviations, observation, of_radius, z, len(seen), whole)
-
-        reference = orders_of(z_middle, middle)[main - 1:main]
+        by_z = {z: _complexes(_seen(analysis, model.matrix)) - _aliases(
+            deviations, observation, radius, z, analysis.shape[0] // 2, whole)
+            for z, analysis in own}
+        reference = by_z[min(by_z, key=abs)][main - 1:main]
         fixed = _complexes(_seen(middle, model.offset))[main - 1:main]
         try:
             turn = _turn(magnet, reference[0], model)
@@ -378,7 +372,7 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix = orders_of(z, analysis)[:len(orders)]
+            matrix = by_z[z][:len(orders)]
             offset = _complexes(_seen(analysis, model.offset))[:len(orders)]
             models.append(MultipoleModel(
                 orders, main, radius, z if magnet.dimension == 3 else None, False,

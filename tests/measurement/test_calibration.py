@@ -60,12 +60,35 @@ def test_the_command_corrects_before_it_writes(tmp_path, capsys):
     np.testing.assert_allclose(found[1], [1.5 / 1.002, 1.5 / 0.996, 1.5 / 1.001], rtol=1e-12)
 
 
+def test_errors_that_are_not_in_per_cent(tmp_path):
+    path = table(tmp_path / "probe.csv")
+    path.write_text(path.read_text().replace("-1.5,0.3", "-1.5,300"))
+    with pytest.raises(MeasurementError, match="errors of Bx of probe.csv must be at most 50 %"):
+        read_calibration(path)
+
+
+def test_computed_components_and_the_table_itself_are_kept(tmp_path, capsys):
+    """Br and Bphi are not what sensors along x and y have read."""
+    (tmp_path / "circle.csv").write_text("r[mm],phi[deg],z[mm],Br[T],Bphi[T]\n5,0,0,1,0\n")
+    (tmp_path / "stage.csv").write_text("x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n0,0,0,1,0,0\n")
+    probe = table(tmp_path / "probe.csv")
+    before = probe.read_bytes()
+    assert main(["import-map", str(tmp_path / "circle.csv"), "-o", str(tmp_path / "map.csv"),
+                 "--calibration", str(probe)]) != 0
+    assert "beside Br and Bphi" in capsys.readouterr().err
+    assert not (tmp_path / "map.csv").exists()
+    assert main(["import-map", str(tmp_path / "stage.csv"), "-o", str(probe),
+                 "--calibration", str(probe)]) != 0
+    assert probe.read_bytes() == before
+
+
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"axes": "xy"}, "columns of probe.csv must be those of every sensor"),
     ({"fields": [-1.0, 0.0, 1.0]}, "fields of Bx of probe.csv must be from -1.4 to 1.4 T"),
     ({"header": "Bx (T),%err Bx,By (T),%err By,Bz (T),remark"}, "one of a header like"),
     ({"header": "Bx (T),%err By,By (T),%err Bz,Bz (T),%err Bx "}, None),
     ({"header": "Bx (lb),%err Bx,By (T),%err By,Bz (T),%err Bz"}, "one of a header like"),
+    ({"header": "Bx (T),%err Bx,Bx [T],%err By,Bz (T),%err Bz"}, "one field and one error for"),
     ({"fields": [-1.5, 1.5, 1.5]}, "two or more different values"),
     ({"fields": [-1.5, "?", 1.5]}, "finite number"),
 ])

@@ -80,6 +80,8 @@ class ImportedMap:
         Columns of the file that are not in the map.
     dropped : int
         Number of points without any measured component, which are not in the map.
+    cylindrical : bool
+        Whether the file has Br and Bphi, so that Bx and By are computed.
     """
 
     data: xr.Dataset
@@ -87,6 +89,7 @@ class ImportedMap:
     field_units: tuple[str, ...]
     ignored: tuple[str, ...]
     dropped: int
+    cylindrical: bool
 
 
 def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
@@ -135,7 +138,7 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     ignored = tuple(column.text for index, column in enumerate(columns)
                     if index not in used.values() and column.text)
     return ImportedMap(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
-                    int(blank.sum()))
+                       int(blank.sum()), "Br" in si)
 
 
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
