@@ -63,7 +63,7 @@ def test_the_command_corrects_before_it_writes(tmp_path, capsys):
 def test_errors_that_are_not_in_per_cent(tmp_path):
     path = table(tmp_path / "probe.csv")
     path.write_text(path.read_text().replace("-1.5,0.3", "-1.5,300"))
-    with pytest.raises(MeasurementError, match="errors of Bx of probe.csv must be at most 50 %"):
+    with pytest.raises(MeasurementError, match=r"errors of Bx of probe\.csv must be at most 50 %"):
         read_calibration(path)
 
 
