@@ -40,10 +40,10 @@ def run(arguments: argparse.Namespace) -> int:
     write_solution(solution, arguments.output)
     summary = solution.summary() | {
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output)}
-    from halbach_fe.report.solution import answer, field_table, write_solution_report
+    from halbach_fe.report.solution import field_table, write_solution_report
     from halbach_fe.report.stray_field import stray_rows
 
-    write_solution_report(solution, arguments.output, {
+    answer = write_solution_report(solution, arguments.output, {
         "study file": common.digest(arguments.study), "GetDP": solution.getdp,
         "method": magnet.study.solver.method,
         "points, readings": f"{len(solution.points)}, {len(solution.readings)}",
@@ -55,5 +55,5 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         common.print_table(field_table(solution), "The field at the study's positions")
         common.print_table(stray_rows(solution.stray_field), "Outside of the magnet")
-        common.say_answer(arguments, answer(solution), arguments.output / "report.html")
+        common.say_answer(arguments, answer, arguments.output / "report.html")
     return 0

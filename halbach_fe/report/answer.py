@@ -73,6 +73,9 @@ class Answer:
         command does it.
     sound : bool
         Whether the answer may be used as it stands. Otherwise its box is a warning.
+    concern : str
+        What is bad about the magnet itself, in a sentence that no summary may leave out; empty if
+        nothing is.
     """
 
     question: str
@@ -81,6 +84,7 @@ class Answer:
     step: str
     command: str = ""
     sound: bool = True
+    concern: str = ""
 
     @property
     def sentences(self) -> tuple[str, str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -65,7 +66,7 @@ def kind_rows(assembly: Assembly) -> list[dict[str, str]]:
              **({"grade": kind.material or ""} if graded else {}),
              "blocks": str(kind.count),
              **({"to order": str(total[kind.number]) if first == kind.number else
-                 f"as kind {first}"} if fewer else {})}
+                 f"kind {first}, upside down"} if fewer else {})}
             for kind, first in zip(assembly.kinds, ordered_as, strict=True)]
 
 
@@ -88,6 +89,17 @@ def plate_diameters(assembly: Assembly) -> str:
         assembly.plates[0].outer_radius_m, assembly.plates[0].inner_radius_m))
     bore = f"and a bore of {inner:.5g}\u00a0mm" if inner else "and no bore"
     return f"All plates have an outer diameter of {outer:.5g}\u00a0mm {bore}."
+
+
+def spacers(assembly: Assembly) -> str:
+    """Say how far neighbouring plates are apart; empty if there are no two plates."""
+    limits = sorted((low, low + plate.thickness_m) for plate in assembly.plates
+                    for low in plate.heights_m)
+    gaps = [f"{1e3 * (low - high):.4g}" for (_, high), (low, _) in itertools.pairwise(limits)]
+    if not gaps:
+        return ""
+    length = gaps[0] if len(set(gaps)) == 1 else f"from the lowest up, {', '.join(gaps)}"
+    return f"The spacers between neighbouring plates are {length}\u00a0mm long."
 
 
 def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str, object]:
@@ -138,6 +150,8 @@ def write_assembly(
         write_csv(columns(assembly), {"study": assembly.magnet.name, "frame": FRAME}, temporary)
     write_text(folder / "assembly.json", json.dumps(
         assembly_summary(assembly, files), indent=1, allow_nan=False) + "\n")
+    ordered_as = dict(zip((kind.number for kind in assembly.kinds), assembly.ordered_as,
+                          strict=True))
     prefix = common_beginning([one.serial for one in assembly.blocks])
     write_page(folder / "assembly.html", "assembly.html.j2", [], study=assembly.magnet.study,
                provenance=provenance, answer=answer(assembly), kinds=kind_rows(assembly),
@@ -145,4 +159,5 @@ def write_assembly(
                prefix=prefix, holder=assembly.holder,
                measured=any(one.serial for one in assembly.blocks),
                files=["assembly.csv", "assembly.json", *files],
-               sheets=[drawing(sheet, prefix) for sheet in sheets(assembly)])
+               spacers=spacers(assembly),
+               sheets=[drawing(sheet, prefix, ordered_as) for sheet in sheets(assembly)])

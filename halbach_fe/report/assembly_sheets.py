@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -144,8 +145,12 @@ class Drawing:
     tables: list[list[dict[str, str]]]
 
 
-def drawing(sheet: Sheet, prefix: str) -> Drawing:
+def drawing(
+    sheet: Sheet, prefix: str, ordered_as: Mapping[int, int] = MappingProxyType({})
+) -> Drawing:
     """Return what the template draws for a sheet; serial numbers go without their ``prefix``.
+
+    ``ordered_as`` names for a kind of blocks the kind that it is, turned upside down.
 
     The labels of the outermost blocks are outside of the plate, those of the innermost, if there
     are others, in its bore, and all others on the blocks.
@@ -189,7 +194,7 @@ def drawing(sheet: Sheet, prefix: str) -> Drawing:
     reach = radius + size * (1 + LETTER * longest)
     engraved = " ".join(_path(1e3 * bar.polygon) for bar in bars)
     return Drawing(sheet.title, drawn, " ".join(map(_path, parts)), engraved,
-                   plate.number if plate else None, reach, _tables(sheet))
+                   plate.number if plate else None, reach, _tables(sheet, ordered_as))
 
 
 def _layers(outlines: Sequence[Floats]) -> list[int]:
@@ -248,7 +253,7 @@ def _arrow(
     return float(start[0]), -float(start[1]), float(end[0]), -float(end[1])
 
 
-def _tables(sheet: Sheet) -> list[list[dict[str, str]]]:
+def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[list[dict[str, str]]]:
     """Return the rows of the tables under a drawing, side by side."""
     several = len(sheet.rings) > 1
     kinds = len({one.kind.number for one in sheet.blocks}) > 1
@@ -261,7 +266,9 @@ def _tables(sheet: Sheet) -> list[list[dict[str, str]]]:
         if one.serial:
             row["serial"] = one.serial
         if kinds:
-            row["kind"] = str(one.kind.number)
+            number = one.kind.number
+            other = ordered_as.get(number, number)
+            row["kind"] = str(number) if other == number else f"{other}, upside down"
         rows.append(row | {"way round": one.way_round.replace("counter-clockwise", "ccw")
                            .replace("clockwise", "cw").replace("from outwards, ", "")})
     tables = min(TABLES, -(-len(rows) // SHORTEST_TABLE))

@@ -39,16 +39,18 @@ COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: int) -> Answer:
     """Say what was simulated, and what to do with it."""
-    fields, more = np.abs(readings["B_T"].values), ""
-    if held_out is not None:
-        more = f", {counted(held_out.sizes['point'], 'held-out point')}"
+    maps = [readings] + ([] if held_out is None else [held_out])
+    largest = max(float(np.nanmax(np.abs(each["B_T"].values))) for each in maps)
+    more = "" if held_out is None else (
+        f", {counted(held_out.sizes['point'], 'more point')} to test predictions (held-out.csv)")
     sigma = _noise(study, readings)
+    low, high = float(np.nanmin(sigma)), float(np.nanmax(sigma))
     return Answer(
         "What would a measurement of this magnet give?",
-        f"map.csv has {counted(readings.sizes['point'], 'point')}{more}; blocks.csv has "
-        f"{counted(blocks, 'single block')}. The largest reading is "
-        f"{flux_density(float(np.nanmax(fields)), 4)}, the noise is "
-        f"{flux_density(float(np.nanmin(sigma)), 2)} at least.",
+        f"Readings up to {flux_density(largest, 4)} with a noise of {flux_density(low, 2)}"
+        f"{'' if np.isclose(low, high) else f' to {flux_density(high, 2)}'}. Simulated are a map "
+        f"of {counted(readings.sizes['point'], 'point')} (map.csv){more}, and coil measurements of "
+        f"{counted(blocks, 'single block')} (blocks.csv).",
         "Only as a test: the magnet was never built. Its blocks were drawn at random, and "
         "its field was computed with programs other than halbach-fe. A campaign may contain a "
         "hidden error, also of the positions that the map states.",

@@ -125,12 +125,14 @@ class Campaign:
         simulated = [f"folder {one.label}" for one in self.chapters
                      if one.verb == "simulate-measurement"]
         said = " ".join([
-            *self._newest(), f"{counted(len(self.chapters), 'result')} of one magnet.",
+            *self._newest(), *self._concerns(),
+            f"{counted(len(self.chapters), 'result')} of one magnet.",
             *([f"The map of {in_a_row(simulated)} is simulated, not measured."] if simulated
               else []), *instead,
             f"Not to be trusted as they are: {', '.join(f'folder {each}' for each in left)}."
             if left else "They do not all fit together." if self.doubts else
-            f"{'All others' if instead else 'The answers'} may be used as they stand."])
+            f"{'All others' if instead else 'The answers'} may be used"
+            f"{', for a test' if simulated else ' as they stand'}."])
         trust = (
             "No: they do not all fit together, as is said below." if self.doubts else
             "Yes: they are of " + (
@@ -151,6 +153,11 @@ class Campaign:
         found = [said for verb, said in sound if verb == "diagnose"]
         measured = [said for verb, said in sound if verb in OF_MEASURED]
         return [*found[-1:], *measured[-1:]]
+
+    def _concerns(self) -> list[str]:
+        """Return what is bad about the magnet, unless a later result of that command is good."""
+        return list(dict.fromkeys(answer.concern for chapter, _, answer in self.answered
+                                  if answer.concern and self.replaced(chapter) is None))
 
     def _next(self) -> Answer | None:
         """Return the answer whose next step is the one to take.

@@ -81,20 +81,23 @@ def answer(found: DemagnetizationMap) -> Answer:
         for share, limit in ((share, found.limit_temperature(share)) for share in SHARES))
     nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
                  if is_nonlinear(found.study) else "")
+    at = f"at {temperature:g}\u00a0°C"
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"{'No: at' if lost > 0 else 'Yes: at'} {temperature:g} °C, {start}. The smallest margin "
+        f"{'No' if lost > 0 else 'Yes'}: {at}, {start}. The smallest margin "
         f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
-        "within some per cent. The very edges of blocks are worse than any cell (--across makes "
-        f"cells smaller); shares of the volume hardly depend on that.{nonlinear}",
-        *(("Choose a grade of a higher coercivity for these blocks (the table says which), or a "
-           "lower temperature. What is lost is found in a measurement.",
+        "within some per cent. The very edges of blocks are worse than any cell (the option "
+        f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}",
+        *(("Choose a grade of a higher coercivity for these blocks (the table on the page says "
+           "which), or keep the magnet cooler. If it is built already, a measurement shows what "
+           "it has lost.",
            "halbach-fe diagnose STUDY --measurements MAP -o DIR") if lost > 0 else
           ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
            "halbach-fe forces STUDY -o DIR") if found.study.dimension == 3 else
           ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
-           "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")))
+           "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")),
+        concern=f"A{at[1:]}, {start}." if lost > 0 else "")
 
 
 @own_style

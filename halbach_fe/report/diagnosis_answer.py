@@ -26,11 +26,18 @@ from halbach_fe.report.unknown_cause import (
     unknown_advice,
     unknown_sentences,
 )
-from halbach_fe.report.words import decimals
+from halbach_fe.report.words import decimals, in_a_row
 
 UNUSUAL_AMPLITUDE = 20.0
 """Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
 magnet that is built with care."""
+
+
+REMEDIES = {
+    "block_flipped": "turn the block of {} the right way round",
+    "block_missing": "put the missing block of {} in",
+    "blocks_swapped": "exchange the blocks of {}"}
+"""What to do at the magnet about an effect that is an error of assembly, by the effect's name."""
 
 
 def answer(diagnosis: Diagnosis) -> Answer:
@@ -46,8 +53,10 @@ def answer(diagnosis: Diagnosis) -> Answer:
         doubts[0] = f"{verdict}. {doubts[0]}"
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
+    remedies = _remedies(diagnosis) if sound else []
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
-        diagnosis, sound), *_next(diagnosis), sound)
+        diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
+            f"In the magnet itself that can be put right: {in_a_row(remedies)}."))
 
 
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:
@@ -84,9 +93,19 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
                 check)
     if diagnosis.found_anything:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
+        if remedies := _remedies(diagnosis):
+            changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
+                       f"stays as it is, update it with {STUDY_FILE}, the study with what was "
+                       "found.")
         return (f"{changed} What else it could be, and which measurement would tell, is below."
                 if any(map(rivals, diagnosis.identified)) else changed), infer
     return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
+
+
+def _remedies(diagnosis: Diagnosis) -> list[str]:
+    """Say what can be put right at the magnet itself, by hand."""
+    return [REMEDIES[effect.hypothesis.effect.name].format(place_in_words(effect.place))
+            for effect in diagnosis.identified if effect.hypothesis.effect.name in REMEDIES]
 
 
 def _fails(diagnosis: Diagnosis) -> bool:

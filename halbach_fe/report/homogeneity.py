@@ -64,6 +64,11 @@ DRAWN = 24
 """Number of the harmonics in the figure: the largest ones, with names that can be read."""
 
 
+TOO_LARGE_FOR_A_TRAY = 1e4
+"""Deviation in ppm rms from which a tray of small magnets is not advised: 64 cubes of 4 mm in a
+magnet of 80 cubes of 12 mm took 6600 ppm away, of 77000."""
+
+
 def answer(found: HomogeneityResult) -> Answer:
     """Say how homogeneous the field of the best known magnet is, and what to do next."""
     name, best = list(found.by_name.items())[-1]
@@ -82,6 +87,13 @@ def answer(found: HomogeneityResult) -> Answer:
     trust, small = solver_error_text(found.model, best.rms_ppm)
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
+    designed = found.magnet.study.design is not None
+    if name != "prior" and best.rms_ppm > TOO_LARGE_FOR_A_TRAY and designed:
+        return Answer(
+            question, f"{text}.", f"{agreement(found.disagreement)} {trust}",
+            f"A deviation of {1e-4 * best.rms_ppm:.2g} % is that of the design: look for a better "
+            "one. Small magnets in a tray cannot make up for it.",
+            "halbach-fe design STUDY -o DIR", small)
     if name != "prior":
         return Answer(
             question, f"{text}.",

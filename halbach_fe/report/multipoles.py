@@ -110,15 +110,16 @@ def _location(model: MultipoleModel) -> str:
     return "integrated" if model.integrated else "cross-section" if model.z is None else "local"
 
 
-def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:
-    """Return the template variables of the table of a single circle; empty without circles.
+def middle_circle(tables: Sequence[MultipoleTable]) -> MultipoleTable:
+    """Return the circle nearest to the middle of the magnet, and of those the largest."""
+    return min(tables, key=lambda table: (abs(table[0].z or 0.0), -table[0].radius))
 
-    It is the circle nearest to the middle of the magnet, and of those the largest.
-    """
+
+def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:
+    """Return the template variables of the table of `middle_circle`; empty without circles."""
     if not tables:
         return {}
-    model, magnets = min(tables, key=lambda table: (
-        abs(table[0].z or 0.0), -table[0].radius))
+    model, magnets = middle_circle(tables)
     mains = "; ".join(f"{name} {main_in_words(model, known)}" for name, known in magnets.items())
     return {"reference": reference_text(model), "mains": mains, "rows": text_table(**magnets),
             "circles": len(tables)}

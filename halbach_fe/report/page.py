@@ -29,6 +29,7 @@ from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer, inputs_of_command
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
+from halbach_fe.report.words import faults_in_words
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -135,7 +136,7 @@ def _templates() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.globals["is_nonlinear"] = is_nonlinear
+    environment.globals |= {"is_nonlinear": is_nonlinear, "faults_of": faults_in_words}
     environment.filters["units_kept"] = units_kept
     return environment
 

@@ -34,6 +34,10 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import is_nonlinear
 
+LITTLE = 0.97
+"""Uncertainty relative to that of as many of the study's positions from which on a plan is hardly
+better."""
+
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
 
@@ -80,13 +84,14 @@ def _of_study(plan: MeasurementPlan) -> float:
 
 def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
-    left, of_study = (_rms(sd) / _rms(plan.prior_sd) for sd in (plan.planned_sd, plan.baseline_sd))
     points, same = len(plan.points), plan.same_information
     said = f"At the {counted(points, 'position')} of plan.csv. "
     if plan.deviation is None:
-        said += ("With them the standard deviation of a block's magnetization falls to "
-                 f"{fraction(left)} of the prior's, with as many of the study's positions to "
-                 f"{fraction(of_study)}. ")
+        left, of_study = _patterns(plan)
+        said += ("With them the standard deviation of a pattern of blocks, in the geometric mean "
+                 f"over all patterns, falls to {fraction(left)} of the prior's; with as many of "
+                 f"the study's own positions to {fraction(of_study)}"
+                 f"{'' if left < LITTLE * of_study else ', which is hardly more'}. ")
     else:
         said += (f"At a point of {plan.deviation.region.text}, the deviation of |B| from its mean "
                  f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms, after as many of "
@@ -101,7 +106,7 @@ def answer(plan: MeasurementPlan) -> Answer:
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else
                  f"All {len(plan.baseline)} positions of the study together tell more than these "
-                 f"{points}.")
+                 f"{points}{_of_all(plan)}.")
     return Answer(
         "Where should the magnet be measured?", said,
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
@@ -173,18 +178,30 @@ def _pattern_sd(plan: MeasurementPlan, gain: Floats) -> Floats:
     return np.asarray(np.exp(-gain / len(plan.parameters)))
 
 
+def _of_all(plan: MeasurementPlan) -> str:
+    """Say what all positions of the study leave, as the answer says it of the plan."""
+    if plan.deviation is not None:
+        return f": they leave {ppm(plan.deviation.baseline[-1])} ppm rms"
+    return f": they leave {fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))}"
+
+
 def _what_is_left(plan: MeasurementPlan) -> str:
     """Return in words by what `_nearly` counts positions."""
     return ("the standard deviation of a pattern of blocks (geometric mean over all patterns)"
             if plan.deviation is None else "the standard deviation of this deviation")
 
 
+def _patterns(plan: MeasurementPlan) -> Floats:
+    """Return what plan, and as many of the study's positions, leave of the sd of patterns."""
+    count = min(len(plan.points), len(plan.baseline))
+    return _pattern_sd(plan, np.array([
+        plan.gain[-1], plan.baseline_gain[np.searchsorted(plan.baseline_counts, count)]]))
+
+
 def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
     """Return rows of text that compare the plan with the positions of the study."""
     prior, same = _rms(plan.prior_sd), plan.same_information
-    count = min(len(plan.points), len(plan.baseline))
-    patterns = _pattern_sd(plan, np.array([
-        plan.gain[-1], plan.baseline_gain[np.searchsorted(plan.baseline_counts, count)]]))
+    patterns = _patterns(plan)
     return [
         {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
         {"": "positions that tell as much as all of the study's",

@@ -121,14 +121,29 @@ def _axes(nominal: Floats) -> Floats:
     return np.stack([along, across, np.cross(along, across)], axis=1)
 
 
+MOSTLY = 0.5 ** 0.5
+"""Part of a standard deviation from which a contribution makes more than half of the variance."""
+
+
+def _common_sd(prior: MeasuredPrior) -> float:
+    """Return the sd of the mean strength of all blocks, relative to it."""
+    weights = prior.nominal / np.sum(prior.nominal**2)
+    return float(prior.gaussian.sd_of(weights[None])[0])
+
+
 def answer(prior: MeasuredPrior) -> Answer:
     """Say how the measured blocks deviate from the study, and what to do next."""
     size = np.sqrt(np.mean(prior.nominal**2))
     spread = float(np.sqrt(np.mean(prior.gaussian.sd**2))) / size
     shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
-    said = (f"The {counted(prior.count, 'measured block')} deviate from the study's magnetization "
-            f"by {fraction(shift)} rms, and each is now known to {fraction(spread)}, both in "
-            "length and direction together. " + (
+    strength = float(np.mean(np.concatenate([each.deviations[:, 0] for each in prior.types])))
+    common = _common_sd(prior)
+    said = (f"On average the {counted(prior.count, 'measured block')} are "
+            f"{100 * abs(strength):.2g}\u00a0% {'stronger' if strength > 0 else 'weaker'} than the "
+            f"study says. In length and direction together they deviate from it by "
+            f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
+            + (f", most of which ({fraction(common)}) all blocks share, as they share the "
+               "calibration of the coil" if common > MOSTLY * spread else "") + ". " + (
                 "Ring and slot of every block are known: each has its own measurement."
                 if prior.placed else "Which block is in which slot is not known: all blocks of a "
                 "type have its mean and spread."))
@@ -138,8 +153,8 @@ def answer(prior: MeasuredPrior) -> Answer:
              "deviations are distributed normally"
              + (", which does not matter where each block is known." if prior.placed else ".")
              if not tested else
-             "Yes: the deviations are distributed normally, as the prior assumes, as far as so "
-             "many blocks can tell." if not odd else
+             "Yes: nothing speaks against normally distributed deviations, which the prior "
+             "assumes." if not odd else
              f"Only as mean and spread: the deviations of type {', '.join(odd)} are unlikely to be "
              f"distributed normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's "
              "correction)."

@@ -35,7 +35,7 @@ STUDY_FILE = "study.designed.toml"
 
 
 def answer(found: Designed) -> Answer:
-    """Say which rings are best and what more field costs, and what to do next."""
+    """Say which rings are best, what a stronger design has, and what to do next."""
     best, region = found.best, found.region.text
     start = "" if found.reached else ("No design reaches what is asked. The one that misses it by "
                                       "least: ")
@@ -44,7 +44,8 @@ def answer(found: Designed) -> Answer:
             f"{ppm(best.peak_to_peak_ppm)} ppm peak to peak. They weigh {best.mass_kg:.3g} kg."]
     stronger = [one for one in found.front if one.mean_T > best.mean_T]
     if stronger:
-        text.append(f"{1e3 * stronger[0].mean_T:.4g} mT are possible with "
+        text.append("The next stronger design of the table makes "
+                    f"{1e3 * stronger[0].mean_T:.4g} mT with "
                     f"{ppm(stronger[0].peak_to_peak_ppm)} ppm peak to peak.")
     least = smallest(found)
     return Answer(

@@ -43,6 +43,9 @@ from halbach_fe.study.edit_file import write_edited
 LITTLE = 0.05
 """Part of the rms below which the gain of all moves together is called hardly worth the work."""
 
+LIKELY = 0.5
+"""Probability below which the answer says that moves do not reach the limit."""
+
 DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
             "turn": "block that is turned in place", "replace": "block that is replaced"}
 """Names of the kinds of moves in the picture of all moves."""
@@ -186,19 +189,27 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         within = "The deviation is within {} ppm rms"
         see = "homogeneity"
     if shim.steps:
-        said = (f"{counted(len(shim.steps), 'move')}: {what} expected to fall from {before} to "
-                f"{after} {unit}, including the uncertainty.")
-        if _gained(shim) < LITTLE:
-            said += (f" That is {100 * _gained(shim):.2g} % for "
-                     f"{counted(len(shim.steps), 'move')}: hardly worth the work.")
+        moves = counted(len(shim.steps), "move")
+        said = (f"{what} expected to fall from {before} to {after} {unit}, including the "
+                "uncertainty.")
+        if result.disagreement:
+            said = ("No block yet: model and map disagree. If the model were right, with "
+                    f"{moves} {said}")
+        elif _gained(shim) < LITTLE:
+            said = (f"No block: with {moves} {said} That is {100 * _gained(shim):.2g} %, hardly "
+                    "worth the work.")
+        else:
+            said = f"Those of the table. With {moves} {said}"
     else:
         said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
                 "uncertainty.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
-        said += (f" {within.format(limit)} with a probability of {first} before and {last} "
-                 "after.")
+        said += f" {within.format(limit)} with a probability of {first}"
+        said += f" before and {last} after." if shim.steps else "."
+        if shim.steps and shim.within[1] < LIKELY:
+            said += " These moves do not reach that limit."
     ended = f"The search ended because {STOPS[shim.stop]}."
     if result.disagreement:
         return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
-from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
+from halbach_fe.report.multipoles import (
+    MultipoleTable,
+    middle_circle,
+    middle_table,
+    write_multipole_csv,
+)
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -35,23 +40,30 @@ from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
+MIDDLE_M = 1e-9
+"""Distance in m from the middle of a magnet below which a circle is there, but for rounding."""
+
 ROUGH = 1e-3
 """Error of the solver relative to the field above which a solution is not to be used."""
 
 
-def answer(solution: Solution) -> Answer:
-    """Say how strong the field is, how far the solver may be off, and what to do next."""
+def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
+    """Say how strong the field is, how far the solver may be off, and what to do next.
+
+    With ``tables``, the multipoles of the study's circles, the main one is said first.
+    """
     size = np.linalg.norm(solution.flux_density, axis=1)
     low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
     equal = flux_density(low, 4) == flux_density(high, 4)
-    said = (f"At the study's {counted(len(size), 'position')} the nominal magnet makes "
+    main = _main_multipole(tables, solution.magnet.dimension)
+    said = (f"{main}At the study's {counted(len(size), 'position')} the nominal magnet makes "
             f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.")
-    of_blocks = ("That is of the magnet as the study states it: what the tolerances of its blocks "
-                 "change is not in it.")
+    of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
+                 "the tolerances of its blocks besides.")
     if error <= ROUNDING * high:
-        return Answer("How strong is the field?", f"{said} Of blocks with a recoil permeability "
-                      "of 1, without iron, that is exact.",
-                      f"Yes: it is a closed form, without a mesh. {of_blocks}",
+        return Answer("How strong is the field?", said,
+                      "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "
+                      f"there is no iron, so that it is a closed form, without a mesh. {of_blocks}",
                       *_after_an_exact_field(solution))
     sigma = _smallest_noise(solution)
     reading = ("a Fourier coefficient of B_r on a circle" if is_fourier(solution.magnet.study)
@@ -63,13 +75,34 @@ def answer(solution: Solution) -> Answer:
                 f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
         "How strong is the field?",
-        f"{said} Mesh and boundary make a reading, {reading}, wrong by {flux_density(error)} at "
-        f"most ({relative(error / high)} of the largest |B|), by estimate.",
+        f"{said} The error that mesh and boundary make in {reading} is estimated as "
+        f"{flux_density(error)} at most, {relative(error / high)} of the largest |B|.",
         f"{compared}{of_blocks}",
         "Test that estimate with more meshes, which also say how far B at a point is off."
         if fine else
         "See how the error falls with the mesh, then refine mesh.block_size_m.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
+
+
+def _main_multipole(tables: Sequence[MultipoleTable], dimension: int) -> str:
+    """Say how strong the main multipole is in the middle: a dipole by its field, a quadrupole by
+    its gradient, others by their field at a radius. Empty without multipoles.
+    """
+    if not tables:
+        return ""
+    model, magnets = middle_circle(tables)
+    size = next(iter(magnets.values())).main
+    where = "In the middle" if dimension == 2 or abs(model.z or 0.0) < MIDDLE_M else (
+        f"At z = {1e3 * (model.z or 0.0):.4g}\u00a0mm")
+    circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
+    by = "" if dimension == 2 else f" (first harmonic at {circle})"
+    if model.main == 1:
+        return f"{where} the dipole field is {flux_density(size, 4)}{by}. "
+    if model.main == 2:
+        by = by.replace("first", "second")
+        return f"{where} the gradient is {size / model.radius:.4g}\u00a0T/m{by}. "
+    return (f"{where} the main multipole, of order {model.main}, is {flux_density(size, 4)} at "
+            f"{circle}. ")
 
 
 def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
@@ -90,9 +123,9 @@ def _smallest_noise(solution: Solution) -> float:
 @own_style
 def write_solution_report(
     solution: Solution, folder: Path, provenance: Mapping[str, str]
-) -> None:
+) -> Answer:
     """Write report.html, self-contained, and its figures as PNG into ``folder``; and
-    multipoles.csv, if the positions are full circles.
+    multipoles.csv, if the positions are full circles. Return the page's answer.
 
     ``provenance`` are words by key for the end of the page: versions, hashes of files, run time.
     """
@@ -110,15 +143,17 @@ def write_solution_report(
             solution.magnet, solution.points, solution.flux_density, solution.errors)]
     if multipoles:
         write_multipole_csv(solution.magnet.study, multipoles, folder / "multipoles.csv")
+    said = answer(solution, multipoles)
     write_page(
         folder / "report.html", "solution.html.j2", save(figures, folder),
         study=solution.magnet.study,
         magnet_rows=magnet_rows(solution.magnet),
         multipoles=middle_table(multipoles), exact=not solution.errors.any(), provenance=provenance,
-        answer=answer(solution), rows=field_table(solution),
+        answer=said, rows=field_table(solution),
         stray=stray_section(solution.stray_field),
         view=view_of_nominal_magnet(
             solution.magnet, field_points(solution.points, solution.flux_density)))
+    return said
 
 
 def field_table(solution: Solution) -> list[dict[str, str]]:
@@ -137,7 +172,7 @@ def field_table(solution: Solution) -> list[dict[str, str]]:
             for name, value in zip(components, seen, strict=False)} | {"at": where}
 
     def at(number: int) -> str:
-        point = 1e3 * solution.points[number].round(9) + 0.0
+        point = 1e3 * solution.points[number, :solution.magnet.dimension].round(9) + 0.0
         return "({}) mm".format(", ".join(f"{one:.4g}" for one in point))
 
     ends = {"strongest": int(np.argmax(size)), "weakest": int(np.argmin(size))}

@@ -170,11 +170,12 @@ def answer(found: SortedBlocks) -> Answer:
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
     return Answer(
         question,
-        f"As the table of places and blocks.sorted.csv say: {what} then {text(best)} "
-        f"{unit}{sizes}, instead of {text(own)} for the blocks {found.own_order}, and {text(low)} "
-        f"to {text(high)} for 95 % of random orders.{left}{turned}",
-        f"Yes. The uncertainty of {in_a_row(known)} adds {text(spread)} {unit}, whatever the "
-        f"order{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
+        f"The table of places says it, as blocks.sorted.csv does. In these slots {what} "
+        f"{text(best)} {unit}{sizes}; with the blocks {found.own_order} it would be "
+        f"{text(own)}, and in 95 % of random orders {text(low)} to {text(high)}.{left}{turned}",
+        f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "
+        "added by squares, whatever the order"
+        f"{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks.",
         "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")
 

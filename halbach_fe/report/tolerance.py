@@ -74,12 +74,12 @@ def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, st
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
-        row = {"n": str(order), "|c_n| of the mean magnet": _size(found, i),
+        within = {} if found.shares is None else {
+            "within the limit": f"{100 * found.shares[i]:.3g} %"}
+        row = {"n": str(order), **within, "|c_n| of the mean magnet": _size(found, i),
                "sd of b_n": f"{sd[i]:.3g}", "sd of a_n": f"{sd[size + i]:.3g}"}
         row |= {f"{100 * q:g} % below": f"{value:.3g}"
                 for q, value in zip(QUANTILES, found.quantiles[:, i], strict=True)}
-        if found.shares is not None:
-            row["within the limit"] = f"{100 * found.shares[i]:.3g} %"
         rows.append(row)
     return rows
 

@@ -84,8 +84,8 @@ def answer(found: Verification) -> Answer:
     noisy, noise = _beside_the_noise(found)
     trust = ("No: the last refinement does not change the field less than the one before. The "
              "estimate is rough, and the mesh should be finer." if rough else
-             f"Yes: the field converges as it should, with order {found.order:.1f} in the element "
-             "size.")
+             "Yes: the field converges. Elements of half the size divide its change by "
+             f"{2**found.order:.2g} (order {found.order:.1f}).")
     finer = (f"Make mesh.block_size_m smaller (elements are now "
              f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
              "halbach-fe verify STUDY -o DIR")

@@ -19,6 +19,9 @@ ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
 
 
+MOST_PLACES = 4
+"""Largest number of blocks that a line names."""
+
 CERTAIN = 100
 """Power of ten beyond which a Bayes factor is not told in detail."""
 
@@ -114,6 +117,22 @@ def in_a_row(names: Sequence[str]) -> str:
 def is_fourier(study: Study) -> bool:
     """Whether a reading of the study is a Fourier coefficient of B_r, not a component of B."""
     return study.observation.quantity == "fourier_coefficients"
+
+
+def faults_in_words(study: Study) -> str:
+    """Say which blocks the study has reversed, missing or in places of others; empty if none."""
+    found: dict[str, list[str]] = {}
+    for one in study.array.exceptions:
+        if one.ring is None or one.slot is None:
+            continue
+        kind = ("missing" if not one.magnetization_factor else "reversed"
+                if one.magnetization_factor < 0 else "made for another place"
+                if one.mounted_from not in (None, (one.ring, one.slot)) else None)
+        if kind:
+            found.setdefault(kind, []).append(block_in_words(one.ring, one.slot))
+    return "; ".join(
+        f"{kind}: " + ("; ".join(places) if len(places) <= MOST_PLACES else f"{len(places)} blocks")
+        for kind, places in found.items())
 
 
 def place_of(block: MagnetBlock) -> str:

@@ -15,6 +15,7 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.assembly import cad
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
+from halbach_fe.report.assembly import spacers
 from halbach_fe.report.assembly_sheets import drawing, height_mm, sheets
 from halbach_fe.report.page import rendered
 from halbach_fe.study.reader import parse_study
@@ -162,13 +163,40 @@ def test_a_drawing_explains_the_marks_that_it_has(there):
     page = rendered("assembly.html.j2", study=plan.magnet.study, answer=None, pictures=[],
                     provenance={},
                     sheets=found, holder=plan.holder, prefix="", measured=False, kinds=[],
-                    plates=[], diameters="", files=[])
+                    plates=[], diameters="", spacers="", files=[])
     for words, key in EXPLAINED.items():
         assert (words in page) == (key == there)
     assert all(bool(one.engraved) == (there == "engraving_m") for one in found)
     (plate,) = plan.plates
     outlines = found[0].plate.count("M")
     assert outlines == 1 + len(plate.openings) - len(plate.bars)
+
+
+def test_spacers_fill_what_is_between_plates():
+    """Two plates of one ring each, whose distance the study gives."""
+    plan = cad(build_magnet(study()), None)
+    (low, high) = sorted((height, plate.thickness_m) for plate in plan.plates
+                         for height in plate.heights_m)[:2]
+    gap = 1e3 * (high[0] - low[0] - low[1])
+    assert f"plates are {gap:.4g}\u00a0mm long" in spacers(plan)
+    (plate,) = plan.plates
+    alone = replace(plan, plates=(replace(plate, heights_m=plate.heights_m[:1]),))
+    assert spacers(alone) == ""
+
+
+def test_the_sheet_names_the_kind_that_was_ordered():
+    """A kind that is another one upside down is not in the order."""
+    array = DOCUMENT["array"] | {"block": {"shape": "cuboid", "width_m": SIDE}}
+    plan = cad(build_magnet(parse_study(DOCUMENT | {"array": array})), None)
+    (sheet, *_) = sheets(plan)
+    turned = {kind.number: first for kind, first in zip(plan.kinds, plan.ordered_as, strict=True)}
+    rows = [row for rows in drawing(sheet, "", turned).tables for row in rows]
+    assert {row["kind"] for row in rows} == {
+        str(one.kind.number) if turned[one.kind.number] == one.kind.number
+        else f"{turned[one.kind.number]}, upside down" for one in sheet.blocks}
+    assert any("upside down" in row["kind"] for row in rows)
+    assert not any("upside down" in row["kind"]  # the control
+                   for rows in drawing(sheet, "").tables for row in rows)
 
 
 def test_heights_that_are_zero_but_for_rounding_are_zero():

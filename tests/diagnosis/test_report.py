@@ -201,6 +201,12 @@ def test_both_of_two_swapped_blocks_are_named(flat):
     words = "ring 1, slot 3 and ring 1, slot 12"
     assert words in verdict(both)
     assert found_table(both)[0]["place"] == words
+    said = answer(both)  # an error of assembly can be put right, others cannot
+    assert f"exchange the blocks of {words}, and measure again" in said.step
+    assert "study.diagnosed.toml" in said.command
+    assert words in said.concern
+    assert answer(found).concern == ""
+    assert "Look at the magnet" not in answer(found).step
     assert diagnosis_summary(both)["effects"][0]["place"] == "r01s03, r01s12"
     assert "r01s03, r01s12" in note(both.identified[0])
     own = Place(1, 3, other=(1, 4), labels=("A7", "r01s04"))  # a free block has its own label

@@ -44,7 +44,14 @@ from halbach_fe.report import (
     verification,
 )
 from halbach_fe.report.answer import Answer, known_paths
-from halbach_fe.report.words import bayes_factor, decimals, flux_density, ppm, with_error
+from halbach_fe.report.words import (
+    bayes_factor,
+    decimals,
+    faults_in_words,
+    flux_density,
+    ppm,
+    with_error,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -68,6 +75,10 @@ MAGNET = {
         "coercivity_coefficient_per_K": -0.006, "temperature_C": 60}}
 """Sixteen cubes in vacuum, where nothing has to be solved."""
 
+ALIASES = 0.05
+"""Part of a main multipole that eight angles may mistake for it, and that the answer subtracts: the
+order 8 - n of eight cubes, at 0.6 of their radius."""
+
 
 class Given:
     """The magnet, and what the commands need."""
@@ -89,6 +100,41 @@ def of_solve(given):
     found = hf.solve(given.magnet, given.session)
     size = np.linalg.norm(found.flux_density, axis=1)
     return solution.answer(found), [flux_density(size.max(), 4), "exact", "homogeneity STUDY"]
+
+
+def test_the_field_in_the_middle_is_said_first(given, tmp_path):
+    """A dipole by its field, a quadrupole by its gradient; without circles nothing is known."""
+    for order, name, scale, unit in ((1, "dipole field", 1e-3, "mT"), (2, "gradient", 0.03, "T/m"),
+                                     (3, "main multipole, of order 3,", 1e-3, "mT")):
+        magnet = build_magnet(given.study.with_(array__multipole_order=order))
+        found = hf.solve(magnet, given.session)
+        on_circle = np.isclose(found.points[:, 2], 0)  # B_r at 8 angles
+        angle = np.arctan2(*found.points[on_circle, 1::-1].T)
+        radial = (found.flux_density[on_circle, :2] * np.column_stack(
+            [np.cos(angle), np.sin(angle)])).sum(axis=1)
+        size = 2 * abs(np.mean(radial * np.exp(-1j * order * angle)))
+        said = solution.write_solution_report(found, tmp_path, {}).said
+        assert re.match(f"In the middle the {name} is ([0-9.]+)\u00a0{unit}", said)
+        value = float(re.search("is ([0-9.]+)", said)[1])
+        assert value == pytest.approx(size / scale, rel=ALIASES)
+    assert "In the middle" not in solution.answer(found).said
+
+
+def test_blocks_that_are_not_as_designed_are_named(given):
+    """Below the title of every page, so that no number of theirs is read as the design's."""
+    def said(*exceptions):
+        return faults_in_words(given.study.with_(array__exceptions=exceptions))
+
+    assert said() == ""
+    assert said({"ring": 1, "slot": 3, "displacement_m": (1e-4, 0, 0)}) == ""
+    assert said({"ring": 1, "slot": 3, "magnetization_factor": -0.98},
+                {"ring": 1, "slot": 5, "magnetization_factor": 0}) == (
+        "reversed: ring 1, slot 3; missing: ring 1, slot 5")
+    assert said({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
+                {"ring": 1, "slot": 2, "mounted_from": (1, 1)}) == (
+        "made for another place: ring 1, slot 1; ring 1, slot 2")
+    assert "6 blocks" in said(*(
+        {"ring": 1, "slot": slot, "magnetization_factor": -1} for slot in range(1, 7)))
 
 
 def of_verify(given):
@@ -164,8 +210,9 @@ def of_forces(given):
 
 def of_plan(given):
     found = hf.plan(given.magnet, given.session, points=6)
-    left = np.sqrt(np.mean(found.planned_sd**2) / np.mean(found.prior_sd**2))
-    return plan.answer(found), ["6 positions", f"{100 * left:.1f}"]
+    left = np.exp(-found.gain[-1] / len(found.parameters))
+    every = np.exp(-found.baseline_gain[-1] / len(found.parameters))
+    return plan.answer(found), ["6 positions", f"{100 * left:.1f}", f"{100 * every:.1f}"]
 
 
 def of_prior(given):
@@ -179,7 +226,7 @@ def of_sort(given):
     size = np.sqrt(np.mean(found.best.sizes**2))
     low, high = np.quantile(found.random, [0.025, 0.975])
     return sorting.answer(found), [f"{size:.3g} units", "blocks.sorted.csv",
-                                   f"{low:.3g} to {high:.3g} for 95 % of random orders"]
+                                   f"in 95 % of random orders {low:.3g} to {high:.3g}"]
 
 
 @pytest.mark.filterwarnings("ignore:Every block of study")
@@ -227,7 +274,7 @@ def of_tolerance(given):
 def of_demagnetization(given):
     found = hf.demagnetization(given.magnet, given.session, across=2)
     return demagnetization.answer(found), [
-        f"{1e-3 * found.margin.min():+.0f} kA/m", "Yes: at 60 °C", "ring "]
+        f"{1e-3 * found.margin.min():+.0f} kA/m", "Yes: at 60\u00a0°C", "ring "]
 
 
 def of_simulate(given):

@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -92,7 +93,7 @@ def test_every_answer_is_on_the_page(campaign, capsys):
         for key in ("question", "said", "trust", "step"):
             assert said["answer"][key] in page.text
     assert ("4 results of one magnet. The map of folder simulated is simulated, not measured. The "
-            "answers may be used as they stand.") in page.text
+            "answers may be used, for a test.") in page.text
     assert "1 ring of 4 sectors" in page.text
     assert [one for one in page.links if one.startswith("#")] == [
         *(f"#part-{number}" for number in (1, 2, 3, 4, 4, 3, 4))]  # contents, next steps
@@ -428,6 +429,18 @@ def test_the_next_command_names_the_folder_of_its_answer(home):
         f"halbach-fe verify {home / 'diagnosis' / 'new.toml'} -o DIR")
 
 
+def test_what_is_bad_about_the_magnet_is_said_first(home):
+    """However many results come after it, unless a later one of that command is good."""
+    bad = Answer("Do they?", "No.", "Yes.", "Choose.", concern="At 60 °C, half of it is lost.")
+    results(home / "a-hot", "demagnetization", answer=bad)
+    said = found_in(home, "field", "a-hot", "inferred").answer.said
+    assert bad.concern in said
+    assert said.index(bad.concern) < said.index("results of one magnet")
+    assert bad.concern not in found_in(home, "field", "inferred").answer.said  # the control
+    results(home / "b-cool", "demagnetization", answer=replace(bad, said="Yes.", concern=""))
+    assert bad.concern not in found_in(home, "field", "a-hot", "b-cool").answer.said
+
+
 def test_a_better_answer_replaces_one_that_is_not_sound(home):
     """Which the diagnosis of it led to; alone it makes the whole page doubtful."""
     study = home / "study.toml"
@@ -599,4 +612,4 @@ def test_page_records_are_of_what_is_on_the_page(tmp_path):
         "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
-                   "sound": True}}
+                   "sound": True, "concern": ""}}

@@ -1,4 +1,4 @@
-"""A block that was mounted upside down."""
+"""A block that was mounted the wrong way round."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ class BlockFlippedEffect(BlockMissingEffect):
     """One block has the opposite magnetization."""
 
     name = "block_flipped"
-    title = "block mounted upside down"
+    title = "block with its magnetization reversed"
     factor = -1.0
 
 
