@@ -95,12 +95,11 @@ def run(arguments: argparse.Namespace) -> int:
         write_updated_study,
     )
     from halbach_fe.report.inference import score_table, write_inference_report
-    from halbach_fe.report.inference_answer import answer
     from halbach_fe.report.magnetic_axis import axis_rows
     from halbach_fe.report.stray_field import stray_rows
 
     write_inference(result, arguments.output)
-    write_inference_report(result, arguments.output, provenance={
+    answer = write_inference_report(result, arguments.output, provenance={
         "GetDP": session.getdp.version, **common.digests({
             "study file": arguments.study, **common.map_files(arguments, study),
             "held-out map": arguments.held_out, "blocks": arguments.blocks})})
@@ -115,5 +114,5 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_table(overlap_table(result), "Maps where they overlap")
         common.print_table(axis_rows(result.magnetic_axis), "Magnetic centre, axis and roll")
         common.print_table(stray_rows(result.stray_field), "Outside of the magnet")
-        common.say_answer(arguments, answer(result), arguments.output / "report.html")
+        common.say_answer(arguments, answer, arguments.output / "report.html")
     return 0

@@ -51,8 +51,8 @@ FIGURES = {
                "all other readings; markers are filled if the group disagrees with the model"),
     "residuals": (figures.residuals, "Standardized leave-one-out residuals of the training "
                   "readings"),
-    "probabilities": (figures.probabilities, "Left: posterior probability of each effect of the "
-                      "catalogue, if at most one effect is missing and nothing else. Right: how "
+    "probabilities": (figures.probabilities, "Above: posterior probability of each effect of the "
+                      "catalogue, if at most one effect is missing and nothing else. Below: how "
                       "many times as probable the readings are with each identified effect, or an "
                       "alternative of it, as without (Bayes factor); the dashed line is the "
                       "threshold"),

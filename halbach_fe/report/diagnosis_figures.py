@@ -274,8 +274,9 @@ def profile(diagnosis: Diagnosis) -> Figure:
         bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
     top.plot(along[~held], 1e3 * measured[~held], ".", color=MEASURED, ms=4,
              label="measured, training")
-    top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
-             label="measured, held out")
+    if held.any():
+        top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
+                 label="measured, held out")
     band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     if connected:
         bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
@@ -91,8 +92,8 @@ def _chi2(value: float | None) -> str:
 def write_inference_report(
     result: InferenceResult, folder: Path, published: PublishedErrors | None = None,
     assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
-) -> None:
-    """Write report.html and its figures into a folder.
+) -> Answer:
+    """Write report.html and its figures into a folder; return the page's answer.
 
     If the readings are on full circles, multipoles.csv is written too.
 
@@ -146,12 +147,13 @@ def write_inference_report(
             result.magnet, result.observation, result.response))]
     if multipoles:
         write_multipole_csv(result.study, multipoles, folder / "multipoles.csv")
+    said = answer(result, multipoles)
     write_page(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
         provenance=provenance, result=result, multipoles=middle_table(multipoles),
         rows=score_table(result, published), published=published, assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet),
-        answer=answer(result),
+        answer=said,
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
         noise=[flux_density(float(end), 2)
                for end in (result.noise.sd.min(), result.noise.sd.max())],
@@ -163,6 +165,7 @@ def write_inference_report(
             "" if result.magnetic_axis is None else definition(result.magnetic_axis)),
         stray=stray_section(result.stray_field), view=view_of_inference(result),
         view_colours=colours_in_words(result))
+    return said
 
 
 def _solver_error(result: InferenceResult) -> str:

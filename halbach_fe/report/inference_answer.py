@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import Answer
+from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import decimals, flux_density, fraction, place_of, with_error
 
 
-def answer(result: InferenceResult) -> Answer:
-    """Say how well the updated magnet predicts, what its blocks are like, and what to do next."""
-    said = f"{_prediction(result)} {_blocks(result)}"
+def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
+    """Say what field the updated magnet has, how well it predicts, and what to do next.
+
+    The field is the main one of ``tables``, the multipoles of the study's circles.
+    """
+    said = f"{main_field_in_words(tables)} {_prediction(result)} {_blocks(result)}".lstrip()
     question = "What is the measured magnet like?"
     if result.disagreement:
         return Answer(question, "Model and measurement disagree, so that these numbers and their "

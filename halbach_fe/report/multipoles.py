@@ -24,7 +24,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import probability, with_error
+from halbach_fe.report.words import decimals, probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
 
@@ -36,6 +36,9 @@ CONVENTION = "B_y + i B_x = sum (B_n + i A_n) ((x + i y) / R)^(n - 1); n = 1 is 
 DRAWS = 10_000
 """Number of samples of the multipoles from which the probability of being within a limit is
 estimated, with a standard error of 0.5 % at most."""
+
+MIDDLE_M = 1e-9
+"""Distance in m from the middle of a magnet below which a circle is there, but for rounding."""
 
 COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
@@ -113,6 +116,29 @@ def _location(model: MultipoleModel) -> str:
 def middle_circle(tables: Sequence[MultipoleTable]) -> MultipoleTable:
     """Return the circle nearest to the middle of the magnet, and of those the largest."""
     return min(tables, key=lambda table: (abs(table[0].z or 0.0), -table[0].radius))
+
+
+def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
+    """Say how strong the best known magnet's main multipole is in the middle; empty without tables.
+
+    Of a dipole that is its field, of a quadrupole its gradient, of others the field at a radius.
+    """
+    if not tables:
+        return ""
+    model, magnets = middle_circle(tables)
+    known = list(magnets.values())[-1]
+    where = "In the middle" if abs(model.z or 0.0) < MIDDLE_M else (
+        f"At z = {1e3 * (model.z or 0.0):.4g}\u00a0mm")
+    circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
+    name, scale, unit = {
+        1: ("dipole field", 1e3, "mT"), 2: ("gradient", 1 / model.radius, "T/m")}.get(
+            model.main, (f"main multipole, of order {model.main},", 1e3, f"mT at {circle}"))
+    size = (with_error(scale * known.main, scale * known.main_sd) if known.main_sd > 0
+            else decimals(scale * known.main, 4))
+    # in 3D the harmonic of a circle is not the field on the axis
+    by = f" (harmonic of order {model.main} at {circle})" if model.z is not None and (
+        model.main in (1, 2)) else ""
+    return f"{where} the {name} is {size}\u00a0{unit}{by}."
 
 
 def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:

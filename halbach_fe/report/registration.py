@@ -77,9 +77,15 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
         best.middle_m, best.translation_sd_m, strict=True))
     said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
             "magnet.")
+    alike = sum(_fit_alike(best, each) for each in found[1:])
+    if alike:
+        said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
+                 "likely.")
     trust = [*_other_poses(found), _fit(best, before)]
     sound = best.explains and best.at_rest
     maps = "" if name else " --measurements MAP"
+    if best.explains and not best.at_rest:
+        said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
     if best.explains:
         trust.insert(0, AT_REST if best.at_rest else NOT_AT_REST)
     else:

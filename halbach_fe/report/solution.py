@@ -14,7 +14,7 @@ from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
     MultipoleTable,
-    middle_circle,
+    main_field_in_words,
     middle_table,
     write_multipole_csv,
 )
@@ -40,9 +40,6 @@ from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
-MIDDLE_M = 1e-9
-"""Distance in m from the middle of a magnet below which a circle is there, but for rounding."""
-
 ROUGH = 1e-3
 """Error of the solver relative to the field above which a solution is not to be used."""
 
@@ -55,9 +52,9 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
     size = np.linalg.norm(solution.flux_density, axis=1)
     low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
     equal = flux_density(low, 4) == flux_density(high, 4)
-    main = _main_multipole(tables, solution.magnet.dimension)
-    said = (f"{main}At the study's {counted(len(size), 'position')} the nominal magnet makes "
-            f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.")
+    main = main_field_in_words(tables)
+    said = (f"{main} At the study's {counted(len(size), 'position')} the nominal magnet makes "
+            f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.").lstrip()
     of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
                  "the tolerances of its blocks besides.")
     if error <= ROUNDING * high:
@@ -82,27 +79,6 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
         if fine else
         "See how the error falls with the mesh, then refine mesh.block_size_m.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
-
-
-def _main_multipole(tables: Sequence[MultipoleTable], dimension: int) -> str:
-    """Say how strong the main multipole is in the middle: a dipole by its field, a quadrupole by
-    its gradient, others by their field at a radius. Empty without multipoles.
-    """
-    if not tables:
-        return ""
-    model, magnets = middle_circle(tables)
-    size = next(iter(magnets.values())).main
-    where = "In the middle" if dimension == 2 or abs(model.z or 0.0) < MIDDLE_M else (
-        f"At z = {1e3 * (model.z or 0.0):.4g}\u00a0mm")
-    circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
-    by = "" if dimension == 2 else f" (first harmonic at {circle})"
-    if model.main == 1:
-        return f"{where} the dipole field is {flux_density(size, 4)}{by}. "
-    if model.main == 2:
-        by = by.replace("first", "second")
-        return f"{where} the gradient is {size / model.radius:.4g}\u00a0T/m{by}. "
-    return (f"{where} the main multipole, of order {model.main}, is {flux_density(size, 4)} at "
-            f"{circle}. ")
 
 
 def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
