@@ -9,7 +9,7 @@ dropped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -333,7 +333,7 @@ class Competition:
         return self.needed(effects, terms)
 
     def best_explanations(
-        self, catalogued: Sequence[int], scattered: bool = False
+        self, catalogued: Sequence[int], scattered: Collection[int] = ()
     ) -> tuple[Explanation, Explanation]:
         """Return the best explanation, with such effects only as may be named, and the best one
         without any effect.
@@ -342,9 +342,9 @@ class Competition:
         ----------
         catalogued : sequence of int
             The effects that are the best explanation by the catalogue alone, the first found first.
-        scattered : bool
-            Whether these are sources at so many places that they could make up any field, and so
-            name nothing.
+        scattered : collection of int
+            Those of them that are sources at so many places that they could make up any field, and
+            so name nothing. They are left to terms; the other effects are judged beside these.
         """
         by_catalogue = self.explanation(catalogued, ())
         without = self.extended(())
@@ -358,9 +358,12 @@ class Competition:
                 extended = self.extended(start)
                 found += [extended, self.with_more_effects(extended)]
         best = max((by_catalogue, *found), key=lambda one: one.log_odds)
+        if not best.terms and set(scattered) & set(best.effects):
+            others = [number for number in best.effects if number not in scattered]
+            best = self.extended(others) if others else without
         if not best.terms:
             tie = without.log_odds > best.log_odds - INDISTINGUISHABLE_LOG_EVIDENCE
-            instead = scattered or (tie and len(best.effects) >= MANY)
+            instead = tie and len(best.effects) >= MANY
             return without if instead and without.terms else by_catalogue, without
         if not best.effects:
             return best, without

@@ -141,9 +141,11 @@ def judge(
     competition = Competition(marginal, columns[some], residual[some], evidence,
                               search.candidates, flexible, lambda fields: whiten(fields)[some])
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
-    sources = [effect.hypothesis.place.at_m for effect in identified
-               if effect.hypothesis.effect.name == "ferromagnetic_object"]
-    best, without = competition.best_explanations(numbers, are_scattered(sources))
+    sources = {number: effect.hypothesis.place.at_m
+               for number, effect in zip(numbers, identified, strict=True)
+               if effect.hypothesis.effect.name == "ferromagnetic_object"}
+    best, without = competition.best_explanations(
+        numbers, list(sources) if are_scattered(list(sources.values())) else ())
     return Judgement(competition, competition.explanation(numbers, ()), best, without, whiten)
 
 

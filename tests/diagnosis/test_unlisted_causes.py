@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from halbach_fe.diagnosis import diagnose as module
+from halbach_fe.diagnosis.competition import Competition, Explanation
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
-from halbach_fe.diagnosis.search import NominalSolver
+from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.search import NominalSolver, possible
 from halbach_fe.diagnosis.unknown_cause import are_scattered
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.session import Session
@@ -132,6 +137,50 @@ def test_scattered_sources():
     assert not are_scattered(around_one)
     assert are_scattered([*around_one, (0.0, -0.1, 0.12)])
     assert not are_scattered([(0.0, 0.1, 0.12), (0.0, -0.1, 0.12)])  # two may well be two
+
+
+@pytest.mark.parametrize(("terms_alone", "named"), [(500.0, (0,)), (850.0, ())])
+def test_scattered_sources_do_not_take_a_strong_effect_with_them(terms_alone, named):
+    """They are left to terms of any shape, and what is beside them keeps its name if terms alone
+    are much less likely.
+    """
+    term = "a field of any shape"
+
+    class Judged(Competition):
+        """A competition in which an effect and sources explain most, and terms nearly as much."""
+
+        def __init__(self):
+            self.candidates = [object()] * 5
+
+        def explanation(self, effects, terms):
+            return Explanation(tuple(effects), tuple(terms), {0: 0.0, 1: 800.0, 5: 1000.0}[
+                len(effects)], 1.5)
+
+        def extended(self, effects):
+            there = 0 in effects
+            return Explanation((0,) * there, (term,), 900.0 if there else terms_alone, 1.1)
+
+        def with_more_effects(self, start):
+            return start
+
+        def necessary(self, effects):
+            return []
+
+    # terms beside the effect add 100; without it 400 are lost, or only 50
+    best, without = Judged().best_explanations((0, 1, 2, 3, 4), scattered=(1, 2, 3, 4))
+    assert (best.effects, best.terms, without.effects) == (named, (term,), ())
+    alone, _ = Judged().best_explanations((0, 1, 2, 3, 4))  # the control: in one place
+    assert (len(alone.effects), alone.terms) == (5, ())
+
+
+def test_a_small_part_of_a_ring_is_no_ring(small):
+    """A ring is applied in full: 2 % of it stand for something else."""
+    effect = next(one for one in catalogue() if one.name == "iron_ring")
+    place = effect.places(small)[0]
+    for strength, is_possible in ((0.02, False), (-0.5, False), (0.5, True)):
+        found = IdentifiedEffect(Hypothesis(effect, place), np.array([strength]), np.ones(1), None)
+        campaign = SimpleNamespace(points_of=lambda study: np.zeros((1, 3)))
+        assert possible(small, [found], campaign) == is_possible
 
 
 def test_every_family_is_drawn_and_seen():
