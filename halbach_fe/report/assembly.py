@@ -43,8 +43,8 @@ def answer(assembly: Assembly) -> Answer:
                     "blocks on each side" + (
                         "." if np.isinf(wall) else
                         f", and the thinnest wall is {1e3 * wall:.3g}\u00a0mm."))
-        step = ("Make one pocket first and try a block in it; then print this page, and go sheet "
-                "by sheet. See which forces the blocks will feel.")
+        step = ("Make one pocket first and try a block in it; then print the page of this plan, "
+                "and go sheet by sheet. See which forces the blocks will feel.")
     else:
         step = "See which forces the blocks feel, for tools and glue."
     if assembly.left_over:

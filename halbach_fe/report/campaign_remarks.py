@@ -11,8 +11,10 @@ from itertools import combinations
 from pathlib import PurePath
 from typing import Any
 
+from halbach_fe.diagnosis.summary import block_in_words
 from halbach_fe.report.campaign_folders import Chapter
 from halbach_fe.report.words import counted, in_a_row
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.differences import differences
 from halbach_fe.study.model import Study, magnet_description
 
@@ -21,6 +23,9 @@ FINDING = ("register", "diagnose")
 
 OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
 """Commands whose results are of the measured magnet, and should be of such a study."""
+
+EXCEPTIONS = "array.exceptions"
+"""Key of the blocks that deviate from the array."""
 
 MOST_FILES, MOST_KEYS, MOST_VALUE = 6, 3, 40
 """Largest numbers of files and of keys that a sentence names, and of characters of a value."""
@@ -170,6 +175,8 @@ def _difference(key: str, old: Any, new: Any) -> str:
     if any(isinstance(value, list) and value and isinstance(value[0], dict)
            for value in (old, new)):
         before, now = len(old or ()), len(new or ())
+        if key == EXCEPTIONS and 0 < now - before <= MOST_KEYS and new[:before] == (old or []):
+            return f"{key} has {in_a_row([_exception(one) for one in new[before:]])} besides"
         if before == now:
             return f"{key} has {counted(now, 'entry', 'entries')}, as before, but not the same"
         return f"{key} has {counted(now, 'entry', 'entries') if now else 'no entry'}, and " + (
@@ -179,6 +186,15 @@ def _difference(key: str, old: Any, new: Any) -> str:
     if new in (None, []):
         return f"{key} is not given, and was {_short(old)} before"
     return f"{key} is {_short(new)} instead of {_short(old)}"
+
+
+def _exception(entry: dict[str, Any]) -> str:
+    """Return an entry of `array.exceptions` in words: the block, and what it deviates by."""
+    usual = BlockException().model_dump(mode="json")
+    own = ", ".join(f"{key} = {_short(value)}" for key, value in entry.items()
+                    if value != usual[key] and key not in ("ring", "slot"))
+    place = block_in_words(entry["ring"] or 0, entry["slot"] or 0) or "all blocks"
+    return f"{place} ({own})"
 
 
 def _short(value: Any) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,9 +19,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.summary import rivals
+from halbach_fe.diagnosis.summary import block_in_words, place_in_words, rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
+from halbach_fe.report.diagnosis_answer import catalogue_titles, title_of
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -32,6 +35,12 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.point_maps import residual_figure
 from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
+
+NONE = "none"
+"""Name of the probability that nothing is missing."""
+
+LONGEST_NAME = 30
+"""Number of characters in a line of an effect's name beside its bar."""
 
 MAX_BARS = 8
 """Largest number of bars of a chart, and of rows of residuals."""
@@ -214,17 +223,30 @@ def _colours(limit: float) -> ScalarMappable:
 def probabilities(diagnosis: Diagnosis) -> Figure:
     """Draw the probabilities of effects, and Bayes factors of identified effects and rivals."""
     top = sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])[:MAX_BARS]
+    titles = catalogue_titles(diagnosis)
+
+    def in_words(name: str, place: str = "") -> str:
+        """Return the description of an effect in short lines."""
+        said = "nothing is missing" if name == NONE else title_of(name, titles)
+        place = re.sub(r"\br(\d+)s(\d+)\b", lambda found: block_in_words(
+            int(found[1]), int(found[2])), place)
+        return textwrap.fill(", ".join(filter(None, (said, place))), LONGEST_NAME)
+
     bars = []
     for effect in diagnosis.identified:
-        bars.append((effect.selection.candidate.name, effect.selection.log_bayes_factor, POSTERIOR))
-        bars += [(f"or {rival.name}", factor, PUBLISHED) for rival, factor in rivals(effect)]
+        own = effect.hypothesis
+        bars.append((in_words(own.effect.name, place_in_words(own.place)),
+                     effect.selection.log_bayes_factor, POSTERIOR))
+        bars += [("or " + in_words(rival.effect, rival.place), factor, PUBLISHED)
+                 for rival, factor in rivals(effect)]
     if diagnosis.unknown is not None:
         bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MAX_BARS]
     heights = [0.7 + 0.3 * len(top), 0.7 + 0.3 * max(len(bars), 1)]
     figure = figure_of(sum(heights) + 0.2)
     left, right = figure.subplots(2, 1, height_ratios=heights)
-    left.barh([name for name, _ in top], [100 * value for _, value in top], color=POSTERIOR)
+    left.barh([in_words(name) for name, _ in top], [100 * value for _, value in top],
+              color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
         left.text(100 * value + 1, height, said, va="center", fontsize=SMALL)

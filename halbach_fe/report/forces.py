@@ -69,8 +69,8 @@ def answer(found: Forces) -> Answer:
         next_one = int(np.argmax(found.inserted.magnitude))
         inserted, block = found.inserted.magnitude[next_one], found.blocks[next_one]
         text.append(
-            f"While the blocks are inserted the largest is {_newton(inserted)} "
-            f"({_heavy(inserted)}), on {place_of(block)}, the "
+            "During the assembly, of blocks in their places before the next ones are there, the "
+            f"largest is {_newton(inserted)} ({_heavy(inserted)}), on {place_of(block)}, the "
             f"{_ordinal(int(found.step[next_one]))} of {len(found.blocks)}, "
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
     error = float(found.in_place.error_N[worst])
@@ -133,13 +133,14 @@ def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
     azimuthal = np.array([-radial[1], radial[0], 0.0])
     parts = sorted([(float(unit @ radial), "away from the axis", "towards the axis"),
                     (float(unit @ azimuthal), "counter-clockwise", "clockwise"),
-                    (float(unit[2]), "along +z", "along -z")], key=lambda part: -abs(part[0]))
+                    (float(unit[2]), "along +z", "along −z")], key=lambda part: -abs(part[0]))
     if not radius:
-        parts = sorted(((float(unit[k]), f"along +{name}", f"along -{name}")
+        parts = sorted(((float(unit[k]), f"along +{name}", f"along −{name}")
                         for k, name in enumerate(COMPONENTS)), key=lambda part: -abs(part[0]))
     words = [plus if size > 0 else minus for size, plus, minus in parts]
     text = words[0] if abs(parts[0][0]) > MAIN else f"{words[0]} and {words[1]}"
-    return f"{text} ({', '.join(f'{value:+.2f}' for value in unit.round(2) + 0.0)})"
+    numbers = ", ".join(f"{value:+.2f}" for value in unit.round(2) + 0.0)
+    return f"{text} (x, y, z: {numbers})".replace("-", "−")
 
 
 def force_rows(found: Forces) -> list[dict[str, str]]:

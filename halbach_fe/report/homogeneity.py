@@ -117,8 +117,8 @@ def _of_map(found: HomogeneityResult) -> str:
     low, _, high = map(ppm, known.rms_range_ppm)
     if found.map_misfit > POOR:
         return ""
-    return (f"; the readings themselves{' that were held out' if name == HELD_OUT_PART else ''} "
-            f"have {ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high})")
+    return (f"; a fit to the {'held-out ' if name == HELD_OUT_PART else ''}readings alone has "
+            f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high})")
 
 
 def _misfit(found: HomogeneityResult) -> str:

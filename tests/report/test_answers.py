@@ -524,7 +524,7 @@ def test_blocks_that_share_the_largest_force_are_named(given):
     for number in equal[equal != np.argmax(size)]:
         block = found.blocks[number]
         row, = re.findall(rf"ring {block.ring}, slots? ([\d, and]+)",
-                          said.split("as large")[1].split(" While ")[0])
+                          said.split("as large")[1].split(" During ")[0])
         assert str(block.slot) in re.findall(r"\d+", row)
     vectors = found.in_place.force_N.copy()
     vectors[np.argmax(size)] *= 1.01

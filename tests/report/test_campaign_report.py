@@ -201,8 +201,8 @@ def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
         [found / "study.diagnosed.toml"])
     page = parts_of(hf.campaign_report([first, after, found], tmp_path / "all.html"))
     assert ("better is of diagnosis/study.diagnosed.toml, which halbach-fe diagnose wrote: "
-            "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions has 1 entry, and none "
-            "before.") in page.text
+            "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions has all "
+            "blocks (shift_m = 0.002, 0, 0) besides.") in page.text
     assert re.findall(r"folder (\w+),", page.text) == [
         "field", "diagnosis", "better"]
     with pytest.raises(hf.HalbachError, match="of one magnet"):
