@@ -18,7 +18,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
 
     The field is the main one of ``tables``, the multipoles of the study's circles.
     """
-    said = f"{main_field_in_words(tables)} {_prediction(result)} {_blocks(result)}".lstrip()
+    said = f"{_prediction(result)} {_blocks(result)}"
     question = "What is the measured magnet like?"
     if result.disagreement:
         return Answer(question, "Model and measurement disagree, so that these numbers and their "
@@ -34,7 +34,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
                " The instruments have not come to rest: their error bars may be too small.")
     flat = result.magnet.dimension == 2
     return Answer(
-        question, said, "Yes. Model and readings agree: chi² per reading "
+        question, f"{main_field_in_words(tables)} {said}".lstrip(),
+        "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
         f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
         f"See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "

@@ -81,7 +81,9 @@ def answer(check: MapCheck) -> Answer:
     return Answer(
         question, f"{verdict(check)} {_noise(check, keys=True)}", trust,
         "Update the magnet with " + ("oriented_map.csv, which has the right axes and no broken "
-                                     "rows." if better else "this map."),
+                                     "rows." if better else "this map.")
+        + " If you do not know where the map lies in the magnet, let halbach-fe register find it "
+        "first.",
         f"halbach-fe infer STUDY --measurements {used} -o DIR")
 
 

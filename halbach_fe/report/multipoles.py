@@ -216,7 +216,7 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     start = f"{where}the largest unwanted multipole " + (
         "is that" if known.sizes[worst] > sd else "is not known: it may be that")
     text = (f"{start[0].upper()}{start[1:]} of order {known.orders[worst]} with "
-            f"{with_error(float(known.sizes[worst]), sd)} units of 1e-4; the main one is "
+            f"{with_error(float(known.sizes[worst]), sd)} units, which are 1e-4 of the main one, "
             f"{main_in_words(model, known)}.")
     if limit is not None:
         text += (f" All unwanted multipoles are within {limit:g} units with a probability of "
