@@ -13,6 +13,8 @@ is kept.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
@@ -24,7 +26,10 @@ from halbach_fe.solver.mesh import VerifiedMesh
 
 LINES = 6
 """Number of grid lines, along r and along z, through whose crossings a polynomial is laid. The
-point lies between the middle two of them, except near the axis, where the grid begins."""
+point lies between the middle two of them, except near the axis, where the grid begins. For a
+point at the z of a line, the mean of two polynomials is taken, as if it were below the line and
+above: then a magnet and its mirror image at z = 0 have mirrored fields, which columns that follow
+from each other by symmetry need."""
 
 SAME_LINE = 9
 """Decimals of m to which coordinates of the nodes on one grid line agree."""
@@ -52,17 +57,21 @@ def grid_operators(
     value, (along_r, along_z) = nodal_operators(mesh, located, unknowns)
     points = coordinates(mesh, located)
     (r, z), node, material = _grid(mesh)
-    first_r, first_z = _first_line(r, points[:, 0], True), _first_line(z, points[:, 1], False)
-    smooth = np.flatnonzero((first_r >= 0) & (first_z >= 0) & _in_air(
-        material, _cells_around(r, first_r), _cells_around(z, first_z)))
+    first_r = _first_line(r, points[:, 0], "right", from_the_first=True)
+    both_z = [_first_line(z, points[:, 1], side) for side in ("left", "right")]
+    smooth = np.flatnonzero(np.all([
+        (first_r >= 0) & (first_z >= 0) & _in_air(
+            material, _cells_around(r, first_r), _cells_around(z, first_z))
+        for first_z in both_z], axis=0))
     if not len(smooth):
         return value, [along_r, along_z]
     lines = np.arange(LINES)
-    of_r, of_z = first_r[smooth, None] + lines, first_z[smooth, None] + lines
+    of_r = first_r[smooth, None] + lines
+    of_z = np.hstack([first_z[smooth, None] + lines for first_z in both_z])
     index = unknowns.functions[0][node[of_r[:, :, None], of_z[:, None, :]] + 1]  # from 1 in GetDP
-    (at_r, slope_r), (at_z, slope_z) = (
-        _polynomials(x[of_x], points[smooth, axis])
-        for axis, (x, of_x) in enumerate(((r, of_r), (z, of_z))))
+    at_r, slope_r = _polynomials(r[of_r], points[smooth, 0])
+    at_z, slope_z = (np.hstack(halves) / 2 for halves in zip(*(
+        _polynomials(z[part], points[smooth, 1]) for part in np.hsplit(of_z, 2)), strict=True))
     own = sparse.diags_array(np.isin(np.arange(len(points)), smooth, invert=True).astype(float))
     place = sparse.csr_array(
         (np.ones(len(smooth)), (smooth, np.arange(len(smooth)))), (len(points), len(smooth)))
@@ -90,12 +99,15 @@ def _grid(mesh: VerifiedMesh) -> tuple[tuple[Floats, Floats], Ints, NDArray[np.b
     return (r, z), node, material
 
 
-def _first_line(lines: Floats, at: Floats, from_the_first: bool) -> Ints:
+def _first_line(
+    lines: Floats, at: Floats, side: Literal["left", "right"], from_the_first: bool = False
+) -> Ints:
     """Return the number of the first of the `LINES` lines around each place (n,), -1 if too few.
 
-    ``from_the_first`` takes the first lines where there are too few below the place.
+    A place on a line is taken for one on this side of it. ``from_the_first`` takes the first lines
+    where there are too few below the place.
     """
-    first = np.searchsorted(lines, at, side="right") - LINES // 2
+    first = np.searchsorted(lines, np.round(at, SAME_LINE), side=side) - LINES // 2
     if from_the_first:
         first = np.maximum(first, 0)
     return np.where((first >= 0) & (first + LINES <= len(lines)), first, -1)
