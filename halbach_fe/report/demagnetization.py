@@ -70,6 +70,11 @@ def answer(found: DemagnetizationMap) -> Answer:
     temperature, lost = found.material.temperature_C, found.share_beyond_now
     worst = int(np.argmin(found.margin))
     block = place_of(found.blocks[found.cells.block[worst]])
+    most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
+    by_number = {each.name: each for each in found.blocks}
+    losing = "" if not lost else (
+        f" The block that loses most is {place_of(by_number[most['block']])}, of which "
+        f"{100 * most['share_beyond_knee']:.3g} % is past the knee.")
     start = (f"{100 * lost:.2g} % of the magnet's volume is past the knee of its demagnetization "
              "curve and loses magnetization for good" if lost > 0 else
              "no cell is past the knee of the demagnetization curve")
@@ -84,7 +89,7 @@ def answer(found: DemagnetizationMap) -> Answer:
     at = f"at {temperature:g}\u00a0°C"
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"{'No' if lost > 0 else 'Yes'}: {at}, {start}. The smallest margin "
+        f"{'No' if lost > 0 else 'Yes'}: {at}, {start}.{losing} The smallest margin "
         f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (the option "

@@ -47,6 +47,9 @@ EQUAL = 1e-3
 NUMBERED_SLOTS = 48
 """Largest number of blocks of a ring that have their numbers in the figure."""
 
+WHOLE_RING = 0.01
+"""Part of the largest force on a block below which a ring as a whole feels none worth a word."""
+
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
 
@@ -75,11 +78,31 @@ def answer(found: Forces) -> Answer:
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
     error = float(found.in_place.error_N[worst])
     return Answer(
-        question, " ".join([*text, _mass(found)]),
-        f"Yes, to {_newton(error)}; that is the error of the integration. The blocks are those of "
-        "the study, at rest in their places: a block that is 1 % stronger feels 1 % more, and one "
-        "that comes nearer to its neighbours than its place is may feel more.", *plan,
+        question, " ".join([*text, *_on_rings(found), _mass(found)]),
+        "Yes, for the blocks of the study, at rest in their places: a block that is 1 % stronger "
+        "feels 1 % more, and one that comes nearer to its neighbours than its place is may feel "
+        f"more. The integration itself is right to {_newton(error)}.", *plan,
         sound=error <= ROUGH * size)
+
+
+def _on_rings(found: Forces) -> list[str]:
+    """Say which force the blocks of a ring feel together: what holds the rings has to bear it."""
+    rings = np.array([block.ring for block in found.blocks])
+    together = {ring: found.in_place.force_N[rings == ring].sum(axis=0)
+                for ring in np.unique(rings).tolist()}
+    ring, force = max(together.items(), key=lambda each: float(np.linalg.norm(each[1])))
+    size = float(np.linalg.norm(force))
+    if len(together) < 2 or size < WHOLE_RING * found.in_place.magnitude.max():
+        return []
+    return [f"Together the blocks of ring {ring} are pushed by {_newton(size)} "
+            f"({_heavy(size)}) along {_numbers(force / size)}: what holds the rings has to bear "
+            "that."]
+
+
+def _numbers(unit: Floats) -> str:
+    """Return the components of a unit vector (3,) as text."""
+    return "(x, y, z: {})".format(", ".join(
+        f"{value:+.2f}" for value in unit.round(2) + 0.0).replace("-", "−"))
 
 
 def _as_large(found: Forces, worst: int) -> str:
@@ -139,8 +162,7 @@ def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
                         for k, name in enumerate(COMPONENTS)), key=lambda part: -abs(part[0]))
     words = [plus if size > 0 else minus for size, plus, minus in parts]
     text = words[0] if abs(parts[0][0]) > MAIN else f"{words[0]} and {words[1]}"
-    numbers = ", ".join(f"{value:+.2f}" for value in unit.round(2) + 0.0)
-    return f"{text} (x, y, z: {numbers})".replace("-", "−")
+    return f"{text} {_numbers(unit)}"
 
 
 def force_rows(found: Forces) -> list[dict[str, str]]:
