@@ -170,8 +170,9 @@ def verdict(check: MapCheck) -> str:
                 f"{flux_density(check.size_T)}.")
     return (f"Passed. The map obeys div B = 0 and curl B = 0 to {size}; more than "
             f"{100 * VIOLATED:g} % would fail. That is what a fit without a magnet leaves: a model "
-            "of the magnet that predicts readings worse than that lacks something, and close to the edges of blocks, where the field varies more than "
-            "this fit can follow, a model can do better.")
+            "of the magnet that predicts readings worse than that lacks something, and close to "
+            "the edges of blocks, where the field varies more than this fit can follow, a model "
+            "can do better.")
 
 
 def _where(check: MapCheck, reach: Reach) -> str:
