@@ -33,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         place_of,
         write_multipoles,
     )
+    from halbach_fe.report.words import faults_in_words
     from halbach_fe.study.reader import read_study
 
     study, limit = read_study(arguments.study), arguments.limit_units
@@ -52,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
             common.print_table(multipole_rows(columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
                 "of the cross-section" if model.z is None else f"on {place_of(model)}"))
-        common.say_answer(arguments, answer(tables, limit, found.disagreement),
+        common.say_answer(arguments, answer(
+            tables, limit, found.disagreement, faults_in_words(study)),
                           arguments.output / "multipoles.html")
     return 0

@@ -56,7 +56,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
     remedies = _remedies(diagnosis) if sound else []
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
         diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
-            f"In the magnet itself that can be put right: {in_a_row(remedies)}."))
+            f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
+            f"{STUDY_FILE}, which has it as it is."))
 
 
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:

@@ -87,9 +87,10 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     enough = share is not None and share >= ENOUGH
     step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
-            ("Look for a better design first: even perfect blocks leave "
-             f"{100 * found.ordered.rms_ppm / half:.3g} % of the deviation, and sorting changes "
-             "only the rest.", "halbach-fe design STUDY -o DIR")
+            ("Look for a better design first: perfect blocks would leave "
+             f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured "
+             "blocks can use their errors against it, but takes only a part of it away.",
+             "halbach-fe design STUDY -o DIR")
             if found.ordered.rms_ppm > OF_THE_DESIGN * half else
             ("Sort measured blocks into their slots before assembly: that is better than chance.",
              "halbach-fe sort STUDY BLOCKS -o DIR"))

@@ -10,7 +10,14 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
-from halbach_fe.report.words import decimals, flux_density, fraction, place_of, with_error
+from halbach_fe.report.words import (
+    decimals,
+    faults_in_words,
+    flux_density,
+    fraction,
+    place_of,
+    with_error,
+)
 
 
 def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
@@ -33,12 +40,16 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
     flat = result.magnet.dimension == 2
+    faults = faults_in_words(result.study)
+    mend = "" if not faults else (
+        f"This is the magnet with blocks that are not as designed ({faults}): put that right and "
+        "measure again, or go on with it as it is. ")
     return Answer(
         question, f"{main_field_in_words(tables)} {said}".lstrip(),
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
         f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
-        f"See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
+        f"{mend}See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
         f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
         f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
         "-o DIR")
@@ -87,6 +98,9 @@ def _blocks(result: InferenceResult) -> str:
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
     start = (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
              f"rms, the most {place_of(block)}")
+    if result.disagreement:  # error bars that are not to be used are not stated
+        return (f"{start}, which seems to be reversed." if mean[worst] < -1 else
+                f"{start} by {100 * mean[worst]:+.2g}\u00a0%.")
     if mean[worst] < -1:
         return (f"{start}, which is reversed: magnetized the other way round, with "
                 f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")

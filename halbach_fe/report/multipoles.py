@@ -24,7 +24,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import decimals, probability, with_error
+from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
 from halbach_fe.study.model import Study
 
@@ -169,9 +169,13 @@ def _probability_within(known: Multipoles, limit: float) -> float:
 
 
 def answer(
-    tables: Sequence[MultipoleTable], limit: float | None, disagreement: str | None = None
+    tables: Sequence[MultipoleTable], limit: float | None, disagreement: str | None = None,
+    faults: str = "",
 ) -> Answer:
-    """Say how large the unwanted multipoles of the best known magnet are, and what to do next."""
+    """Say how large the unwanted multipoles of the best known magnet are, and what to do next.
+
+    ``faults`` names the blocks that are not as designed, see `faults_in_words`.
+    """
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
@@ -186,7 +190,9 @@ def answer(
         return of_a_conflict(question, said, disagreement)
     return Answer(
         question, said, f"{agreement(disagreement)} ± is what map, prior and solver leave open.",
-        "If that is too much, look for blocks to swap or to turn.",
+        "If these multipoles are too large, "
+        + (f"first put right in the magnet what is not as designed ({faults}), or "
+           if faults else "") + "look for blocks to swap or to turn.",
         "halbach-fe shim STUDY --measurements MAP -o DIR")
 
 
@@ -254,5 +260,6 @@ def write_multipoles(
               "rows": multipole_rows(magnets), "picture": picture}
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, answer=answer(tables, limit, disagreement), parts=parts,
+               provenance=provenance, answer=answer(
+                   tables, limit, disagreement, faults_in_words(study)), parts=parts,
                rows=multipole_rows(tables[0][1]))

@@ -17,7 +17,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import MEASURED, PUBLISHED, figure_of, own_style, save, write_page
-from halbach_fe.report.words import counted, fraction, p_value
+from halbach_fe.report.words import counted, fraction, p_value, with_error
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -138,9 +138,10 @@ def answer(prior: MeasuredPrior) -> Answer:
     shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
     strength = float(np.mean(np.concatenate([each.deviations[:, 0] for each in prior.types])))
     common = _common_sd(prior)
+    side = "stronger" if strength > 0 else "weaker"
     said = (f"On average the {counted(prior.count, 'measured block')} are "
-            f"{100 * abs(strength):.2g}\u00a0% {'stronger' if strength > 0 else 'weaker'} than the "
-            f"study says. In length and direction together they deviate from it by "
+            f"{with_error(100 * abs(strength), 100 * common)}\u00a0% {side} than the study says. "
+            "In length and direction together they deviate from it by "
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
             + (f", most of which ({fraction(common)}) all blocks share, as they share the "
                "calibration of the coil" if common > MOSTLY * spread else "") + ". " + (

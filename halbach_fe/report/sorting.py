@@ -186,7 +186,9 @@ def _ordered(found: SortedBlocks) -> str:
         return ""
     values = found.model.units(found.model.offset + found.model.matrix @ found.model.nominal)
     return (f" With all blocks as ordered the deviation would be "
-            f"{ppm(float(np.linalg.norm(values)))} ppm rms, by the design of the rings.")
+            f"{ppm(float(np.linalg.norm(values)))} ppm rms, by the design of the rings: sorting "
+            "uses the errors of blocks against it. If what is left is too much, look for another "
+            "design (halbach-fe design) before you assemble this one.")
 
 
 def _uncertainty(found: SortedBlocks) -> float:
