@@ -27,13 +27,11 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.multipoles import (
-        answer,
         multipole_rows,
         multipoles_summary,
         place_of,
         write_multipoles,
     )
-    from halbach_fe.report.words import faults_in_words
     from halbach_fe.study.reader import read_study
 
     study, limit = read_study(arguments.study), arguments.limit_units
@@ -42,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, study) as session:
         found = multipoles(magnet, session, common.reference(arguments), posterior)
     tables = found.tables
-    write_multipoles(study, tables, limit, arguments.output, {
+    answer = write_multipoles(study, tables, limit, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(
             {"study file": arguments.study, "posterior": arguments.posterior})},
         found.disagreement)
@@ -53,7 +51,5 @@ def run(arguments: argparse.Namespace) -> int:
             common.print_table(multipole_rows(columns), "Multipoles in units of 1e-4, " + (
                 "integrated along z" if model.integrated else
                 "of the cross-section" if model.z is None else f"on {place_of(model)}"))
-        common.say_answer(arguments, answer(
-            tables, limit, found.disagreement, faults_in_words(study)),
-                          arguments.output / "multipoles.html")
+        common.say_answer(arguments, answer, arguments.output / "multipoles.html")
     return 0

@@ -19,6 +19,9 @@ from halbach_fe.report.page import write_page
 from halbach_fe.report.solids import holder_name, write_solids
 from halbach_fe.report.words import counted
 
+SHORTEST_MM = 1e-3
+"""Distance between plates below which they touch, but for rounding."""
+
 FRAME = ("x, y, z of the magnet; x is at the large notch of a plate, the pockets are open towards "
          "+z, and angles count counter-clockwise as seen from +z")
 
@@ -92,12 +95,18 @@ def plate_diameters(assembly: Assembly) -> str:
 
 
 def spacers(assembly: Assembly) -> str:
-    """Say how far neighbouring plates are apart; empty if there are no two plates."""
+    """Say how far neighbouring plates are apart; empty if there are no two plates.
+
+    Plates that touch, or lie beside each other, have no spacer between them.
+    """
     limits = sorted((low, low + plate.thickness_m) for plate in assembly.plates
                     for low in plate.heights_m)
-    gaps = [f"{1e3 * (low - high):.4g}" for (_, high), (low, _) in itertools.pairwise(limits)]
-    if not gaps:
+    if len(limits) < 2:
         return ""
+    lengths = [1e3 * (low - high) for (_, high), (low, _) in itertools.pairwise(limits)]
+    if min(lengths) < SHORTEST_MM:
+        return "Keep the distances between the lower faces, by spacers where plates do not touch."
+    gaps = [f"{length:.4g}" for length in lengths]
     length = gaps[0] if len(set(gaps)) == 1 else f"from the lowest up, {', '.join(gaps)}"
     return f"The spacers between neighbouring plates are {length}\u00a0mm long."
 

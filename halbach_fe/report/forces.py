@@ -48,7 +48,8 @@ NUMBERED_SLOTS = 48
 """Largest number of blocks of a ring that have their numbers in the figure."""
 
 WHOLE_RING = 0.01
-"""Part of the largest force on a block below which a ring as a whole feels none worth a word."""
+"""Part of the largest force on a block below which a ring as a whole feels none worth a word: a
+block's own force is not known better, as its strength is not."""
 
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""

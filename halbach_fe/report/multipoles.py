@@ -246,8 +246,8 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
 def write_multipoles(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
     provenance: Mapping[str, str], disagreement: str | None = None,
-) -> None:
-    """Write multipoles.csv, multipoles.json, multipoles.html and its figures."""
+) -> Answer:
+    """Write multipoles.csv, multipoles.json, multipoles.html and its figures; return the answer."""
     write_multipole_csv(study, tables, folder / "multipoles.csv")
     summary = multipoles_summary(study, tables, limit)
     write_text(folder / "multipoles.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
@@ -259,7 +259,7 @@ def write_multipoles(
     parts = [{"title": _location(model), "reference": reference_text(model),
               "rows": multipole_rows(magnets), "picture": picture}
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
+    said = answer(tables, limit, disagreement, faults_in_words(study))
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, answer=answer(
-                   tables, limit, disagreement, faults_in_words(study)), parts=parts,
-               rows=multipole_rows(tables[0][1]))
+               provenance=provenance, answer=said, parts=parts, rows=multipole_rows(tables[0][1]))
+    return said

@@ -182,6 +182,8 @@ def test_spacers_fill_what_is_between_plates():
     (plate,) = plan.plates
     alone = replace(plan, plates=(replace(plate, heights_m=plate.heights_m[:1]),))
     assert spacers(alone) == ""
+    touching = replace(plate, heights_m=(0.0, plate.thickness_m))
+    assert "where plates do not touch" in spacers(replace(plan, plates=(touching,)))
 
 
 def test_the_sheet_names_the_kind_that_was_ordered():

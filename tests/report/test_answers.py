@@ -208,6 +208,38 @@ def of_forces(given):
                                   f"{found.mass_kg.sum():.4g} kg"]
 
 
+def test_the_force_on_a_ring_is_that_of_its_blocks_together(given):
+    """Two equal rings feel opposite forces along z; the control is one ring, which feels none."""
+    found = hf.forces(given.magnet, given.session)
+    ring = np.array([block.ring for block in found.blocks])
+    together = found.in_place.force_N[ring == 1].sum(axis=0)
+    assert abs(together[2]) > 10 * np.hypot(*together[:2])
+    said = forces.answer(found).said
+    assert f"pushed by {forces._newton(float(np.linalg.norm(together)))}" in said
+    named = int(re.search(r"the blocks of ring (\d) are pushed", said)[1])
+    sign = "+" if found.in_place.force_N[ring == named].sum(axis=0)[2] > 0 else "−"
+    assert f"(x, y, z: +0.00, +0.00, {sign}1.00)" in said
+    single = build_magnet(given.study.with_(array__rings=1))
+    assert "are pushed by" not in forces.answer(hf.forces(single, given.session)).said
+
+
+def test_the_block_that_loses_most_is_named(given):
+    """At a temperature at which some lose; the control is the magnet that loses nothing."""
+    def said(temperature):
+        magnet = build_magnet(given.study.with_(demagnetization__temperature_C=temperature))
+        found = hf.demagnetization(magnet, given.session, across=2)
+        return demagnetization.answer(found), found
+
+    hot, found = said(140.0)
+    most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
+    assert most["share_beyond_knee"] > 0
+    assert f"of which {100 * most['share_beyond_knee']:.3g} % is past the knee" in hot.said
+    assert hot.concern.startswith("At 140")
+    cold, _ = said(20.0)
+    assert "loses most" not in cold.said
+    assert cold.concern == ""
+
+
 def of_plan(given):
     found = hf.plan(given.magnet, given.session, points=6)
     left = np.exp(-found.gain[-1] / len(found.parameters))
