@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,6 +28,10 @@ from halbach_fe.solver.session import RunSize, Session
 
 NEWTON_HISTORY = "newton.csv"
 """File in the run folder with the relative residual of every Newton step."""
+
+LOOK_S = 0.2
+"""Longest time in s for which the main thread waits for runs without looking at signals. A signal
+that comes just before a thread blocks does not wake it, and Ctrl-C would then have no effect."""
 
 MATRIX_FILE = "matrix.bin"
 """File in the run folder to which PETSc writes the matrix."""
@@ -111,9 +115,10 @@ def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
         try:
             for task in tasks:  # Ctrl-C may come here, while the first runs go on already
                 futures.append(pool.submit(run, task))
-            wait(futures, return_when=FIRST_EXCEPTION)
-            for future in futures:
-                if future.done():
+            running: Collection[Future[Floats]] = futures
+            while running:
+                done, running = wait(futures, LOOK_S, FIRST_EXCEPTION)
+                for future in done:
                     future.result()
             return [future.result() for future in futures]
         finally:

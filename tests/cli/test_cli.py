@@ -546,6 +546,33 @@ def test_interruption_ends_getdp_too(study, tmp_path, start, number):
     assert not list(out.glob("field_map*"))
 
 
+UNWOKEN = """
+import signal, sys, threading, time
+threading.Thread(target=time.sleep, args=(1e3,), daemon=True).start()  # it receives the signals
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+from halbach_fe.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""Program whose main thread no Ctrl-C wakes, as if it came just before the thread blocked."""
+
+
+def test_an_interruption_that_wakes_nobody_ends_getdp_too(study, tmp_path, start):
+    marker = tmp_path / "pid"
+    fake = fake_getdp(tmp_path, f"echo $$ > {marker}; exec sleep 60")
+    process = start(
+        [sys.executable, "-c", UNWOKEN, "solve", str(study), "-o", str(tmp_path / "out"),
+         "--getdp", str(fake)], stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    while not (marker.exists() and marker.read_text().strip()):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    time.sleep(1)  # the main thread waits for GetDP now
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=50)  # GetDP itself would take 60
+    assert process.returncode == 130
+    assert said.strip().endswith("interrupted")
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_the_end_of_halbach_fe_ends_wrapped_getdp(study, tmp_path, start, number):
     """A wrapper's child is GetDP, and a cluster's modules wrap it."""
