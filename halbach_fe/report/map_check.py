@@ -54,8 +54,10 @@ def answer(check: MapCheck) -> Answer:
             "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
-    trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. A map "
-             "cannot show everything, though: see below.")
+    trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. More "
+             f"than {100 * VIOLATED:g}\u00a0% would fail. A model of the magnet that predicts "
+             "readings worse than this fit lacks something; close to the edges of blocks, where "
+             "the field varies more than the fit can follow, it can do better.")
     if _violates(check):
         return Answer(
             question, f"{verdict(check)} {_noise(check)}",
@@ -78,13 +80,27 @@ def answer(check: MapCheck) -> Answer:
             "either the field is steeper there than the lines show, as near edges of magnets, or "
             "these readings are wrong. An update of the magnet tells which.")
     used = "DIR/oriented_map.csv" if better else "MAP"
+    named = ("oriented_map.csv, which has the right axes and no broken rows" if better
+             else "this map")
+    said = f"{verdict(check)} {_noise(check, keys=True)}"
+    if _on_a_stage(check):
+        return Answer(
+            question, said, trust, "Find where the map lies in the magnet, as its coordinates seem "
+            f"to be those of a stage: the origin is far from all readings. Use {named}.",
+            f"halbach-fe register STUDY --measurements {used} -o DIR")
     return Answer(
-        question, f"{verdict(check)} {_noise(check, keys=True)}", trust,
-        "Update the magnet with " + ("oriented_map.csv, which has the right axes and no broken "
-                                     "rows." if better else "this map.")
-        + " If you do not know where the map lies in the magnet, let halbach-fe register find it "
-        "first.",
+        question, said, trust, f"Update the magnet with {named}. If you do not know where the map "
+        "lies in the magnet, let halbach-fe register find it first.",
         f"halbach-fe infer STUDY --measurements {used} -o DIR")
+
+
+def _on_a_stage(check: MapCheck) -> bool:
+    """Tell whether the origin is farther from the map than the map is long: no user puts the
+    origin of a magnet's coordinates there.
+    """
+    low = min((each[0] for each in check.windows[1]), default=0.0)
+    high = max((each[1] for each in check.windows[1]), default=0.0)
+    return max(low, -high) > high - low
 
 
 def _noise(check: MapCheck, keys: bool = False) -> str:
@@ -168,11 +184,7 @@ def verdict(check: MapCheck) -> str:
                 f"{_where(check, check.reach)}, and to "
                 f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
                 f"{flux_density(check.size_T)}.")
-    return (f"Passed. The map obeys div B = 0 and curl B = 0 to {size}; more than "
-            f"{100 * VIOLATED:g} % would fail. That is what a fit without a magnet leaves: a model "
-            "of the magnet that predicts readings worse than that lacks something, and close to "
-            "the edges of blocks, where the field varies more than this fit can follow, a model "
-            "can do better.")
+    return (f"Passed. The map obeys div B = 0 and curl B = 0 to {size}.")
 
 
 def _where(check: MapCheck, reach: Reach) -> str:

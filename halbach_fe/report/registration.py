@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
@@ -17,7 +18,7 @@ from halbach_fe.inference.pose_result import ProbePrior, Registration
 from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points, turn_of
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -76,7 +77,7 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
     place = ", ".join(with_error(1e3 * value, 1e3 * sd) for value, sd in zip(
         best.middle_m, best.translation_sd_m, strict=True))
     said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
-            "magnet.")
+            f"magnet. On the map's stage the middle of the magnet is at {_magnet_on_stage(best)}.")
     alike = sum(_fit_alike(best, each) for each in found[1:])
     if alike:
         said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
@@ -107,6 +108,31 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
             if best.explains else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound)
+
+
+def _magnet_on_stage(best: Registration) -> str:
+    """Return where the middle of the magnet is by the map's own coordinates, in mm."""
+    centre, sd = magnet_on_stage(best)
+    return "({}) mm".format(", ".join(
+        with_error(1e3 * value, 1e3 * each) for value, each in zip(centre, sd, strict=True)))
+
+
+def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
+    """Return where the middle of the magnet is by the map's own axes, in m, and its sd (3,) each.
+
+    It moves with the place of the map's middle, and with the turns about that.
+    """
+    instrument = best.instrument
+    turn = turn_of(instrument).as_matrix()
+    scale = 1 + np.array([instrument.radius_scale, instrument.radius_scale, instrument.z_scale])
+    sensor = np.mean(instrument.sensor_position_m, axis=0)
+    centre = (-turn.T @ instrument.translation_m - sensor) / scale
+    x, y, z = best.middle_m
+    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
+    variance = best.translation_sd_m**2 + arms**2 @ best.rotation_sd_rad**2
+    axes = np.array([COMPONENTS.index(axis[-1]) for axis in instrument.position_axes])
+    signs = np.array([-1.0 if axis.startswith("-") else 1.0 for axis in instrument.position_axes])
+    return signs * centre[axes], np.sqrt(turn.T**2 @ variance / scale**2)[axes]
 
 
 def _other_poses(found: Sequence[Registration]) -> list[str]:
@@ -296,6 +322,8 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         "instrument": each.instrument.model_dump(mode="json", exclude_defaults=True),
         "open_keys": {key: {"value": value, "sd": sd}
                       for key, (value, sd) in each.open_keys.items()},
+        "magnet_on_stage_m": numbers(magnet_on_stage(each)[0]),
+        "magnet_on_stage_sd_m": numbers(magnet_on_stage(each)[1]),
         "middle_m": numbers(each.middle_m), "translation_sd_m": numbers(each.translation_sd_m),
         "rotation_sd_rad": numbers(each.rotation_sd_rad),
         "rms_T": numbers(each.rms_T), "nominal_rms_T": numbers(each.nominal_rms_T),

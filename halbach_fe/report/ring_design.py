@@ -28,7 +28,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import ppm
+from halbach_fe.report.words import PERCENT_FROM, counted, in_a_row, ppm, relative
 from halbach_fe.study.edit_file import write_edited
 
 STUDY_FILE = "study.designed.toml"
@@ -47,16 +47,37 @@ def answer(found: Designed) -> Answer:
         text.append("The next stronger design of the table makes "
                     f"{1e3 * stronger[0].mean_T:.4g} mT with "
                     f"{ppm(stronger[0].peak_to_peak_ppm)} ppm peak to peak.")
+    if best.peak_to_peak_ppm > 1e6 * PERCENT_FROM:
+        text.append(f"That varies by {relative(1e-6 * best.peak_to_peak_ppm)}: it is no "
+                    "homogeneous field.")
     least = smallest(found)
     return Answer(
         f"Which rings make a homogeneous field in {region}?", " ".join(text),
         (f"Yes, as the design of the {least} that the search found, which does not prove that "
-         "there is no better one. These are blocks as ordered: their tolerances leave more.")
+         "there is no better one. These are blocks as ordered: their tolerances leave more."
+         f"{at_limits(found)}")
         if found.reached else "No. What was asked for is excluded by the limits of [design].",
         "See what the tolerances of the blocks leave of it." if found.reached else
         "Allow more mass, a lower field or more kinds of rings in [design], or a smaller region.",
         f"halbach-fe {'homogeneity DIR/' + STUDY_FILE if found.reached else 'design STUDY'} -o DIR",
         found.reached)
+
+
+def at_limits(found: Designed) -> str:
+    """Say which radii of the best design are the first or last that [design] allows, if any are."""
+    assert found.study.design is not None
+    layers, said = found.study.design.layer, []
+    for number, layer in enumerate(layers):
+        radii = [option[number].radius_m for z, option in zip(
+            found.best.z_m, found.best.rings, strict=True) if option[number] is not None
+            for _ in range(1 if z == 0 else 2)]
+        of = f" of layer {number + 1}" if len(layers) > 1 else ""
+        for word, end in (("smallest", min(layer.radii_m)), ("largest", max(layer.radii_m))):
+            count = int(np.isclose(radii, end).sum())
+            if count and len(layer.radii_m) > 1:
+                said.append(f"{counted(count, 'ring')} {'has' if count == 1 else 'have'} the "
+                            f"{word} radius{of} that [design] allows, {1e3 * end:.6g}\u00a0mm")
+    return f" {in_a_row(said)}: radii beyond that may be better." if said else ""
 
 
 def smallest(found: Designed) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import combinations, product
 
 import magpylib
@@ -122,6 +123,25 @@ def test_a_least_field_costs_homogeneity(designed, session):
     assert fields == sorted(fields)
     assert ppm == sorted(ppm)
     assert designed.best is designed.front[0]
+
+
+def test_radii_at_the_limits_and_per_cents_are_said(designed):
+    best = designed.best
+    radii = [option[0].radius_m for z, option in zip(best.z_m, best.rings, strict=True)
+             for _ in range(1 if z == 0 else 2)]
+    widest = sum(np.isclose(radii, 0.068))
+    assert 0 < widest < len(radii)
+    assert (f"{widest} rings have the largest radius that [design] allows, 68\u00a0mm"
+            in answer(designed).trust)
+    # the control: with a larger radius in the list, that of 68 mm is no limit
+    layer = designed.study.design.layer[0].with_(radii_m=(0.058, 0.063, 0.068, 0.08))
+    wider = replace(designed, study=designed.study.with_(
+        design=designed.study.design.with_(layer=(layer,))))
+    assert "largest radius" not in answer(wider).trust
+    assert "no homogeneous field" not in answer(designed).said
+    uneven = replace(best, peak_to_peak_ppm=1e5)
+    assert "varies by 10\u00a0%: it is no homogeneous field" in answer(
+        replace(designed, best=uneven)).said
 
 
 def test_what_cannot_be_reached_is_said(session):

@@ -30,6 +30,7 @@ from halbach_fe.report.registration import (
     NOT_AT_REST,
     answer,
     is_symmetric_to,
+    magnet_on_stage,
     place_table,
 )
 from halbach_fe.solver.session import Session
@@ -66,6 +67,11 @@ def test_a_pose_is_found_from_nothing(magnet, generator, tmp_path, number):
     assert best.middle_m == pytest.approx(
         middle, abs=4 * float(np.linalg.norm(best.translation_sd_m)))
     assert np.linalg.norm(best.translation_sd_m) < 2e-4
+    off = (magnet_on_stage(best)[0] - ([0.3, -0.2, 0.4] - turn.inv().apply(shift)))
+    sd = magnet_on_stage(best)[1]
+    assert (np.abs(off) < 4 * sd).all()
+    # the turns move it too, by a lever of a centimetre
+    assert (sd < 2 * np.linalg.norm(best.translation_sd_m)).all()
     origin = shift - turn.apply([0.3, -0.2, 0.4])
     # the origin is half a metre from the map, so that a turn moves it too
     assert best.instrument.translation_m == pytest.approx(origin, abs=1e-3)

@@ -378,3 +378,11 @@ CLEAN = MapCheck(
     structure=0.0, redundancy=0.8, excluded=np.zeros(315, bool), residual_T=np.zeros((315, 3)),
     unseen_T=np.zeros((315, 3)), corrected_T=np.zeros((315, 3)))
 """What is known of a map without errors."""
+
+
+def test_a_map_on_a_stage_is_registered_first():
+    near, far = (replace(CLEAN, windows=("z", ((start, start + 0.1, (NOISE_T,) * 3),
+                                               (start + 0.1, start + 0.3, (NOISE_T,) * 3))))
+                 for start in (-0.1, -0.7))
+    assert "infer STUDY --measurements MAP" in answer(near).command
+    assert "register STUDY --measurements MAP" in answer(far).command
