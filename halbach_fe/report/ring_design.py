@@ -68,8 +68,8 @@ def at_limits(found: Designed) -> str:
     assert found.study.design is not None
     layers, said = found.study.design.layer, []
     for number, layer in enumerate(layers):
-        radii = [option[number].radius_m for z, option in zip(
-            found.best.z_m, found.best.rings, strict=True) if option[number] is not None
+        radii = [ring.radius_m for z, option in zip(
+            found.best.z_m, found.best.rings, strict=True) if (ring := option[number]) is not None
             for _ in range(1 if z == 0 else 2)]
         of = f" of layer {number + 1}" if len(layers) > 1 else ""
         for word, end in (("smallest", min(layer.radii_m)), ("largest", max(layer.radii_m))):
