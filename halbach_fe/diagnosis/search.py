@@ -196,6 +196,9 @@ def score_hypotheses(
             return campaign.places(effect, update.study)
         return effect.shortlist(update.study, update.prior.mean[uniform], information, score)
 
+    # What all blocks share is known this well only, as the calibration of the coil. A block that is
+    # reversed or elsewhere has it with another sign or direction, which the prior does not know.
+    common = update.study.prior.common_mode_sd
     shortlisted = [Hypothesis(effect, place) for effect in effects
                     if campaign.places(effect, study)
                     for place in dict.fromkeys((
@@ -210,6 +213,15 @@ def score_hypotheses(
     places = {effect.name: [one.place for one in shortlisted if one.effect is effect]
               for effect in effects}
     first = {effect.name: set(effect.representatives(places[effect.name])) for effect in effects}
+
+    def by_response(hypothesis: Hypothesis, scene: Scene) -> Floats:
+        """Return the whitened signature (rows, k), by the response matrix if that is possible."""
+        change = hypothesis.effect.magnetization_change(scene.fields[0], hypothesis.place)
+        if change is None:
+            return whitened(update.observation.read(scene.signature(hypothesis)))
+        size = update.magnet.dimension
+        return np.sum([response[:, size * block:size * (block + 1)] @ vector
+                       for block, vector in change.items()], axis=0)[:, None]
 
     def compare(hypothesis: Hypothesis) -> None:
         """Compute the signature of a hypothesis, unless it is known or the time is up."""
@@ -226,8 +238,7 @@ def score_hypotheses(
                 return
             if signature is None:
                 if key not in known:
-                    known[key] = whitened(update.observation.read(
-                        nominal_start.signature(hypothesis)))
+                    known[key] = by_response(hypothesis, nominal_start)
                 signature = signatures[key] = known[key]
         elif effect.applied_in_full:
             others = campaign.with_terms(apply_effects(
@@ -235,8 +246,9 @@ def score_hypotheses(
             amounts = np.pad(present.values,
                              (0, len(amplitude_scale(effect)) - len(present.values)))
             amounts[0] = 1.0
-            signature = whitened(update.observation.read(_discrete_signature(
-                present.hypothesis, amounts, scene_of(others))))
+            signature = (whitened(update.observation.read(_discrete_signature(
+                present.hypothesis, amounts, scene_of(others)))) if effect.refinements
+                else by_response(hypothesis, scene_of(others)))
             residual = residual + signature @ amounts
         else:
             amounts = np.pad(present.values,
@@ -244,11 +256,14 @@ def score_hypotheses(
             signature = whitened(update.observation.read(nominal.derivative(hypothesis, amounts)))
             residual = residual + signature @ amounts
         scored.append(hypothesis)
-        columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
+        own = signature * amplitude_scale(effect)[:signature.shape[1]]
+        if present is None and effect.is_binary and common:
+            own = np.hstack([own, common * own])
+        columns.append(own)
         candidates.append(Candidate(
-            effect.name, place.name, tuple(range(signature.shape[1])),
+            effect.name, place.name, tuple(range(own.shape[1])),
             effect.is_binary or (effect.applied_in_full
-                                 and signature.shape[1] > len(effect.parameters)), effect.unique,
+                                 and own.shape[1] > len(effect.parameters)), effect.unique,
             len(places[effect.name])))
         if present is None and effect.refinements and not effect.applied_in_full:
             improvable.setdefault(effect.name, []).append(len(scored) - 1)
@@ -406,7 +421,7 @@ def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -
     Such an effect is not linear in its first amplitude, which is 1 if it is present. The first
     signature is the finite difference between the fields with and without the effect at the given
     amounts, less the contribution of its refinements to this difference. The linear signatures of
-    the refinements follow it. Effects without refinements have their ordinary signature.
+    the refinements follow it.
 
     Parameters
     ----------
@@ -417,8 +432,6 @@ def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -
         Fields of the study without the effect.
     """
     effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
-    if not effect.refinements:
-        return scene.signature(hypothesis)
 
     def of_map(nominal: NominalFields) -> Floats:
         refined = effect.refine(nominal, place, values)
@@ -482,7 +495,7 @@ def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Iden
         hypothesis = search.hypotheses[search.candidates.index(selection.candidate)]
         free, fixed = len(selection.candidate.free), int(selection.candidate.is_binary)
         scale = amplitude_scale(hypothesis.effect)[fixed:fixed + free]
-        part = slice(first, first + free)
+        part = slice(first, first + len(scale))  # without the tolerance of binary effects
         identified.append(IdentifiedEffect(
             hypothesis, np.concatenate([np.ones(fixed), scale * fit.mean[part]]),
             np.concatenate([np.zeros(fixed), scale * deviation[part]]), selection))

@@ -76,7 +76,22 @@ def test_what_a_block_has_lost_is_no_part_of_the_derivative(nominal, loss):
     effect = EFFECTS["block_demagnetized"]
     place = effect.places(STUDY)[5]
     there = replace(nominal, study=effect.apply(STUDY, place, [loss]))
-    assert effect.signature(there, place) == pytest.approx(effect.signature(nominal, place))
+    assert effect.derivative(there, place, [loss]) == pytest.approx(
+        effect.signature(nominal, place))
+
+
+@pytest.mark.parametrize("loss", [-0.3, 0.4])
+def test_the_loss_of_a_reversed_block_has_the_other_sign(nominal, loss):
+    """Or a search that has found both runs away from the model of the reversed block alone."""
+    effect = EFFECTS["block_demagnetized"]
+    place = effect.places(STUDY)[5]
+    reversed_block = EFFECTS["block_flipped"].apply(STUDY, place, [1.0])
+    there = replace(nominal, study=effect.apply(reversed_block, place, [loss]))
+    change = (shown(effect.apply(reversed_block, place, [loss + STEP]))
+              - shown(effect.apply(reversed_block, place, [loss])))
+    assert STEP * effect.derivative(there, place, [loss])[0] == pytest.approx(change, abs=1e-12)
+    assert effect.derivative(there, place, [loss]) == pytest.approx(
+        -effect.signature(nominal, place))
 
 
 @pytest.mark.parametrize("name", ["block_missing", "block_flipped", "blocks_swapped"])

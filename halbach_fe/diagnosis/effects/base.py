@@ -171,6 +171,18 @@ class Effect(ABC):
         """
         return places
 
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        """Return the changes (D,) in A/m of blocks' magnetizations per unit, by the blocks' numbers
+        from 0.
+
+        It is None of an effect that is more than such a change, or has several parameters. The
+        response matrix turns these changes into readings, with all that permeable blocks and iron
+        add, whereas `signature` holds in vacuum.
+        """
+        return None
+
     @abstractmethod
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters."""

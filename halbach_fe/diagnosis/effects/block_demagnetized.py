@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -36,13 +36,29 @@ class BlockDemagnetizedEffect(Effect):
         """See `Effect.places`."""
         return each_block(study)
 
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        """See `Effect.magnetization_change`."""
+        (number,) = blocks_at(nominal, place)
+        return {number: -nominal.magnetizations[number]}
+
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
         (number,) = blocks_at(nominal, place)
+        return -nominal.block_fields[number][None]
+
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`: the loss is relative to the block without it, which may be
+        reversed by another effect.
+        """
+        (number,) = blocks_at(nominal, place)
+        left = 1.0 - values[0]
+        if left:
+            return self.signature(nominal, place) / left
         block = nominal.blocks[number]
-        # relative to the intact block, even if the study contains a loss already
-        intact = nominal.intact_blocks[number].remanence
-        return -intact * (nominal.unit_fields[number] @ np.array(block.easy_axis))[None]
+        return -nominal.intact_blocks[number].remanence * (
+            nominal.unit_fields[number] @ np.array(block.easy_axis))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import (
@@ -32,6 +32,13 @@ class BlockMissingEffect(Effect):
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
         return each_block(study)
+
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        """See `Effect.magnetization_change`."""
+        (block,) = blocks_at(nominal, place)
+        return {block: (self.factor - 1) * nominal.magnetizations[block]}
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""

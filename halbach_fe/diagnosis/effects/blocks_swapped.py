@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -75,18 +75,28 @@ class BlocksSwappedEffect(Effect):
         return [place_of(blocks[i], blocks[j])
                 for i, j in zip(first[best], second[best], strict=True)]
 
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        """See `Effect.signature`."""
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        """See `Effect.magnetization_change`."""
+        return self._change(nominal, place)
+
+    def _change(self, nominal: NominalFields, place: Place) -> dict[int, Floats]:
+        """Return the change (D,) in A/m of the magnetization at both places."""
         where = [(block.ring, block.slot) for block in nominal.blocks]
         here, there = where.index((place.ring, place.slot)), where.index(place.other)
-        size = nominal.study.dimension
-        total = np.zeros_like(nominal.points)
+        size, change = nominal.study.dimension, {}
         for to, source in ((here, there), (there, here)):
             turn = rotation_about_z(np.radians(
                 nominal.blocks[to].angle_deg - nominal.blocks[source].angle_deg))
-            total += nominal.field_with(to, turn[:size, :size] @ nominal.magnetizations[source]
-                                      - nominal.magnetizations[to])
-        return total[None]
+            change[to] = np.asarray(turn[:size, :size] @ nominal.magnetizations[source]
+                                    - nominal.magnetizations[to])
+        return change
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        """See `Effect.signature`."""
+        return np.sum([nominal.field_with(block, change) for block, change in self._change(
+            nominal, place).items()], axis=0)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
