@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
@@ -16,11 +17,22 @@ from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from tests.diagnosis.campaign import CIRCLES, DOCUMENT, NOISE_T, STUDY, measured, with_array
+from tests.diagnosis.campaign import (
+    CIRCLES,
+    DOCUMENT,
+    NOISE_T,
+    STUDY,
+    drawn,
+    field,
+    measured,
+    with_array,
+)
 
 
 class Restless(BlocksSwappedEffect):
@@ -107,6 +119,45 @@ def test_sides_that_are_equal_are_told_with_their_odds(session, generator):
     assert abs(named.values[0]) == pytest.approx(0.04, abs=4 * named.sd[0])
     assert "The magnet is the same from several sides" in " ".join(answer(found).sentences)
     assert len(diagnosis_summary(found)["positions"]) == len(found.positions) > 1
+
+
+@pytest.mark.parametrize("name", ["block_flipped", "block_missing", "blocks_swapped"])
+def test_whole_blocks_beside_a_wrong_calibration_of_the_coil(session, generator, name):
+    """All measured blocks are 1.5 % too strong, and each of them is known to 0.1 %. The block that
+    is reversed or elsewhere differs from its own measurement more than all others, and another
+    effect of that block would explain it better.
+    """
+    blocks, polarizations = build_magnet(STUDY).blocks, drawn(STUDY, generator)
+    volume, number = blocks[0].volume, 16
+    moments = 1.015 * volume / MU_0 * np.array([
+        Rotation.from_euler("z", -block.angle_deg, degrees=True).apply(polarization)
+        for block, polarization in zip(blocks, polarizations, strict=True)])
+    sd = 1e-3 * np.linalg.norm(moments, axis=1)
+    count, ones = len(blocks), np.ones(len(blocks))
+    table = BlockTable(
+        tuple(map(str, range(count))), ("",) * count, np.array([block.ring for block in blocks]),
+        np.array([block.slot for block in blocks]),
+        moments + sd[:, None] * generator.standard_normal(moments.shape), sd, volume * ones,
+        np.nan * ones)
+    built = polarizations.copy()
+    if name == "blocks_swapped":  # on opposite sides of a ring
+        opposite = number + 6 if number % 12 < 6 else number - 6
+        built[[number, opposite]] = -polarizations[[opposite, number]] * [1, 1, -1]
+    else:
+        built[number] *= -1 if name == "block_flipped" else 0
+    true = field(STUDY, built, CIRCLES)
+    data = field_map(CIRCLES, true + NOISE_T * generator.standard_normal(true.shape))
+    some = [effect for effect in catalogue() if effect.name in (
+        name, "block_demagnetized", "block_turned", "ferromagnetic_object")]
+    found = diagnose(STUDY, data, session, table, effects=some)
+    (named,) = found.identified
+    assert named.hypothesis.effect.name == name
+    block = blocks[number]
+    assert (block.ring, block.slot) in [
+        (named.hypothesis.place.ring, named.hypothesis.place.slot), named.hypothesis.place.other]
+    assert found.converged
+    assert found.rounds <= 3
+    assert found.after.prior_conflict < found.after.conflict_limit
 
 
 def identified(name, value, *equals):
