@@ -36,6 +36,10 @@ def answer(assembly: Assembly) -> Answer:
     if different < len(assembly.kinds):
         said.append(f"To order are {counted(different, 'kind')}: the others are the same blocks, "
                     "turned upside down.")
+    if not any(kind.material for kind in assembly.kinds):
+        said.append("The study names no grade (array.material): order one that has the remanence "
+                    "of the table, and bears the temperature and the field of the others, which "
+                    "halbach-fe demagnetization tells.")
     said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
              for reason in assembly.reasons]
     trust = ("Yes, as far as shapes and places of the study are right. Whether the holder bears "
