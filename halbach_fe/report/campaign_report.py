@@ -103,8 +103,14 @@ class Campaign:
             not own or one.uses(chapter))), None)
 
     def done_before(self, chapter: Chapter, answer: Answer) -> Chapter | None:
-        """Return an earlier chapter of the command of an answer, if it read what this one did."""
+        """Return an earlier chapter of the command of an answer, if it read what this one did.
+
+        A command that names files which ``chapter`` has written, or new ones, was not run before.
+        """
         verb = re.match("halbach-fe ([a-z-]+)", answer.command)
+        new = {*(PurePath(name).name for name in chapter.record.files), "NEW_MAP"}
+        if new & {PurePath(word.strip("'")).name for word in answer.command.split()}:
+            return None
         return next((one for one in self.chapters[:self.chapters.index(chapter)]
                      if verb and verb[1] == one.verb != chapter.verb
                      and set(chapter.record.inputs.values()) <= set(one.record.inputs.values())),

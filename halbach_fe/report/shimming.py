@@ -199,7 +199,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             said = (f"No block: with {moves} {said} That is {100 * _gained(shim):.2g} %, hardly "
                     "worth the work.")
         else:
-            said = f"Those of the table. With {moves} {said}"
+            said = f"Those of the {moves} that shim lists: {said}"
     else:
         said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
                 "uncertainty.")
