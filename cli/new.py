@@ -71,7 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "aisi_1010; adds the tube")
     parser.add_argument("--dsv-m", type=common.positive_number, metavar="X",
                         help="diameter of a spherical volume in the middle, on whose surface the "
-                        "field is measured (default: circles along the magnet)")
+                        "field is measured, and in which that of a dipole is to be homogeneous "
+                        "(default: circles along the magnet)")
 
 
 def _radii(text: str) -> tuple[float, ...]:

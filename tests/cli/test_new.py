@@ -89,6 +89,13 @@ def test_command_writes_rings_of_their_own_and_free_blocks(tmp_path, capsys):
 CUBES = ["--cube-m", "0.012", "--radius-m", "0.136", "--blocks-per-ring", "24"]
 
 
+def study_without_sphere(folder):
+    """A dipole that is measured on circles."""
+    path = folder / "circles.toml"
+    assert main(["new", str(path), *CUBES, "--rings", "4"]) == 0
+    return path
+
+
 def test_cubes_around_a_sphere_with_noise_that_suits_them(tmp_path):
     """A magnet of cubes makes some 10 mT, and a cross-section of sectors some 0.7 T."""
     path, strong = tmp_path / "cubes.toml", tmp_path / "strong.toml"
@@ -96,6 +103,8 @@ def test_cubes_around_a_sphere_with_noise_that_suits_them(tmp_path):
     study = read_study(path)
     points = points_from(study.observation.positions)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.08, rtol=1e-3)
+    assert study.homogeneity.sphere_m == 0.08  # its field is to be homogeneous there
+    assert read_study(study_without_sphere(tmp_path)).homogeneity is None
     assert study.array.block.width_m == study.array.ring_length_m == 0.012
     hidden = held_out_readings(study, observe(study, points, np.ones_like(points, bool)))
     assert hidden.mean() == pytest.approx(1 / 5, abs=0.01)
