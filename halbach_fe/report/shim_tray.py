@@ -57,13 +57,14 @@ def _answer(found: FilledTray) -> Answer:
     if all(not count for count in found.left.values()):
         text += " The whole inventory is used: more magnets may do better."
     if before < FEW * after:
+        useless = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
         if found.magnet.study.design is not None:
             return Answer(
-                question, f"{text} That is hardly less.", _ranges(tray),
+                question, useless, _ranges(tray),
                 "The deviation is that of the design, and too large for a tray: search for a "
                 "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
         return Answer(
-            question, f"{text} That is hardly less.", _ranges(tray),
+            question, useless, _ranges(tray),
             "Take larger magnets or more places, or look for what the deviation comes from: its "
             "harmonics tell.", "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     if after > 2 * found.after.rms_ppm:
