@@ -396,7 +396,8 @@ def diagnosis_summary(
     diagnosis: Diagnosis, separations: Sequence[Separation] = ()
 ) -> dict[str, object]:
     """Return the content of diagnosis.json, whose keys docs/diagnosis.md describes."""
-    conflicting = diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
+    conflicting = (diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
+                   or diagnosis.after.held_out_conflict)
     return {
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
@@ -409,6 +410,7 @@ def diagnosis_summary(
         else "suspected" if diagnosis.suspected and not diagnosis.found_anything else
         "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
         "named" if diagnosis.found_anything else "nothing",
+        "held_out_conflict": diagnosis.after.held_out_conflict or None,
         "gross": [_gross(error) for error in diagnosis.gross_errors],
         "poses": [_pose(pose) for pose in diagnosis.poses],
         "positions": [asdict(position) for position in diagnosis.positions],

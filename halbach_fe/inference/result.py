@@ -401,7 +401,7 @@ class InferenceResult(ShownInNotebook):
     @property
     def disagreement(self) -> str:
         """Sentences if prior, model and maps cannot all be right, else an empty string."""
-        found = [self._conflict or self.too_near, self._held_out_conflict,
+        found = [self._conflict or self.too_near, self.held_out_conflict,
                  *(each.disagreement for each in self.overlaps)]
         return " ".join(sentence for sentence in found if sentence)
 
@@ -439,7 +439,7 @@ class InferenceResult(ShownInNotebook):
         return ""
 
     @property
-    def _held_out_conflict(self) -> str:
+    def held_out_conflict(self) -> str:
         """A sentence if held-out readings are far from their predictions, else nothing."""
         for part, words in ((HELD_OUT, ""), (HELD_OUT_MAP, " of the held-out map")):
             of_part = [score for score in self.scores if score.part == part]

@@ -44,11 +44,12 @@ def answer(diagnosis: Diagnosis) -> Answer:
     """Say what the study lacks, how sure that is, and what to do next."""
     found, doubts = _found(diagnosis), _doubts(diagnosis)
     sound = not (diagnosis.unknown or diagnosis.suspected or diagnosis.solver_error or _fails(
-        diagnosis))
+        diagnosis) or diagnosis.after.held_out_conflict)
     if diagnosis.identified and doubts:
         # besides how well the model fits now, and error bars that are too wide
         doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
-        wrong = diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
+        wrong = (diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
+                 or diagnosis.after.held_out_conflict)
         verdict = "No" if wrong else "Only in part" if doubtful or not sound else "Yes"
         doubts[0] = f"{verdict}. {doubts[0]}"
     if not diagnosis.identified:
@@ -73,6 +74,8 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
                 f"{chi2}, so that error bars of an update with this map are too small.")
     if diagnosis.suspected:
         return f"Only in part: a suspicion is no certainty. Without it {chi2}."
+    if not _fails(diagnosis):
+        return f"No. {diagnosis.after.held_out_conflict}"
     return f"No: {chi2}."
 
 
@@ -92,6 +95,11 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         check = "halbach-fe check MAP -o DIR"
         return ("Check the map without any magnet: it says which noise and which rows are in it.",
                 check)
+    if diagnosis.after.held_out_conflict:
+        return ("Let the diagnosis see readings like those that were held out, which contradict "
+                "it: hold out others, spread over the whole map ([inference.held_out]), and "
+                "diagnose again. If they are a map of its own, test first whether it is of the "
+                "same magnet in the same state.", again)
     if diagnosis.found_anything:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
         if remedies := _remedies(diagnosis):
@@ -122,7 +130,8 @@ def _found(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.solver_error:
         return sentences
     if diagnosis.identified:
-        fits = diagnosis.converged and not _fails(diagnosis)
+        fits = diagnosis.converged and not (
+            _fails(diagnosis) or diagnosis.after.held_out_conflict)
         start = f"{_maps(diagnosis)} explained by" if fits else (
             "The best explanation from the catalogue is")
         sentences.append(f"{start}: " + "; ".join(
@@ -136,6 +145,9 @@ def _found(diagnosis: Diagnosis) -> list[str]:
                  f"Nothing else is missing that {these} can show: with that," if sentences
                  else f"Nothing is missing that {these} can show:")
         agree = "the maps agree" if several else "the map agrees"
+        if diagnosis.after.held_out_conflict:
+            start = "Something is missing that was not found: readings that were held out disagree."
+            agree = f"The others of {these} agree"
         sentences.append(f"{start} {agree} with the study within noise (chi² per reading "
                          f"{decimals(after.prior_conflict)}).")
     if unknown is not None:
@@ -172,6 +184,10 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             f"{decimals(before.prior_conflict)}{held[0]}).")
         if _fails(diagnosis) and diagnosis.unknown is None:
             sentences.append("That is still too large: another cause is missing.")
+        elif diagnosis.after.held_out_conflict:
+            sentences.append(
+                "The held-out readings contradict that, as their chi² should be about 1: another "
+                f"cause looks like {added} where the other readings are.")
     sentences += [
         f"{_maps(diagnosis, 'do')} not tell {title_of(effect.hypothesis.effect.name, titles)} "
         f"from {joined_by_or(titles_of_rivals(effect, titles))}."

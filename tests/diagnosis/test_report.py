@@ -156,6 +156,37 @@ def test_verdicts(flat):
     assert "Yes: the readings are explained" in verdict(replace(nothing, before=fine, after=fine))
 
 
+@pytest.mark.parametrize(("inner", "outer", "named", "said"), [
+    (0.0, 0.0, [], "Yes: the readings are explained"),
+    (0.02, 0.0, [], "No. Held-out readings are farther from their predictions"),
+    (0.0, 0.02, ["gain_x"], "No. With this effect"),
+    (0.02, 0.02, ["gain_x"], "Yes. With this effect")])
+def test_held_out_readings_are_heard(
+    dipole, session, generator, inner, outer, named, said
+):
+    """The sensor of x shows more in the circle that is not fitted only, or in the other one."""
+    study = dipole(
+        array__recoil_permeability=1.0, noise=NOISE, inference={"held_out": {"radii_m": [0.05]}},
+        observation={"quantity": "flux_density", "components": ["x", "y"], "positions": {
+            "kind": "circles", "radius_m": [0.05, 0.075], "angles": 24}})
+    points = np.vstack([circle(0.05, 24), circle(0.075, 24)])
+    gain = np.outer(np.repeat([inner, outer], 24), [1, 0, 0])
+    found, further = diagnosed(study, points, lambda field: gain * field, ["gain_x"], session,
+                               generator)
+    assert [one.hypothesis.effect.name for one in found.identified] == named
+    told = answer(found)
+    assert told.trust.startswith(said)
+    assert told.sound == said.startswith("Yes")
+    assert told.said.startswith("The map is explained" if named and told.sound else "Nothing is"
+                                if told.sound else "The best explanation" if named else
+                                "Something is missing that was not found")
+    assert told.command.startswith(f"halbach-fe {'infer' if told.sound else 'diagnose'}")
+    summary = diagnosis_summary(found, further)
+    assert bool(summary["held_out_conflict"]) != told.sound
+    assert summary["verdict"] == (
+        "named" if named else "nothing" if told.sound else "unexplained")
+
+
 def test_the_page_of_what_is_unknown(flat, tmp_path):
     found, _ = flat
     unknown = UnknownCause("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
