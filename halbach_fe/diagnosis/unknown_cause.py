@@ -20,6 +20,7 @@ from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
+    DETECTION_LOG_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
     log_bayes_factors,
     selected_effect,
@@ -189,6 +190,12 @@ def describe_unknown(
     if not (best.terms or ambiguous):
         return None
     shown = judgement.without if ambiguous else best
+    alone = competition.explanation(shown.effects, ())
+    factor = (shown.log_odds - alone.log_odds
+              - len(shown.terms) * competition.prior_of_family)
+    if not ambiguous and _over_larger_noise(
+            factor, alone.chi2, shown.chi2, competition.evidence.readings) < DETECTION_LOG_ODDS:
+        return None
     first = competition.terms_beside(shown.effects, ())
     factors = {kind: max(term.fitted.log_bayes_factor for term in first
                          if (term.family.acts_on == "field") == (kind == "field"))
@@ -214,12 +221,26 @@ def describe_unknown(
                    if hypothesis.effect.name == "ferromagnetic_object"]
         if dipoles:
             source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
-    alone = competition.explanation(shown.effects, ())
     return UnknownCause(
-        "either" if factors[kind] - other < INDISTINGUISHABLE_LOG_EVIDENCE else kind,
-        shown.log_odds - alone.log_odds - len(shown.terms) * competition.prior_of_family,
+        "either" if factors[kind] - other < INDISTINGUISHABLE_LOG_EVIDENCE else kind, factor,
         not identified, ambiguous, float(size.max()),
         tuple(points[int(np.argmax(size))].tolist()), source, tuple(parts))
+
+
+def _over_larger_noise(
+    log_bayes_factor: float, before: float, after: float, readings: int
+) -> float:
+    """Return the log Bayes factor of terms if the size of the noise is unknown, with and without
+    them.
+
+    Noise of another size is the other explanation of a large chi-squared. With noise of the stated
+    size, terms that take chi-squared per reading from ``before`` to ``after`` explain
+    ``readings (before - after) / 2``, and with the likeliest size ``readings log(before / after) /
+    2``. What the freedom of the terms costs remains. A chi-squared below 1 counts as 1: noise may
+    be larger than it is stated, but is not smaller.
+    """
+    before, after = max(before, 1.0), max(after, 1.0)
+    return log_bayes_factor - readings * (before - after - float(np.log(before / after))) / 2
 
 
 def _part(term: Term, field: Floats, rivals: Sequence[Term]) -> UnknownPart:

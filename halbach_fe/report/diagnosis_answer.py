@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
@@ -158,7 +160,8 @@ def _found(diagnosis: Diagnosis) -> list[str]:
             f"{disagree} with the study (chi² per reading "
             f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
             "and no effect of the catalogue explains the difference, nor does a smooth field or "
-            "sensor error. Check the noise of the study.")
+            "sensor error. The readings scatter as if their noise were "
+            f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that.")
     for suspicion in diagnosis.suspected:
         sentences.append(suspicion_in_words(suspicion, titles))
     return sentences

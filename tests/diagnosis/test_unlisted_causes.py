@@ -17,12 +17,16 @@ from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import NominalSolver, possible
 from halbach_fe.diagnosis.unknown_cause import are_scattered
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
 from halbach_fe.synthetic.unlisted_causes import families, random_function, rms, simulate_unlisted
+from tests.conftest import circle
 from tests.support.unlisted import STUDY, false_names
 
 SLOW = ("iron_ring", "iron_saturation", "neighbour_magnet")
@@ -207,3 +211,30 @@ def test_seeds_are_reproducible():
     assert first[0].equals(second[0])
     assert first[1] == second[1]
     assert not first[0].equals(simulate_unlisted(STUDY, 10)[0])
+
+
+@pytest.mark.parametrize(("times", "amplitude_T"), [(2.0, 0.0), (5.0, 0.0), (1.0, 3e-4)])
+def test_noise_that_is_larger_than_stated_is_no_unknown_cause(
+    dipole, session, generator, times, amplitude_T
+):
+    """Terms of any shape explain a part of any few readings. The control: a rough function of the
+    azimuth that both circles share.
+    """
+    study = dipole(
+        array__recoil_permeability=1.0, noise={"regions": [{"name": "all", "sigma_T": 2e-5}]},
+        observation={"quantity": "flux_density", "components": ["x", "y"], "positions": {
+            "kind": "circles", "radius_m": [0.05, 0.075], "angles": 32}})
+    points = np.vstack([circle(0.05, 32), circle(0.075, 32)])
+    noise = times * 2e-5 * generator.standard_normal(points.shape)
+    rough = amplitude_T * np.tile(generator.standard_normal((32, 3)), (2, 1))
+    data = field_map(points, field_of(build_magnet(study).blocks, points) + noise + rough)
+    some = [effect for effect in catalogue() if effect.name in (
+        "gain_x", "offset_y", "mapper_translation")]
+    found = diagnose(study, data, session, effects=some)
+    assert found.identified == ()
+    assert (found.unknown is not None) == bool(amplitude_T)
+    said = answer(found).said
+    assert ("The readings scatter as if their noise were" in said) != bool(amplitude_T)
+    if not amplitude_T:  # the blocks' tolerances take a part of it
+        factor = float(said.split("noise were ")[1].split()[0])
+        assert 0.7 * times < factor < 1.1 * times
