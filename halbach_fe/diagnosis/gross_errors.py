@@ -61,6 +61,10 @@ MIN_READINGS = 12
 """Smallest number of readings for the search. With fewer readings some gross error would fit any
 map."""
 
+MIN_USED = 0.9
+"""Smallest share of the observed values that a convention must use. One that puts a component of a
+cross-section along z, which is not observed there, has less to explain than the others."""
+
 BLOCK_MAGNETIZATION_SD = 0.02
 """Standard deviation of a block's magnetization along each axis, relative to its nominal
 magnitude."""
@@ -491,7 +495,7 @@ class _Search:
     ) -> tuple[Floats, float] | None:
         """Return standardized residuals (values,), and their rms relative to that of the map.
 
-        None if points are inside material, or fewer than half of the observed values remain.
+        None if points are inside material, or less than `MIN_USED` of the observed values remain.
         """
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
@@ -509,7 +513,7 @@ class _Search:
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
         used = ~np.isnan(shown) & self.observed
-        if not used.any() or 2 * used.sum() < self.present:
+        if not used.any() or used.sum() < MIN_USED * self.present:
             return None
         whole = max(_size(shown), 1e-300)
         sd = np.sqrt(variance[used] + (EFFECT_FIELD_SD * max(whole, _size(field))) ** 2)

@@ -12,6 +12,10 @@ from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.session import Session
+from halbach_fe.study.reader import parse_study
+from tests.conftest import circle
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured, with_array
 
 NONE = np.eye(3)
@@ -226,3 +230,43 @@ def test_a_wrong_block_is_not_another_number_of_rings(generator, lacking):
     assert found.names == ("millimetres",)
     assert found.misfit_after > 0.05  # by itself it would not have been believed
     assert find_gross_errors(found.apply(study), data) == ()
+
+
+@pytest.fixture(scope="module")
+def yoked(getdp, tmp_path_factory):
+    """A quadrupole in an iron ring, in cross-section, and its field on two circles.
+
+    The iron changes the field more than a wrong block does, and the search does not know of it.
+    """
+    study = parse_study({
+        "name": "yoked", "dimension": 2,
+        "array": {"multipole_order": 2, "blocks_per_ring": 16, "inner_radius_m": 0.02,
+                  "outer_radius_m": 0.036, "remanence_T": 1.3, "block": {"shape": "sector"}},
+        "iron_ring": {"inner_radius_m": 0.038, "outer_radius_m": 0.046,
+                      "relative_permeability": 1000.0},
+        "mesh": {"block_size_m": 0.004, "bore_size_m": 0.004},
+        "observation": {"quantity": "flux_density", "components": ["x", "y"], "positions": {
+            "kind": "circles", "radius_m": [0.0067, 0.0133], "angles": 32}},
+        "noise": {"regions": [{"name": "all", "sigma_T": 7e-5}]}})
+    points = np.vstack([circle(0.0067, 32), circle(0.0133, 32)])
+    field = solve_nominal(build_magnet(study), points,
+                          Session(getdp, tmp_path_factory.mktemp("yoked")))
+    return study, points, np.column_stack([field[:, :2], np.full(len(points), np.nan)])
+
+
+@pytest.mark.parametrize(("columns", "names"), [
+    ([1, 2], []), ([1, -2], ["sign_flipped_axis"]), ([2, 1], ["swapped_axes"])])
+def test_no_component_of_a_cross_section_is_put_along_z(yoked, generator, columns, names):
+    """There it would not be compared, so that any field would be explained."""
+    study, points, field = yoked
+    shown = field.copy()
+    shown[:, :2] = np.sign(columns) * field[:, np.abs(columns) - 1]
+    data = field_map(points, shown + 7e-5 * generator.standard_normal(shown.shape))
+    found = find_gross_errors(study, data)
+    assert [name for each in found for name in each.names] == names
+    for error in found:
+        possible = [one.fields for one in (error.convention, *error.alternatives)]
+        assert all(fields[2] == "z" for fields in possible)
+        # or positions that are mirrored, of which a quadrupole makes the same readings
+        assert tuple(f"{'-' * (column < 0)}{'xyz'[abs(column) - 1]}"
+                     for column in (*columns, 3)) in possible
