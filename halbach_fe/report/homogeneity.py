@@ -87,26 +87,31 @@ def answer(found: HomogeneityResult) -> Answer:
     trust, small = solver_error_text(found.model, best.rms_ppm)
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
-    designed = found.magnet.study.design is not None
-    if name != "prior" and best.rms_ppm > TOO_LARGE_FOR_A_TRAY and designed:
-        return Answer(
-            question, f"{text}.", f"{agreement(found.disagreement)} {trust}",
-            f"A deviation of {1e-4 * best.rms_ppm:.2g} % is that of the design: look for a better "
-            "one. Small magnets in a tray cannot make up for it.",
-            "halbach-fe design STUDY -o DIR", small)
+    better: tuple[str, str] | None = None
+    if best.rms_ppm > TOO_LARGE_FOR_A_TRAY:
+        stated = found.magnet.study.design is not None
+        better = (
+            f"A deviation of {1e-4 * best.rms_ppm:.2g} % is that of the rings, not of their errors:"
+            f" look for better rings{'' if stated else ', by a table [design] in the study'}, or "
+            "for a smaller region. Small magnets in a tray cannot make up for it.",
+            "halbach-fe design STUDY -o DIR")
+    if name != "prior" and better:
+        return Answer(question, f"{text}.", f"{agreement(found.disagreement)} {trust}", *better,
+                      small)
     if name != "prior":
         return Answer(
             question, f"{text}.",
             f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
             "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
+    measure = ("Measure it, and update its blocks with the map; then ask again with --posterior "
+               "and the posterior.h5 that this command writes into its DIR:",
+               "halbach-fe infer STUDY --measurements MAP -o DIR")
     return Answer(
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
-        "Measure it, and update its blocks with the map; then ask again with --posterior and the "
-        "posterior.h5 that this command writes into its DIR:",
-        "halbach-fe infer STUDY --measurements MAP -o DIR", small)
+        *(better or measure), small)
 
 
 def _of_map(found: HomogeneityResult) -> str:

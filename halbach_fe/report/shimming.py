@@ -201,7 +201,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         else:
             said = f"Those of the {moves} that shim lists: {said}"
     else:
-        said = (f"No move is worthwhile. Leave it as it is: {before} {unit}, including the "
+        said = (f"No move is worthwhile. Leave it as it is: {what} {before} {unit}, including the "
                 "uncertainty.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)

@@ -503,11 +503,15 @@ def test_commands_name_the_posterior_that_was_read(given):
     """It lies in the folder of the update, not in that of the command which read it."""
     still = hf.shim(given.updated, given.session, swaps=0, turns=0)
     assert still.stop == "budget"  # other blocks would fit
-    for found in (homogeneity.answer(hf.homogeneity(given.magnet, given.session,
-                                                    posterior=given.updated)),
-                  shimming.answer(still, given.updated)):
+    of_field = hf.homogeneity(given.magnet, given.session, posterior=given.updated)
+    name, known = list(of_field.by_name.items())[-1]
+    even = replace(of_field, by_name={name: replace(known, rms_ppm=900.0)})
+    for found in (homogeneity.answer(even), shimming.answer(still, given.updated)):
         assert "DIR/posterior.h5" not in found.command
         assert "--posterior POSTERIOR" in found.command
+    # the control: no tray makes up for per cents
+    assert homogeneity.answer(of_field).command == "halbach-fe design STUDY -o DIR"
+    assert f"A deviation of {1e-4 * known.rms_ppm:.2g} %" in homogeneity.answer(of_field).step
 
 
 def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_path):
