@@ -182,9 +182,10 @@ def _difference(key: str, old: Any, new: Any) -> str:
         return f"{key} has {counted(now, 'entry', 'entries') if now else 'no entry'}, and " + (
             f"{before or 'none'} before")
     if old in (None, []):
-        return f"{key} is {_short(new)}, and was not given before"
+        return f"{key} is {'given' if isinstance(new, dict) else _short(new)}, and was not before"
     if new in (None, []):
-        return f"{key} is not given, and was {_short(old)} before"
+        known = "given" if isinstance(old, dict) else _short(old)
+        return f"{key} is not given, and was {known} before"
     return f"{key} is {_short(new)} instead of {_short(old)}"
 
 

@@ -41,6 +41,9 @@ SWEEP_K = 40.0
 """Margin in K by which the temperature axis extends beyond the magnet's temperature and beyond the
 limit temperature of the last of `SHARES`."""
 
+ROOM_C = 20.0
+"""Temperature in °C at which a magnet is kept at least."""
+
 WORST_ROWS = 12
 """Number of blocks in the page's table."""
 
@@ -86,11 +89,13 @@ def answer(found: DemagnetizationMap) -> Answer:
         for share, limit in ((share, found.limit_temperature(share)) for share in SHARES))
     nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
                  if is_nonlinear(found.study) else "")
+    cold = " It loses magnetization at room temperature already." if (
+        found.limit_temperature(SHARES[-1]) < min(ROOM_C, temperature)) else ""
     at = f"at {temperature:g}\u00a0°C"
     return Answer(
         "Do the blocks keep their magnetization?",
         f"{'No' if lost > 0 else 'Yes'}: {at}, {start}.{losing} The smallest margin "
-        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.",
+        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{cold}",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (the option "
         f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}",

@@ -58,8 +58,10 @@ NEGLIGIBLE = 1e-9
 def answer(found: Forces) -> Answer:
     """Say how large the forces are in place and during the assembly, and what to do next."""
     question = "Which forces act on the blocks?"
-    plan = ("Plan tools and glue for these forces; see what heat does to the blocks (the study's "
-            "[demagnetization]).", "halbach-fe demagnetization STUDY -o DIR")
+    hot = "" if found.magnet.study.demagnetization is not None else (
+        ": put a table [demagnetization] with temperature_C into the study")
+    plan = (f"Plan tools and glue for these forces; see what heat does to the blocks{hot}.",
+            "halbach-fe demagnetization STUDY -o DIR")
     worst = int(np.argmax(found.in_place.magnitude))
     size = found.in_place.magnitude[worst]
     if size < NEGLIGIBLE:

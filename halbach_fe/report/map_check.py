@@ -115,11 +115,11 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
     noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
-    where = "that belongs into the study as sigma_T"
+    where = "that is sigma_T of the study, unless you know it better"
     if check.position_noise_m >= SCATTERED_M:
         noise += (", and where the field is steep, readings scatter like positions that are "
                   f"{check.position_noise_m * 1e6:.0f} µm off")
-        where = "these belong into the study as sigma_T and position_sd_m"
+        where = "these are sigma_T and position_sd_m of the study, unless you know them better"
     return f"{noise}: {where}." if keys else f"{noise}."
 
 

@@ -29,7 +29,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, decimals, flux_density, with_error
+from halbach_fe.report.words import counted, decimals, flux_density, in_a_row, with_error
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -144,7 +144,7 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
             if _fit_alike(found[0], each):
                 alike.append(each)
             else:
-                unlike.append(f"{100 * value:.0f}")
+                unlike.append(f"{100 * value:.0f}\u00a0%")
     others, one = counted(len(alike), "other pose"), len(alike) == 1
     if alike and all(is_symmetric_to(found[0], each) for each in alike):
         said.append(
@@ -159,7 +159,7 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
                     "how the map was measured which one is real.")
     if unlike:
         said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out, with a probability "
-                    f"of {', '.join(unlike)} % beside {100 * probability[0]:.0f} % of this one.")
+                    f"of {in_a_row(unlike)} beside {100 * probability[0]:.0f} % of this one.")
     return said
 
 

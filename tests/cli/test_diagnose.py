@@ -347,7 +347,7 @@ def test_the_documentation_says_what_is_in_the_file():
     study = parse_study(tomllib.loads(STUDY))
     update = SimpleNamespace(
         study=study, parts=("training",), maps=("map",), regions=("all",), is_campaign=False,
-        prior_conflict=1.0, conflict_limit=2.0,
+        prior_conflict=1.0, conflict_limit=2.0, held_out_conflict="",
         readings=np.zeros(1), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
