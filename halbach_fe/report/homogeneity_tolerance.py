@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import ppm, with_error
+from halbach_fe.report.words import ppm, share_in_words
 
 ENOUGH = 0.9
 """Share of the magnets within the limit from which the tolerances suffice."""
@@ -80,7 +80,7 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
             f"{ppm(found.ordered.rms_ppm)} ppm rms.")
     share, prior = found.share, found.study.prior
     if share is not None and found.limit is not None:
-        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
+        said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
@@ -92,7 +92,8 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
              "blocks can use their errors against it, but takes only a part of it away.",
              "halbach-fe design STUDY -o DIR")
             if found.ordered.rms_ppm > OF_THE_DESIGN * half else
-            ("Sort measured blocks into their slots before assembly: that is better than chance.",
+            ("Sort measured blocks into their slots before assembly: where several fit a slot, "
+             "that is better than chance.",
              "halbach-fe sort STUDY BLOCKS -o DIR"))
     text, small = solver_error_text(found.model, half)
     return Answer(

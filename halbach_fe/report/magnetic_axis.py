@@ -31,7 +31,9 @@ def axis_rows(axis: MagneticAxis | None) -> list[dict[str, str]]:
 def definition(axis: MagneticAxis) -> str:
     """Return how centre, axis and roll are defined for the magnet's order, in sentences."""
     roll = ("The roll is the turn of the main multipole about z from that of the nominal magnet, "
-            "right-handed, in the mean along z weighted by the field. In the table of multipoles, "
+            "right-handed; in a magnet of finite length in the mean along its middle half, "
+            "weighted by the square of the field. The integral along z, whose roll shim states, "
+            "has another one if rings are turned against each other. In the table of multipoles, "
             "a of the main order says the same of one circle, with the other sign.")
     if axis.order == 1:
         return ("A dipole has no axis. Its centre is the point near the middle, of a magnet of "

@@ -31,7 +31,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import whole, with_error
+from halbach_fe.report.words import share_in_words, whole
 from halbach_fe.response.multipoles import plain
 
 LEAST_OF_SD = 5e-3
@@ -104,11 +104,12 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
             f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
     share, prior = found.share, found.study.prior
     if share is not None:
-        said = (f"{with_error(100 * share, 100 * (found.share_sd or 0.0))}\u00a0% of the magnets "
+        said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
-    step = (("Sort measured blocks into their slots before assembly: that is better than chance.",
+    step = (("Sort measured blocks into their slots before assembly: where several fit a slot, "
+             "that is better than chance.",
              "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))

@@ -103,6 +103,15 @@ def whole(number: int) -> str:
     return f"{number:,}".replace(",", "\u202f") if abs(number) >= 10_000 else str(number)
 
 
+def share_in_words(share: float, sd: float | None) -> str:
+    """Return a share of what was drawn in per cent, with its standard deviation; in words if it is
+    none or all, of which the draws tell no standard deviation.
+    """
+    if share in (0.0, 1.0):
+        return "All" if share else "None"
+    return f"{with_error(100 * share, 100 * (sd or 0.0))}\u00a0%"
+
+
 def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a number and its noun: 1 move, 2 moves."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
