@@ -110,6 +110,19 @@ def test_whole_blocks_count_as_they_were_measured(nominal, name, generator):
         change).max()  # negative control: nominal blocks
 
 
+def test_changes_of_magnetizations_have_the_signature_in_vacuum(nominal):
+    """The response matrix turns them into readings where blocks are permeable."""
+    found = {name: effect for name, effect in EFFECTS.items()
+             if effect.magnetization_change(nominal, effect.places(STUDY)[5 % len(
+                 effect.places(STUDY))]) is not None}
+    assert set(found) == {"block_missing", "block_flipped", "blocks_swapped", "block_demagnetized"}
+    for effect in found.values():
+        place = effect.places(STUDY)[5]
+        field = sum(nominal.field_with(block, change) for block, change in
+                    effect.magnetization_change(nominal, place).items())
+        assert effect.signature(nominal, place)[0] == pytest.approx(field, abs=1e-12)
+
+
 def test_refinements_are_derivatives(nominal):
     effect = EFFECTS["neighbour_magnet"]
     place = effect.places(STUDY)[3]
