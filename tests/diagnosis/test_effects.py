@@ -113,8 +113,8 @@ def test_whole_blocks_count_as_they_were_measured(nominal, name, generator):
 def test_changes_of_magnetizations_have_the_signature_in_vacuum(nominal):
     """The response matrix turns them into readings where blocks are permeable."""
     found = {name: effect for name, effect in EFFECTS.items()
-             if effect.magnetization_change(nominal, effect.places(STUDY)[5 % len(
-                 effect.places(STUDY))]) is not None}
+             if any(effect.magnetization_change(nominal, place) is not None
+                    for place in effect.places(STUDY)[:1])}
     assert set(found) == {"block_missing", "block_flipped", "blocks_swapped", "block_demagnetized"}
     for effect in found.values():
         place = effect.places(STUDY)[5]
