@@ -76,6 +76,9 @@ class Answer:
     concern : str
         What is bad about the magnet itself, in a sentence that no summary may leave out; empty if
         nothing is.
+    changes_study : bool
+        Whether a study that the command wrote says something else than the one that it read, beyond
+        the error bars. Otherwise results of the one are as good as those of the other.
     """
 
     question: str
@@ -85,6 +88,7 @@ class Answer:
     command: str = ""
     sound: bool = True
     concern: str = ""
+    changes_study: bool = True
 
     @property
     def sentences(self) -> tuple[str, str, str]:

@@ -24,6 +24,9 @@ FINDING = ("register", "diagnose")
 OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
 """Commands whose results are of the measured magnet, and should be of such a study."""
 
+UPDATED_BY_MAP = ("infer", "diagnose", "shim", "shim-tray")
+"""Commands that update the blocks by a map, and take measured blocks too."""
+
 EXCEPTIONS = "array.exceptions"
 """Key of the blocks that deviate from the array."""
 
@@ -37,7 +40,7 @@ OF_MAPPER = ("instrument", "instrument_sd", "maps")
 def doubts(chapters: Sequence[Chapter]) -> list[str]:
     """Return a sentence for everything that does not fit together."""
     return [*_changed(chapters), *_out_of_date(chapters), *_other_files(chapters),
-            *_unused_findings(chapters), *_unrelated(chapters),
+            *_unused_findings(chapters), *_unused_blocks(chapters), *_unrelated(chapters),
             *(text for text, known in _versions(chapters) if not known)]
 
 
@@ -93,7 +96,8 @@ def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
     """Name studies with findings that no result here is of."""
     found = []
     for one in chapters:
-        found_nothing = one.verb == "diagnose" and not one.pages[0].said.rows
+        found_nothing = not any(page.said.answer is None or page.said.answer.changes_study
+                                for page in one.pages)
         written = [] if found_nothing or not one.record.inputs else [
             name for name in one.digests.values() if name.endswith(".toml")]
         later = [other for other in chapters if other.verb in OF_MEASURED]
@@ -103,6 +107,21 @@ def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
                          f"{'is' if len(later) == 1 else 'are'} without what "
                          f"{one.record.command} has found.")
     return found
+
+
+def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
+    """Name updates by a map without the measured blocks that other results here are of."""
+    known = [one for one in chapters if "BLOCKS" in one.record.named]
+    verbs = {one.verb for one in known}
+    without = [one for one in chapters if one.verb in UPDATED_BY_MAP and one.verb not in verbs
+               and "MAP" in one.record.named and "BLOCKS" not in one.record.named]
+    if not known or not without:
+        return []
+    return [f"{_listed(without)} {'is' if len(without) == 1 else 'are'} without the measured "
+            f"blocks that {_listed(known)} {'has' if len(known) == 1 else 'have'} read, and "
+            f"{'knows' if len(without) == 1 else 'know'} less of the magnet: run "
+            f"{in_a_row(list(dict.fromkeys(one.record.command for one in without)))} again with "
+            "--blocks."]
 
 
 def _unrelated(chapters: Sequence[Chapter]) -> list[str]:

@@ -146,8 +146,10 @@ class Campaign:
                 "one study") + ", and no file was changed since. How far each can be trusted "
             "stands with it below.")
         last = self._next()
-        return Answer("What is known of this magnet?", said, trust,
-                      last.step if last else "Nothing that the results name is left to do.",
+        step = last.step if last else "Nothing that the results name is left to do."
+        if self.doubts and not left:
+            step = f"Mend what does not fit together, as the list below says. After that: {step}"
+        return Answer("What is known of this magnet?", said, trust, step,
                       last.command if last else "", sound=not (self.doubts or left))
 
     def _newest(self) -> list[str]:
@@ -197,8 +199,13 @@ class Campaign:
         if not found.sound:
             return next(own.with_paths({"DIR": found.folder}) for one, _, own in self.answered
                         if one is found)
-        return replace(answer, step=f"Repeat {chapter.label} with {found.label}/{DIAGNOSED}, which "
-                       "has what its study lacks.", command="")
+        repeat = (f"Repeat {chapter.label} with {found.label}/{DIAGNOSED}, which has what its "
+                  "study lacks.")
+        concern = next((own.concern for one, _, own in self.answered
+                        if one is found and own.concern), "")
+        return replace(answer, command="", step=repeat if not concern else (
+            "Put right what was not assembled as designed, and measure again. Or, if it stays, "
+            f"{repeat[0].lower()}{repeat[1:]}"))
 
     def plain(self) -> dict[str, object]:
         """Return the answers and what does not fit as plain data."""

@@ -60,7 +60,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
         diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
             f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
-            f"{STUDY_FILE}, which has it as it is."))
+            f"{STUDY_FILE}, which describes it with these errors."),
+        diagnosis.found_anything)
 
 
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:

@@ -92,8 +92,8 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
              "blocks can use their errors against it, but takes only a part of it away.",
              "halbach-fe design STUDY -o DIR")
             if found.ordered.rms_ppm > OF_THE_DESIGN * half else
-            ("Sort measured blocks into their slots before assembly: where several fit a slot, "
-             "that is better than chance.",
+            ("Measure the blocks before assembly, and see what sorting them into the slots that "
+             "they fit gains.",
              "halbach-fe sort STUDY BLOCKS -o DIR"))
     text, small = solver_error_text(found.model, half)
     return Answer(

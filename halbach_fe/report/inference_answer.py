@@ -45,7 +45,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"This is the magnet with blocks that are not as designed ({faults}): put that right and "
         "measure again, or go on with it as it is. ")
     return Answer(
-        question, f"{main_field_in_words(tables)} {said}".lstrip(),
+        question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
         f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
@@ -53,6 +53,16 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
         f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
         "-o DIR")
+
+
+def _largest_field(result: InferenceResult) -> str:
+    """Say how strong the updated field is at its strongest reading; empty if none is a field."""
+    if result.study.observation.quantity != "flux_density":
+        return ""
+    known = result.prediction_posterior
+    most = int(np.argmax(np.abs(known.mean)))
+    return ("The strongest component of the updated field at the map's positions is "
+            f"{with_error(1e3 * abs(known.mean[most]), 1e3 * known.sd[most])} mT.")
 
 
 def _prediction(result: InferenceResult) -> str:

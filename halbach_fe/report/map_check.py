@@ -246,6 +246,15 @@ def residual_table(check: MapCheck) -> list[dict[str, str]]:
               for low, high, values in windows)]
 
 
+def weighted_note(check: MapCheck) -> str:
+    """Explain residuals that are larger with the instrument; empty if none are."""
+    if (check.rms_T <= check.rms_as_given_T).all():
+        return ""
+    return ("With the instrument, readings count less where the field is steep, as positions that "
+            "scatter a little change them much there: so plain residuals can be larger than those "
+            "of the map as it is given, where every reading counts alike.")
+
+
 @own_style
 def write_map_check(
     data: xr.Dataset, check: MapCheck, folder: Path, provenance: Mapping[str, str]
@@ -282,7 +291,7 @@ def write_map_check(
                provenance=provenance, check=check, answer=answer(check),
                found=sentences(check), files=", ".join(files),
                undetermined=undetermined(check), instrument=instrument_table(check),
-               rows=residual_table(check))
+               rows=residual_table(check), weighted=weighted_note(check))
 
 
 def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:

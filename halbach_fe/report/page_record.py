@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
@@ -77,8 +78,9 @@ def _cleaned(text: str) -> str:
 
 def _cleaned_answer(answer: Answer) -> Answer:
     """Return an answer whose texts have no control characters."""
-    texts = {key: _cleaned(value) for key, value in vars(answer).items() if key != "sound"}
-    return Answer(**texts, sound=answer.sound)
+    cleaned: dict[str, Any] = {key: _cleaned(value) for key, value in vars(answer).items()
+                               if isinstance(value, str)}
+    return replace(answer, **cleaned)
 
 
 Text = Annotated[str, AfterValidator(_cleaned)]

@@ -38,6 +38,9 @@ LITTLE = 0.97
 """Uncertainty relative to that of as many of the study's positions from which on a plan is hardly
 better."""
 
+VAGUE = 0.7
+"""Uncertainty relative to the prior's from which on the readings tell little of single blocks."""
+
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
 
@@ -88,20 +91,29 @@ def answer(plan: MeasurementPlan) -> Answer:
     said = f"At the {counted(points, 'position')} of plan.csv. "
     if plan.deviation is None:
         left, of_study = _patterns(plan)
+        beside = "" if _is_the_study(plan) else (
+            f"; with as many of the study's own positions to {fraction(of_study)}"
+            f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
         said += ("With them the standard deviation of a pattern of blocks, in the geometric mean "
-                 f"over all patterns, falls to {fraction(left)} of the prior's; with as many of "
-                 f"the study's own positions to {fraction(of_study)}"
-                 f"{'' if left < LITTLE * of_study else ', which is hardly more'}. ")
+                 f"over all patterns, falls to {fraction(left)} of the prior's{beside}. ")
+        if left > VAGUE:
+            said += ("So such a map tells little of the single blocks, at whatever positions of "
+                     "these it is measured. Measure the blocks before assembly, or the field "
+                     "nearer to them. ")
     else:
         said += (f"At a point of {plan.deviation.region.text}, the deviation of |B| from its mean "
-                 f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms, after as many of "
-                 f"the study's positions to {ppm(_of_study(plan))}, and before to "
-                 f"{ppm(plan.deviation.prior)}. ")
+                 f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms"
+                 + ("" if _is_the_study(plan) else ", after as many of the study's positions to "
+                    f"{ppm(_of_study(plan))}") + f", and before to {ppm(plan.deviation.prior)}. ")
     everything = points == len(plan.candidates)
     if everything:
-        said += ("These are all the candidates, so that the plan only orders "
-                 f"them. With the first {_nearly(plan)}, {_what_is_left(plan)} is at most "
-                 f"{NEARLY:g} times that with all of them.")
+        nearly = _nearly(plan)
+        said += ("These are all the candidates"
+                 f"{', the positions of the study' if _is_the_study(plan) else ''}: the plan only "
+                 "orders them.")
+        if 1 < nearly < points:  # a single one that suffices only shows that none tells much
+            said += (f" With the first {nearly}, {_what_is_left(plan)} is at most "
+                     f"{NEARLY:g} times that with all of them.")
     else:
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else

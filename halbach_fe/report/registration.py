@@ -61,6 +61,10 @@ NOT_AT_REST = (
     "farther away than the error bars say.")
 
 
+CERTAIN_SD = 3.0
+"""Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
+numbers that are zero, one is farther away in one of 15 maps."""
+
 NOMINAL = "nominal magnet"
 UPDATED = "magnet as the maps before have updated it"
 """What the readings are compared with before they update the blocks."""
@@ -107,7 +111,21 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
              f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
             if best.explains else
             ("Look for what the model lacks.",
-             f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound)
+             f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound,
+        changes_study=not _is_as_assumed(best))
+
+
+def _is_as_assumed(best: Registration) -> bool:
+    """Tell whether pose and probe are those of a map that no study describes, within errors."""
+    found, assumed, probe = best.instrument, Instrument(), best.probe
+    far = [(found.translation_m, best.translation_sd_m), (found.rotation_rad, best.rotation_sd_rad),
+           (found.gain, probe.gain), (found.offset_T, probe.offset_T),
+           (list(found.crosstalk.values()), probe.crosstalk),
+           (found.sensor_position_m, probe.sensor_m)]
+    return not best.open_keys and (found.position_axes, found.field_axes) == (
+        assumed.position_axes, assumed.field_axes) and all(
+        np.all(np.abs(np.array(value, float)) <= CERTAIN_SD * np.array(sd, float))
+        for value, sd in far)
 
 
 def _magnet_on_stage(best: Registration) -> str:

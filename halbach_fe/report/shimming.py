@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -40,8 +41,13 @@ from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
 
+T = TypeVar("T")
+
 LITTLE = 0.05
 """Part of the rms below which the gain of all moves together is called hardly worth the work."""
+
+MOST = 0.9
+"""Part of the gain of all moves that the first of them make, which the answer names."""
 
 LIKELY = 0.5
 """Probability below which the answer says that moves do not reach the limit."""
@@ -142,8 +148,13 @@ def table_title(shim: Shim) -> str:
 def value_table(shim: Shim) -> list[dict[str, str]]:
     """Return the rows of the table of multipoles or fields before and after, as text."""
     if shim.fields is None:
-        return text_table(before=shim.before, after=shim.after)
-    return homogeneity_rows(dict(zip(("before", "after"), shim.fields, strict=True)))
+        return text_table(**_compared(shim, shim.before, shim.after))
+    return homogeneity_rows(_compared(shim, *shim.fields))
+
+
+def _compared(shim: Shim, before: T, after: T) -> dict[str, T]:
+    """Return what is before and after the moves by its name; without moves there is one magnet."""
+    return {"before": before, "after": after} if shim.steps else {"as it is": before}
 
 
 def _placement_text(shim: Shim, placement: Placement) -> str:
@@ -199,10 +210,11 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             said = (f"No block: with {moves} {said} That is {100 * _gained(shim):.2g} %, hardly "
                     "worth the work.")
         else:
-            said = f"Those of the {moves} that shim lists: {said}"
+            said = (f"{'The block' if len(shim.steps) == 1 else 'The blocks'} of the {moves} "
+                    f"listed below: {said}{_first_moves(shim)}")
     else:
         said = (f"No move is worthwhile. Leave it as it is: {what} {before} {unit}, including the "
-                "uncertainty.")
+                f"uncertainty{_unknown_part(shim)}.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
@@ -219,13 +231,37 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
     if reason_against(shim, result):
         make = f"Leave the magnet as it is. If the gain is worth the work after all: {make}"
+    mounted = "" if not shim.steps or shim.study.prior.mounting_sd_deg > 0 else (
+        " That blocks are turned a little when they are mounted again is left out, as the study "
+        "has no prior.mounting_sd_deg.")
     return Answer(
-        question, said, f"Yes. Model and map agree. {ended}", *(
+        question, said, f"Yes. Model and map agree. {ended}{mounted}", *(
             (make,
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
              f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")))
+
+
+def _first_moves(shim: Shim) -> str:
+    """Say how few of the moves make most of the gain, if not all of them are needed for that."""
+    sizes = np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
+    part = (sizes[0] - sizes) / (sizes[0] - sizes[-1])
+    first = int(np.argmax(part >= MOST))
+    if first == len(shim.steps):
+        return ""
+    return (f" The first {'one makes' if first == 1 else f'{first} make'} "
+            f"{100 * part[first]:.0f}\u00a0% of that gain.")
+
+
+def _unknown_part(shim: Shim) -> str:
+    """Say how much of the rms is uncertainty, if that is most of it; with its unit."""
+    known = shim.before.rms_of_mean
+    if known**2 > shim.before.rms**2 / 2:
+        return ""
+    unit = "units" if shim.fields is None else "ppm"
+    return (f", which is most of it: {_size(shim, known)} {unit} are known to be there. Measured "
+            "blocks (--blocks) or a map at more places would tell more")
 
 
 @own_style
@@ -243,9 +279,9 @@ def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> 
         write_edited(folder / "study.shimmed.toml", text, [(shimmed, note)])
     write_text(folder / "shim.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     figures = {} if shim.fields is not None else {"shim_multipoles.png": (
-        multipole_figure({"before": shim.before, "after": shim.after}, shim.limit),
-        "Unwanted multipoles before and after the moves, normal (left) and skew (right); bars are "
-        "two standard deviations")}
+        multipole_figure(_compared(shim, shim.before, shim.after), shim.limit),
+        f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
+        "and skew (right); bars are two standard deviations")}
     if shim.steps:
         figures |= {
             "shim_moves.png": (
@@ -270,12 +306,14 @@ def _convention(shim: Shim) -> str:
     if isinstance(shim.model, DeviationModel):
         return (f"{SIZES} Ranges contain the uncertainty of the blocks after the update; after the "
                 "moves also that of mounting and of replaced blocks.")
-    before, after = (main_in_words(shim.model, known) for known in (shim.before, shim.after))
-    first, last = (f"{with_error(1e3 * known.roll, 1e3 * known.roll_sd)} mrad"
-                   for known in (shim.before, shim.after))
+    known = _compared(shim, shim.before, shim.after)
+    when = {name: f" {name}" if shim.steps else "" for name in known}
+    main = ", ".join(f"{main_in_words(shim.model, each)}{when[name]}"
+                     for name, each in known.items())
+    roll = ", ".join(f"{with_error(1e3 * each.roll, 1e3 * each.roll_sd)} mrad{when[name]}"
+                     for name, each in known.items())
     return (f"{reference_text(shim.model)} ± is the standard deviation, including the error of the "
-            f"solver. Main multipole: {before} before, {after} after. It is rotated about the z "
-            f"axis by {first} before, {last} after.")
+            f"solver. Main multipole: {main}. It is rotated about the z axis by {roll}.")
 
 
 def _moves_figure(shim: Shim) -> Figure:

@@ -108,8 +108,8 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
-    step = (("Sort measured blocks into their slots before assembly: where several fit a slot, "
-             "that is better than chance.",
+    step = (("Measure the blocks before assembly, and see what sorting them into the slots that "
+             "they fit gains.",
              "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))

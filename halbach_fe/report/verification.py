@@ -33,9 +33,24 @@ from halbach_fe.report.page import (
     stacked_axes,
     write_page,
 )
-from halbach_fe.report.words import ROUNDING, decimals, flux_density, is_fourier, ppm, relative
+from halbach_fe.report.words import (
+    ROUNDING,
+    decimals,
+    flux_density,
+    in_a_row,
+    is_fourier,
+    ppm,
+    relative,
+)
 from halbach_fe.response.discretization_error import REFINEMENT
-from halbach_fe.response.mesh_convergence import EXACT, FLATTEST, STEEPEST, STEPS, Verification
+from halbach_fe.response.mesh_convergence import (
+    BOUNDARY,
+    EXACT,
+    FLATTEST,
+    STEEPEST,
+    STEPS,
+    Verification,
+)
 
 COLOURS = (THIRD, PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("v", "^", "o", ".", "s", "x")
@@ -89,6 +104,11 @@ def answer(found: Verification) -> Answer:
     finer = (f"Make mesh.block_size_m smaller (elements are now "
              f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
              "halbach-fe verify STUDY -o DIR")
+    keys = _boundary_keys(found)
+    if keys and _boundary_part(found) > error / 2:
+        finer = ("Most of the error is that the computed region ends too near. Make "
+                 + " and ".join(f"{key} larger (now {1e3 * size:.3g} mm)"
+                                for key, size in keys.items()) + ", and verify again.", finer[1])
     return Answer(question, said, " ".join(filter(None, (trust, noise))),
                   *(finer if rough or noisy else measure), sound=not rough)
 
@@ -107,12 +127,33 @@ def _beside_the_noise(found: Verification) -> tuple[bool, str]:
         f"times the smallest noise in the study ({flux_density(sigma)}).")
 
 
+def _boundary_part(found: Verification) -> float:
+    """Return the part of the pointwise error in T that a boundary farther away removes."""
+    return sum(each.pointwise for each in found.differences
+               if each.what == BOUNDARY) * found.main_field_T
+
+
+def _boundary_keys(found: Verification) -> dict[str, float]:
+    """Return the sizes in m of the computed region that the study states, by their keys.
+
+    The usual ones are so large that a boundary farther away changes the mesh rather than the field.
+    """
+    stated = found.magnet.study.open_boundary.model_dump(exclude_none=True)
+    return {f"open_boundary.{name}": size for name, size in stated.items()}
+
+
+def _comparison(change: str) -> str:
+    """Return a change of the model, of those after the refinements, as the caption names it."""
+    return f"a {change}" if change == BOUNDARY else f"the {change}"
+
+
 def error_basis(found: Verification) -> str:
     """Return sentences that state how the error is estimated."""
     if found.differences[-1].what == EXACT:
         return "The error is the difference from the exact field of the blocks in vacuum."
     limit = {FLATTEST: " at most", STEEPEST: " at least"}.get(found.order, "")
-    boundary = (", plus the change that a boundary farther away makes"
+    boundary = (", plus the change that a boundary farther away makes, for which there is another "
+                "mesh of the same element sizes"
                 if found.route != "moments" else "")
     text = ("The estimated error is the total change that all further refinements would make"
             f"{boundary}. It assumes that the changes by successive refinements go on to decrease "
@@ -147,8 +188,8 @@ def write_verification(
         figures["verification_convergence.png"] = _convergence_figure(found), (
             "Change of the field against element size, both logarithmic: change by the "
             "next finer mesh with the slope of the order, estimated error of the study's own "
-            "mesh, and for comparison the changes by a boundary farther away and by another "
-            "formulation")
+            "mesh, and for comparison the change by "
+            f"{in_a_row([_comparison(each.what) for each in found.differences[STEPS:]])}")
         figures["verification_along.png"] = _change_figure(found), (
             "Change of B at every position of the study, for each change of the model")
     figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (

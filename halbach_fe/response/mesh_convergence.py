@@ -33,6 +33,9 @@ OWN, COARSEST, COARSER, FINER, FARTHER = (
     "the study's mesh", "a much coarser mesh", "a coarser mesh", "a finer mesh",
     "a farther boundary")
 
+BOUNDARY = "boundary farther away"
+"""Description of the change of the field by that boundary."""
+
 STEPS = 3
 """Number of changes by successive refinements, which come first among the differences."""
 
@@ -174,7 +177,7 @@ def verify(
              "coarser mesh to the study's": (coarse, base),
              "the study's mesh to a finer": (base, fine)}
     pairs |= {description: (base, fields[purpose]) for purpose, description in (
-        (FARTHER, "boundary farther away"), (f"the dual route, {DUAL.get(route)}",
+        (FARTHER, BOUNDARY), (f"the dual route, {DUAL.get(route)}",
                                              f"dual route, {DUAL.get(route)}"))
         if purpose in fields}
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:

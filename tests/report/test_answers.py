@@ -652,3 +652,70 @@ def test_none_and_all_of_the_magnets_have_no_error_bar():
     assert share_in_words(0.0, 0.01) == "None"
     assert share_in_words(1.0, 0.01) == "All"
     assert share_in_words(0.25, 0.011) == "25.0\u00a0±\u00a01.1\u00a0%"
+
+
+def test_a_boundary_that_is_too_near_is_moved_before_the_mesh_is_refined(dipole, session):
+    """If the study puts it there: the usual one is far away, and what changes is the mesh."""
+    for radius, moved in ((0.3, True), (None, False)):
+        magnet = build_magnet(dipole(
+            open_boundary={} if radius is None else {"radius_m": radius},
+            array__recoil_permeability=1.05,
+            noise={"regions": [{"name": "bore", "sigma_T": 1e-9}]}))
+        said = verification.answer(hf.verify(magnet, session)).step
+        assert ("open_boundary.radius_m larger (now 300 mm)" in said) == moved
+        assert ("mesh.block_size_m smaller" in said) != moved
+
+
+def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path):
+    """Without moves there is one magnet, neither before nor after anything."""
+    found = hf.shim(given.updated, given.session, swaps=1, turns=0)
+
+    def sized(part):
+        return replace(found.before, mean=part * found.before.mean, root=part * found.before.root)
+
+    def of_sizes(*parts):
+        return replace(found, steps=tuple(replace(found.steps[0], after=sized(part))
+                                          for part in parts))
+
+    said = shimming.answer(of_sizes(0.5, 0.3, 0.28, 0.27), given.updated).said
+    assert said.endswith(" The first 2 make 96\u00a0% of that gain.")
+    assert "The first" not in shimming.answer(of_sizes(0.8, 0.5), given.updated).said  # control
+    still = replace(found, steps=(), within=None)
+    vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],
+                                          root=found.before.root))
+    assert "which is most of it" in shimming.answer(vague, given.updated).said
+    sure = replace(still, before=replace(found.before, root=1e-3 * found.before.root))
+    assert "which is most of it" not in shimming.answer(sure, given.updated).said  # the control
+    shimming.write_shim(sure, given.updated, tomlkit.dumps(MAGNET), tmp_path / "still")
+    text = (tmp_path / "still" / "shim.html").read_text()
+    assert "b_n as it is" in text
+    assert "before and after" not in text.partition("</header>")[2].partition("<details")[0]
+    assert [*shimming.value_table(found)[0]] == ["n", "b_n before", "b_n after", "a_n before",
+                                                 "a_n after"]
+
+
+def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
+    """And says that a map which tells little of the blocks does so."""
+    every = plan.answer(hf.plan(given.magnet, given.session)).said
+    assert "the positions of the study: the plan only orders them" in every
+    assert "as many of the study's own positions" not in every
+    assert "With the first 1," not in every
+    assert "tells little of the single blocks" not in every  # the control
+    noisy = build_magnet(given.study.with_(noise={"regions": [{"name": "all", "sigma_T": 1.0}]}))
+    vague = plan.answer(hf.plan(noisy, given.session)).said
+    assert "tells little of the single blocks" in vague
+    assert "With the first 1," not in vague
+
+
+def test_an_update_without_circles_states_its_strongest_reading(given):
+    """The control has a table of multipoles, whose main one is said instead."""
+    said = inference_answer.answer(given.updated).said
+    strongest = 1e3 * np.abs(given.updated.prediction_posterior.mean).max()
+    value = re.match("The strongest component of the updated field at the map's positions is "
+                     "([0-9.]+)\xa0±", said)[1]
+    assert float(value) == pytest.approx(strongest, rel=1e-3)
+    model, magnets = hf.multipoles(
+        given.magnet, given.session, hf.MultipoleReference(z_m=0.0), posterior=given.updated
+    ).tables[0]
+    assert "strongest component" not in inference_answer.answer(
+        given.updated, [(model, magnets)]).said

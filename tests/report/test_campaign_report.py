@@ -305,9 +305,11 @@ def another_map(home):
             files=["posterior.h5"])
 
 
-def unused_finding(home, finds=True):
-    results(home / "diagnosis", "diagnose", reads=[home / "study.toml"],
-            files=["study.diagnosed.toml"], finds=finds)
+def unused_finding(home, finds=True, verb="diagnose", concern=""):
+    results(home / "diagnosis", verb, reads=[home / "study.toml"],
+            files=["study.diagnosed.toml"], answer=Answer(
+                "What?", "That.", "Yes.", "Step after diagnose.", concern=concern,
+                changes_study=finds))
 
 
 def another_material(home):
@@ -349,9 +351,30 @@ def test_what_does_not_fit(home, change, said):
     assert "What does not fit together" in page.text
 
 
-def test_a_diagnosis_that_found_nothing(home):
-    unused_finding(home, finds=False)
+@pytest.mark.parametrize("verb", ["diagnose", "register"])
+def test_a_study_that_says_nothing_new_need_not_be_used(home, verb):
+    """A diagnosis that found nothing, or a map that lies where the study says."""
+    unused_finding(home, finds=False, verb=verb)
     assert found_in(home).doubts == []
+    unused_finding(home, verb=verb)
+    assert found_in(home).doubts != []  # the control
+
+
+def test_measured_blocks_that_some_results_are_without(home):
+    """Of one magnet, they would contradict those with them; the same command twice is a study of
+    what the blocks tell.
+    """
+    blocks = {"MAP": home / "map.csv", "BLOCKS": home / "blocks.csv"}
+    results(home / "sorted", "sort", named={"BLOCKS": home / "blocks.csv"})
+    results(home / "shimmed", "shim", named={"MAP": home / "map.csv"})
+    campaign = found_in(home, "field", "sorted", "shimmed")
+    assert campaign.doubts == [
+        "shimmed is without the measured blocks that sorted has read, and knows less of the "
+        "magnet: run halbach-fe shim again with --blocks."]
+    assert campaign.answer.step.startswith("Mend what does not fit together")
+    results(home / "shimmed-too", "shim", named=blocks)
+    assert found_in(home, "field", "sorted", "shimmed-too").doubts == []
+    assert found_in(home, "field", "sorted", "shimmed", "shimmed-too").doubts == []
 
 
 def test_other_settings_are_said_but_no_doubt(home):
@@ -473,6 +496,11 @@ def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
     assert last.step.startswith("Repeat shimmed with diagnosis/study.diagnosed.toml")
     assert not last.sound
     assert last.trust.startswith(("No", "Only"))
+    unused_finding(home, concern="The magnet was not assembled as designed: turn a block.")
+    by_hand = found_in(home, "field", "shimmed", "diagnosis").answer
+    assert by_hand.step.startswith("Put right what was not assembled as designed, and measure "
+                                   "again. Or, if it stays, repeat shimmed with diagnosis/")
+    assert "turn a block" in by_hand.said
 
 
 def test_a_diagnosis_that_is_not_sound_says_itself_what_to_do(home):
@@ -516,7 +544,8 @@ def everywhere(home, text):
     folder = results(home / "field", "solve", files=["a.csv"])
     said = json.loads((folder / PAGE_RECORD).read_text())
     said |= {"title": text, "rows": [{text or "x": text}], "provenance": {"programs": text},
-             "answer": {key: text if key != "sound" else False for key in said["answer"]}}
+             "answer": {key: text if isinstance(value, str) else False
+                        for key, value in said["answer"].items()}}
     said["figures"][0]["caption"] = text
     said["study"]["description"] = text.replace("\x1b", "").replace("\u202e", "")
     (folder / PAGE_RECORD).write_text(json.dumps(said))
@@ -612,4 +641,4 @@ def test_page_records_are_of_what_is_on_the_page(tmp_path):
         "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
-                   "sound": True, "concern": ""}}
+                   "sound": True, "concern": "", "changes_study": True}}

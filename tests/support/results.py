@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -23,16 +23,18 @@ FIGURE = Figure(figsize=(0.2, 0.2))
 
 def results(
     folder: Path, verb: str, study: Study | None = STUDY, reads: Sequence[Path] = (),
-    files: Sequence[str] = (), answer: Answer | None = None, finds: bool = True,
+    files: Sequence[str] = (), answer: Answer | None = None,
+    named: Mapping[str, Path] | None = None,
 ) -> Path:
-    """Write files, a figure and a page, with a table if it finds anything; return the folder."""
+    """Write files, a figure and a page with a table; return the folder."""
     said = answer or Answer(f"What of {verb}?", f"{folder.name} says so.", f"Trust in {verb}.",
                             f"Step after {verb}.", "halbach-fe solve STUDY -o DIR")
-    with result_folder(folder, f"halbach-fe {verb}", study.name if study else "", reads):
+    with result_folder(folder, f"halbach-fe {verb}", study.name if study else "", reads,
+                       named=named or {}):
         for name in files:
             write_text(folder / name, f"{name} of {folder.name}")
         write_page(folder / "page.html", "calibration.html.j2",
                    save({f"{verb}.png": (FIGURE, f"figure of {verb}")}, folder), study,
                    answer=said, results={},
-                   rows=[{"order": "2", "size": f"cell of {verb}"}] if finds else [])
+                   rows=[{"order": "2", "size": f"cell of {verb}"}])
     return folder
