@@ -39,8 +39,11 @@ from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 NONE = "none"
 """Name of the probability that nothing is missing."""
 
-LONGEST_NAME = 30
+LONGEST_NAME = 38
 """Number of characters in a line of an effect's name beside its bar."""
+
+BAR_IN, LINE_IN = 0.3, 0.14
+"""Height in inches of a bar, and of every further line of its name."""
 
 MAX_BARS = 8
 """Largest number of bars of a chart, and of rows of residuals."""
@@ -242,11 +245,12 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     if diagnosis.unknown is not None:
         bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MAX_BARS]
-    heights = [0.7 + 0.3 * len(top), 0.7 + 0.3 * max(len(bars), 1)]
+    names = [in_words(name) for name, _ in top]
+    heights = [0.7 + (BAR_IN + LINE_IN * max(name.count("\n") for name in own)) * len(own)
+               for own in (names, [name for name, *_ in bars] or [""])]
     figure = figure_of(sum(heights) + 0.2)
     left, right = figure.subplots(2, 1, height_ratios=heights)
-    left.barh([in_words(name) for name, _ in top], [100 * value for _, value in top],
-              color=POSTERIOR)
+    left.barh(names, [100 * value for _, value in top], color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
         left.text(100 * value + 1, height, said, va="center", fontsize=SMALL)

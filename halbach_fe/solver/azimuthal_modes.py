@@ -34,7 +34,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
-from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.getdp import DIRECT_SOLVER_OF_PLANE, Job
 from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import (
     Located,
@@ -395,6 +395,7 @@ def fill_run_folder(
         numbers={"VACUUM": vacuum, "FIRST_SOURCE": sources[0], "LAST_SOURCE": sources[1],
                  "PRINTED_SOURCE": printed},
         unknowns=unknowns_of(case.mesh.inner, case.mesh.axis, modes[0]),
+        options=DIRECT_SOLVER_OF_PLANE,
         solves=len(modes) * (sources[1] - sources[0] + 1), time_limit_s=time_limit_s)
 
 

@@ -47,6 +47,11 @@ DIRECT_SOLVER = (
 factorization takes half the memory of LU. If rows were longer than preallocated, the assembly would
 be many times slower."""
 
+DIRECT_SOLVER_OF_PLANE = (*DIRECT_SOLVER, "-mat_mumps_icntl_7", "2")
+"""PETSc options of the same for a mesh of a plane that is factorized anew for each mode. With the
+ordering AMF instead of PORD, a mode with 20 sources takes a sixth less; in 3D the fill would grow.
+"""
+
 CONJUGATE_GRADIENTS = (
     "-petsc_prealloc", "400",
     "-ksp_type", "cg", "-pc_type", "sor", "-pc_sor_local_symmetric", "-ksp_rtol", "1e-10",
