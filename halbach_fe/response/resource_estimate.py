@@ -83,8 +83,8 @@ GETDP_BYTES, GETDP_SECONDS = 50e6, 0.1
 
 PLANE = CostLaw(3600, 0, 1.8e-5, 8e-7)
 """Law for plane meshes. The memory is within 5 % of that of eleven runs on cross-sections and
-half-planes with 3 400 to 152 000 unknowns, the time within 30 % of that of eight runs with 38 000 to
-139 000 unknowns, 1 to 29 matrices and 1 to 580 solves. Of the bytes per unknown,
+half-planes with 3 400 to 152 000 unknowns, the time within 30 % of that of eight runs with 38 000
+to 139 000 unknowns, 1 to 29 matrices and 1 to 580 solves. Of the bytes per unknown,
 ``-petsc_prealloc 200`` takes 2400."""
 
 FACTORIZED = CostLaw(2480, 150, 1.1e-6, 1.3e-6, 1.4)
