@@ -64,6 +64,10 @@ FIGURES = {
                        "magnet")}
 """Function that draws each figure of the page, and its caption."""
 
+ALONE = ("Posterior probability of each effect of the catalogue, if at most one effect is missing "
+         "and nothing else")
+"""Caption of the picture of probabilities if nothing was found."""
+
 SCATTERED = ("Measured less predicted over the map, before and after the diagnosis: what remains "
              "after it should be noise, without a pattern")
 """Caption of the profile of points that lie on no line or circle."""
@@ -147,6 +151,8 @@ def write_diagnosis_report(
     drawn = {name: (draw(diagnosis), text) for name, (draw, text) in FIGURES.items()}
     if figures.is_scattered(diagnosis.before):
         drawn["profile"] = drawn["profile"][0], SCATTERED
+    if not diagnosis.identified and diagnosis.unknown is None:
+        drawn["probabilities"] = drawn["probabilities"][0], ALONE
     pictures = save({f"diagnosis_{name}.png": each for name, each in drawn.items()}, folder)
     titles = catalogue_titles(diagnosis)
     write_page(

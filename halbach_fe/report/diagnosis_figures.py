@@ -247,9 +247,9 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     bars = bars[:2 * MAX_BARS]
     names = [in_words(name) for name, _ in top]
     heights = [0.7 + (BAR_IN + LINE_IN * max(name.count("\n") for name in own)) * len(own)
-               for own in (names, [name for name, *_ in bars] or [""])]
+               for own in (names, [name for name, *_ in bars]) if own]
     figure = figure_of(sum(heights) + 0.2)
-    left, right = figure.subplots(2, 1, height_ratios=heights)
+    left, *others = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     left.barh(names, [100 * value for _, value in top], color=POSTERIOR)
     for height, (_, value) in enumerate(top):
         said = f"{100 * value:.2f} %" if value > 1e-4 else "less than 0.01 %"
@@ -257,7 +257,8 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     left.set_xlim(0, 130)
     left.set_xticks(range(0, 101, 20))
     left.set_xlabel("probability in %, if at most one effect is missing")
-    if bars:
+    left.set_ylim(len(top) - 0.4, -0.6)
+    for right in others:
         right.barh(range(len(bars)), [value / np.log(10) for _, value, _ in bars],
                    color=[colour for *_, colour in bars])
         right.set_yticks(range(len(bars)), [name for name, *_ in bars])
@@ -265,11 +266,7 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
         right.set_xlim(left=0.3)
         right.axvline(DETECTION_LOG_ODDS / np.log(10), color=MEASURED, lw=0.8, ls="--")
         right.set_xlabel("power of ten of the Bayes factor")
-    else:
-        right.text(0.5, 0.5, "no effect was identified", ha="center", transform=right.transAxes)
-        right.set_axis_off()
-    for axis, shown in ((left, top), (right, bars)):
-        axis.set_ylim(max(len(shown), 1) - 0.4, -0.6)
+        right.set_ylim(len(bars) - 0.4, -0.6)
     return figure
 
 

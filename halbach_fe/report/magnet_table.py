@@ -30,7 +30,7 @@ def in_one_line(magnet: Magnet) -> str:
     """Return the magnet in a line: blocks, bore, length, remanence, iron."""
     length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
               else ", in cross-section")
-    iron = "without iron" if iron_of(magnet.study) is None else iron_description(magnet)
+    iron = "without iron" if iron_of(magnet.study) is None else f"iron: {iron_description(magnet)}"
     return (f"{layout(magnet)}{length}, bore {2e3 * magnet.bore_radius:.4g} mm, outer diameter "
             f"{2e3 * magnet.array_outer_radius:.4g} mm, remanence "
             f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")

@@ -6,6 +6,7 @@ the fit of held-out readings before and after.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -98,9 +99,9 @@ def title_of_hidden(name: str) -> str:
     """Return an effect in words, with the sensor if it is of one: gain_x is one of Bx."""
     for effect in catalogue():
         if effect.name == name:
-            return effect.title + (f" (B{name[-1]})" if name[-2:] in ("_x", "_y", "_z") else "")
-        if effect.name[:-2] == name:
             return effect.title
+        if effect.name[:-2] == name:
+            return re.sub("the B[xyz] sensor", "a sensor", effect.title)
     return name.replace("_", " ")
 
 

@@ -64,7 +64,7 @@ def test_a_cross_section(flat, tmp_path):
     page = (tmp_path / "diagnosis.html").read_text()
     assert page.count("<img alt=") == 5
     assert "along z" not in page.split("<h2>Structure")[1].split("<img")[0]  # no M_z
-    assert "sensitivity of a sensor (gain_x), " in verdict(found)
+    assert "sensitivity of the Bx sensor, " in verdict(found)
     assert " %" in verdict(found)
 
 

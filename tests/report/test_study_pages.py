@@ -57,7 +57,7 @@ def test_sealed_cases_say_how_sure_their_rates_are(tmp_path):
     for number in ("95.0\u00a0% of 40", "83.1\u00a0% to 99.4\u00a0%", "0.0\u00a0% of 20",
                    "16.8\u00a0%"):
         assert number in said
-    assert "sensitivity of a sensor (Bx)" in text
+    assert "sensitivity of the Bx sensor" in text
     for code in ("gain_x", "naming_rate", "naming rate"):
         assert code not in text
 

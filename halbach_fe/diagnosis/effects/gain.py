@@ -17,11 +17,11 @@ from halbach_fe.study.types import COMPONENTS
 class GainEffect(InstrumentEffect):
     """The sensor of one component has a relative error of its sensitivity."""
 
-    title = "sensitivity of a sensor"
     parameters = (Parameter("gain", "1", 3e-3),)
 
     def __init__(self, axis: str) -> None:
         self.axis = axis
+        self.title = f"sensitivity of the B{axis} sensor"  # type: ignore[misc]
         self.name = f"gain_{axis}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

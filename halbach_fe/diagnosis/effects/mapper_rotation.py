@@ -17,11 +17,11 @@ from halbach_fe.study.measurement import Instrument
 class MapperRotationEffect(InstrumentEffect):
     """The mapper is turned about the magnet's centre, its points and its sensors alike."""
 
-    title = "mapper turned about an axis"
     parameters = (Parameter("angle", "rad", 2e-3),)
 
     def __init__(self, name: str, axis: str) -> None:
         self.axis = axis
+        self.title = f"mapper turned about {axis}"  # type: ignore[misc]
         self.name = name  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

@@ -20,11 +20,11 @@ class MisalignmentEffect(InstrumentEffect):
     ``misalignment_zx`` is the fraction of Bx in the reading of the z sensor.
     """
 
-    title = "sensors that are not perpendicular"
     parameters = (Parameter("crosstalk", "rad", 2e-3),)
 
     def __init__(self, sensor: str, component: str) -> None:
         self.sensor, self.component = sensor, component
+        self.title = f"B{sensor} sensor tilted towards {component}"  # type: ignore[misc]
         self.name = f"misalignment_{sensor}{component}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

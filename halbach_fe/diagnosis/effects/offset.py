@@ -17,11 +17,11 @@ from halbach_fe.study.types import COMPONENTS
 class OffsetEffect(InstrumentEffect):
     """The sensor of one component has a constant offset."""
 
-    title = "zero of a sensor"
     parameters = (Parameter("offset", "T", 1e-4),)
 
     def __init__(self, axis: str) -> None:
         self.axis = axis
+        self.title = f"zero of the B{axis} sensor"  # type: ignore[misc]
         self.name = f"offset_{axis}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

@@ -17,11 +17,11 @@ from halbach_fe.study.types import COMPONENTS
 class PlanarHallEffect(InstrumentEffect):
     """The reading of one sensor has an additional term in the product of the other components."""
 
-    title = "planar Hall effect of a sensor"
     parameters = (Parameter("coefficient", "1/T", 5e-3),)
 
     def __init__(self, axis: str) -> None:
         self.axis = axis
+        self.title = f"planar Hall effect of the B{axis} sensor"  # type: ignore[misc]
         self.name = f"planar_hall_{axis}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

@@ -17,11 +17,11 @@ from halbach_fe.study.types import COMPONENTS
 class QuadraticNonlinearityEffect(InstrumentEffect):
     """The reading of one sensor has an additional term in the square of its field component."""
 
-    title = "quadratic non-linearity of a sensor"
     parameters = (Parameter("coefficient", "1/T", 3e-3),)
 
     def __init__(self, axis: str) -> None:
         self.axis = axis
+        self.title = f"quadratic non-linearity of the B{axis} sensor"  # type: ignore[misc]
         self.name = f"quadratic_nonlinearity_{axis}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

@@ -17,12 +17,12 @@ from halbach_fe.study.types import COMPONENTS
 class SensorPositionEffect(InstrumentEffect):
     """The sensor of one component is displaced from the probe's reference point."""
 
-    title = "position of a sensor in the probe"
     parameters = (
         Parameter("x", "m", 1e-3), Parameter("y", "m", 1e-3), Parameter("z", "m", 1e-3),)
 
     def __init__(self, axis: str) -> None:
         self.axis = axis
+        self.title = f"place of the B{axis} sensor in the probe"  # type: ignore[misc]
         self.name = f"sensor_position_{axis}"  # type: ignore[misc]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
