@@ -20,7 +20,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.prism import Prism, upright
-from halbach_fe.inference.block_prior import prior_from_blocks, shape_axes
+from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array import block_name
 from halbach_fe.study.free_blocks import SIZES
@@ -352,7 +352,7 @@ def _measured_axes(magnet: Magnet) -> list[Floats | None]:
     meant, found = as_meant(magnet).blocks, []
     for source, matrix in mountings(magnet):
         factor = np.cbrt(np.linalg.det(matrix))
-        found.append(matrix / factor @ shape_axes(meant[source]) if factor > 0 else None)
+        found.append(matrix / factor @ meant[source].shape_axes if factor > 0 else None)
     return found
 
 

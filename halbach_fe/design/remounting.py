@@ -24,7 +24,6 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
-from halbach_fe.inference.block_prior import shape_axes
 from halbach_fe.study.array import BlockException
 
 LARGEST_ANGLE = np.radians(2.0)
@@ -110,7 +109,7 @@ class Mounts:
 def mounts_of(magnet: Magnet) -> Mounts:
     """Return the slots of a magnet with its present blocks."""
     meant, built = as_meant(magnet).blocks, magnet.blocks
-    frames = np.array([shape_axes(block) for block in meant])
+    frames = np.array([block.shape_axes for block in meant])
     shapes, own_turns = _shapes(meant)
     kinds = _kinds(meant, shapes)
     sources = np.array([source for source, _ in mountings(magnet)])
@@ -166,7 +165,7 @@ def _corners(block: MagnetBlock) -> Floats:
     """
     corners = np.array([[*edge.start, 0.0] for edge in block.outline])
     if block.label is None:
-        corners = corners @ shape_axes(block)
+        corners = corners @ block.shape_axes
     corners -= corners.mean(axis=0)
     length = 2 * float(np.ptp(corners)) if np.isinf(block.z_max) else block.z_max - block.z_min
     return np.vstack([corners[:, :2], [length, 0.0]])
@@ -230,12 +229,12 @@ def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magne
     for to, source, matrix in moved:
         meant, earlier = before[source]
         total = matrix @ earlier
-        here, there = (rotation_about_z(np.radians(old[i].angle_deg))
-                       for i in (to, meant))
+        here = rotation_about_z(np.radians(old[to].angle_deg))  # axes of `rotation_deg`
+        turned = total @ old[to].carried_from(old[meant]).T
         exceptions.append(BlockException(
             ring=old[to].ring, slot=old[to].slot,
             mounted_from=(old[meant].ring, old[meant].slot),
-            rotation_deg=rotation_deg(here.T @ total @ there)
+            rotation_deg=rotation_deg(here.T @ turned @ here)
             if np.isclose(np.linalg.det(total), 1.0) else (0.0, 0.0, 0.0)))
         expected[to] = source, meant, total
     changed = magnet.with_(array__exceptions=array.exceptions + tuple(exceptions))

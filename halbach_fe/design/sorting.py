@@ -33,7 +33,6 @@ from halbach_fe.inference.block_prior import (
     first_of_types,
     loose_blocks,
     prior_from_blocks,
-    shape_axes,
     types_of,
     with_types,
 )
@@ -254,7 +253,7 @@ def _blocks(
     size = magnet.dimension
     vectors, _ = loose_blocks(magnet, table)
     there = present(magnet)
-    frames = np.array([shape_axes(magnet.blocks[number]) for number in there])[:, :size, :size]
+    frames = np.array([magnet.blocks[number].shape_axes for number in there])[:, :size, :size]
     # The order hardly changes the main multipole: scale it with the blocks' median strength.
     nominal = magnet.nominal_magnetization.reshape(-1, size)[there]
     main = model.nominal_main * float(np.median(np.linalg.norm(vectors, axis=1))

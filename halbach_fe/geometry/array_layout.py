@@ -88,8 +88,7 @@ def _with_exceptions(
         if exception.mounted_from is not None:
             changed["mounted_from"] = exception.mounted_from
             meant = places[exception.mounted_from]
-            turn = (0.0, 0.0, np.radians(block.angle_deg - meant.angle_deg))
-            easy_axis = rotation_matrix(turn) @ meant.easy_axis
+            easy_axis = block.carried_from(meant) @ meant.easy_axis
         if exception.magnetization_angle_deg is not None:
             direction = np.radians(exception.magnetization_angle_deg)
             easy_axis = np.array([np.cos(direction), np.sin(direction), 0.0])

@@ -108,6 +108,23 @@ class MagnetBlock:
         return np.asarray(rotation_matrix(self.rotation_rad) @ nominal)
 
     @cached_property
+    def shape_axes(self) -> Floats:
+        """Axes of the block's shape in its nominal place, as columns (3, 3).
+
+        x is radial, or along the nominal magnetization for cuboids that are oriented along it. Of a
+        free block they are the axes of its table.
+        """
+        return rotation_matrix((0.0, 0.0, np.radians(self.facing_deg)) if self.label is None
+                               else self.orientation_rad)
+
+    def carried_from(self, place: MagnetBlock) -> Floats:
+        """Return the rotation (3, 3) of what is moved here from the place of another block.
+
+        It turns with the shape, so that it fits the place where it comes to lie.
+        """
+        return np.asarray(self.shape_axes @ place.shape_axes.T)
+
+    @cached_property
     def position(self) -> Floats:
         """Origin of the block's frame, (3,) in m, moved with a displaced or rotated block."""
         turned = rotation_matrix(self.rotation_rad) @ (np.array(self.origin_m) - self.middle)

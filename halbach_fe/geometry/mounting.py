@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import rotation_matrix
@@ -24,8 +22,7 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
     for block in magnet.blocks:
         ring, slot = block.mounted_from or (block.ring, block.slot)
         number = magnet.number_of(ring, slot)
-        moved = block.angle_deg - magnet.blocks[number].angle_deg
-        turn = rotation_matrix(block.rotation_rad) @ rotation_matrix((0.0, 0.0, np.radians(moved)))
+        turn = rotation_matrix(block.rotation_rad) @ block.carried_from(magnet.blocks[number])
         factor = magnetization_factor(exceptions_of(array, block.ring, block.slot))
         found.append((number, factor * turn))
     return found

@@ -25,7 +25,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.symmetry import rotation_about_z
@@ -236,13 +236,13 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     blocks, size = magnet.blocks, magnet.dimension
     table = with_types(magnet, table)
     _check_types(magnet, table)
-    _check_alike(magnet, shape_axes, "Make them types of their own.")
+    _check_alike(magnet, lambda block: block.shape_axes, "Make them types of their own.")
     index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
     frames = np.array([_frame(block) for block in blocks])[index]
     _check_near(table, np.linalg.solve(frames, measured[:, :, None])[:, :, 0] - [1, 0, 0])
-    own = np.array([shape_axes(blocks[i]).T for i in index])
+    own = np.array([blocks[i].shape_axes.T for i in index])
     roots = own @ conversion * table.sigma[:, None, None]
     return np.einsum("nij,nj->ni", own, measured)[:, :size], roots[:, :size, :size]
 
@@ -268,7 +268,7 @@ def as_mounted(
     ndarray, shape (rows, 3), in A m^2
     """
     index = _block_of_rows(as_meant(magnet), table)
-    own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ shape_axes(block)
+    own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ block.shape_axes
                     for block in magnet.blocks])  # axes of the shape in those of the place
     turns = own[places] @ (np.eye(3) if turned is None else turned) @ own[index].transpose(0, 2, 1)
     return np.einsum("nij,nj->ni", turns, table.moment)
@@ -329,16 +329,6 @@ def first_of_types(magnet: Magnet) -> dict[str, int]:
     present = {label: [number for number in members if magnet.blocks[number].remanence]
                for label, members in types_of(magnet).items()}
     return {label: members[0] for label, members in present.items() if members}
-
-
-def shape_axes(block: MagnetBlock) -> Floats:
-    """Return the axes of a block's shape in its nominal place, as columns (3, 3).
-
-    x is radial, or along the nominal magnetization for cuboids that are oriented along it; for a
-    free block they are the axes of its table.
-    """
-    return (rotation_about_z(np.radians(block.facing_deg)) if block.label is None
-            else rotation_matrix(block.orientation_rad))
 
 
 def _frame(block: MagnetBlock) -> Floats:

@@ -74,9 +74,9 @@ def _magnetized(
     gradient = next((2 * (part.factor - 1) for part in body.parts if part.u == (0.5, 1.0)), 0.0)
     loss = next((1 - part.factor for part in body.parts if part.v != (-1.0, 1.0)), 0.0)
     for exception in exceptions:
-        if exception.mounted_from is not None:  # in own axes the magnetization stays as it was
+        if exception.mounted_from is not None:  # the magnetization turns with the faces
             made_for = exception.mounted_from
-            easy = np.array(nominal[made_for].easy_axis)
+            easy = body.carried_from(nominal[made_for]).apply(nominal[made_for].easy_axis)
         if exception.magnetization_angle_deg is not None:
             direction = np.radians(exception.magnetization_angle_deg) - body.angle
             easy = np.array([np.cos(direction), np.sin(direction), 0.0])

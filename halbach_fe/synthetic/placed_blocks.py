@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.synthetic.shapes import PrismBody
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
 
 SAME = 1e-6
@@ -52,7 +50,7 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
             continue
         row, target = rows[serial], drawn[place]
         source = drawn[measured.places[row]]
-        turn = _seat(target) * _seat(source).inv()
+        turn = target.carried_from(source)
         moment = turn.apply(measured.moment[row])
         difference = np.linalg.norm(placed.moment[number] - moment) / np.linalg.norm(moment)
         if difference > SAME:
@@ -71,9 +69,3 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
             f"{len(empty)} empty ones, first ring {empty[0][0]}, slot {empty[0][1]}"))
     return replace(single, bodies=tuple(
         there.get((body.ring, body.slot), body) for body in single.bodies))
-
-
-def _seat(body: Body) -> Rotation:
-    """Return the rotation from the axes of a block's faces to the body's own."""
-    turn = body.shape.turn if isinstance(body.shape, PrismBody) else 0.0
-    return body.seat_orientation * Rotation.from_euler("z", turn)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.iron import TrueIron
-from halbach_fe.synthetic.shapes import CylinderBody, Fractions, SectorBody, Shape
+from halbach_fe.synthetic.shapes import CylinderBody, Fractions, PrismBody, SectorBody, Shape
 
 Vector = tuple[float, float, float]
 ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
@@ -131,6 +131,16 @@ class Body:
     def seat_orientation(self) -> Rotation:
         """Rotation from the shape's axes to the body's own."""
         return Rotation.from_rotvec(self.seat)
+
+    @cached_property
+    def face_orientation(self) -> Rotation:
+        """Rotation from the axes of the shape's faces to the body's own."""
+        turn = self.shape.turn if isinstance(self.shape, PrismBody) else 0.0
+        return self.seat_orientation * Rotation.from_euler("z", turn)
+
+    def carried_from(self, other: Body) -> Rotation:
+        """Return the rotation of what is moved here from another body's place, in own axes."""
+        return self.face_orientation * other.face_orientation.inv()
 
     @cached_property
     def shape_orientation(self) -> Rotation:

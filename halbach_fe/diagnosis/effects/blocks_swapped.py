@@ -11,7 +11,6 @@ from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, place_of
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -23,9 +22,10 @@ All pairs, of which there can be tens of thousands, are ranked by an estimate of
 
 
 class BlocksSwappedEffect(Effect):
-    """Two blocks are exchanged, and each keeps its magnetization in its own axes.
+    """Two blocks are exchanged, and each keeps its magnetization in the axes of its shape.
 
-    The magnetization thus turns by the angle between the two slots.
+    The magnetization thus turns by the angle between the shapes in the two slots. Blocks that are
+    oriented along their magnetization are alike but for their errors.
     """
 
     name = "blocks_swapped"
@@ -54,11 +54,9 @@ class BlocksSwappedEffect(Effect):
         at once from the entries of the two blocks.
         """
         blocks, size = build_magnet(study).blocks, study.dimension
-        angles = np.radians([block.angle_deg for block in blocks])
         vectors = mean.reshape(len(blocks), size)
-        own = np.array([rotation_about_z(-angle)[:size, :size] @ vector
-                        for angle, vector in zip(angles, vectors, strict=True)])
-        turns = np.array([rotation_about_z(angle)[:size, :size] for angle in angles])
+        turns = np.array([block.shape_axes[:size, :size] for block in blocks])
+        own = np.einsum("jba,jb->ja", turns, vectors)
         # change of the magnetization at place i when it receives the block of place j
         change = np.einsum("iab,jb->ija", turns, own) - vectors[:, None]
         weights = information.reshape(len(blocks), size, len(blocks), size)
@@ -87,8 +85,7 @@ class BlocksSwappedEffect(Effect):
         here, there = where.index((place.ring, place.slot)), where.index(place.other)
         size, change = nominal.study.dimension, {}
         for to, source in ((here, there), (there, here)):
-            turn = rotation_about_z(np.radians(
-                nominal.blocks[to].angle_deg - nominal.blocks[source].angle_deg))
+            turn = nominal.blocks[to].carried_from(nominal.blocks[source])
             change[to] = np.asarray(turn[:size, :size] @ nominal.magnetizations[source]
                                     - nominal.magnetizations[to])
         return change

@@ -222,13 +222,15 @@ def magnet_length(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet
 
 def blocks_swapped(magnet: TrueMagnet, site: Site, ring: float, slot: float, other_ring: float,
                    other_slot: float) -> TrueMagnet:
-    """Exchange two blocks; each keeps its magnetization in its own axes."""
+    """Exchange two blocks; each keeps its magnetization in the axes of its faces."""
     bodies = {(float(body.ring), float(body.slot)): body for body in magnet.bodies}
     first, second = (ring, slot), (other_ring, other_slot)
 
     def as_other(body: Body) -> Body:
         other = bodies[second if (body.ring, body.slot) == first else first]
-        return replace(body, remanence=other.remanence, easy_axis=other.easy_axis,
+        turn = body.carried_from(other)
+        return replace(body, remanence=vector(turn.apply(other.remanence)),
+                       easy_axis=vector(turn.apply(other.easy_axis)),
                        along=other.along, across=other.across, parts=other.parts)
 
     return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in (first, second))
