@@ -139,6 +139,7 @@ def agreement(disagreement: str | None) -> str:
 def of_a_conflict(question: str, said: str, disagreement: str) -> Answer:
     """Return an answer from an update that disagrees with its map, which is not to be trusted."""
     return Answer(
-        question, said, f"No. It is that of an update that disagrees with its map. {disagreement}",
+        question, f"Not known, as model and measurement disagree. If the model were right: {said}",
+        f"No. {disagreement}",
         "Look for what the study lacks, and update again, before you use these numbers.",
         "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)

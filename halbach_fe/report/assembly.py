@@ -31,7 +31,7 @@ def answer(assembly: Assembly) -> Answer:
     copies = sum(len(plate.heights_m) for plate in assembly.plates)
     said = [f"{counted(len(assembly.blocks), 'block')} of {counted(len(assembly.kinds), 'kind')}"
             + (f" go into {counted(copies, 'plate')} of {counted(len(assembly.plates), 'shape')}."
-               if copies else " go without a holder.")]
+               if copies else ".")]
     different = len(set(assembly.ordered_as))
     if different < len(assembly.kinds):
         said.append(f"To order are {counted(different, 'kind')}: the others are the same blocks, "
@@ -40,10 +40,11 @@ def answer(assembly: Assembly) -> Answer:
         said.append("The study names no grade (array.material): order one that has the remanence "
                     "of the table, and bears the temperature and the field of the others, which "
                     "halbach-fe demagnetization tells.")
-    said += [f"Some have none: {reason}." if copies else f"There is none because of {reason}."
+    said += [f"Some are without a plate, which would have {reason}." if copies else
+             f"No plates are drawn, as they would have {reason}."
              for reason in assembly.reasons]
-    trust = ("Yes, as far as shapes and places of the study are right. Whether the holder bears "
-             "the forces was not computed.")
+    trust = ("Yes, as far as shapes and places of the study are right."
+             + (" Whether the plates bear the forces was not computed." if copies else ""))
     if assembly.plates:
         wall = min(plate.wall_m for plate in assembly.plates)
         said.append(f"Pockets are {1e3 * assembly.holder.clearance_m:.3g}\u00a0mm larger than the "

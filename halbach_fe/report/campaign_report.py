@@ -147,6 +147,9 @@ class Campaign:
             "stands with it below.")
         last = self._next()
         step = last.step if last else "Nothing that the results name is left to do."
+        if any(chapter.verb == "demagnetization" for chapter in self._concerned()):
+            step = (f"Settle first what is said above of losses at its temperature, as what comes "
+                    f"after rests on the magnetization. Then: {step}")
         if self.doubts and not left:
             step = f"Mend what does not fit together, as the list below says. After that: {step}"
         return Answer("What is known of this magnet?", said, trust, step,
@@ -159,13 +162,20 @@ class Campaign:
         sound = [(chapter.verb, answer.said) for chapter, _, answer in self.answered
                  if answer.sound]
         found = [said for verb, said in sound if verb == "diagnose"]
-        measured = [said for verb, said in sound if verb in OF_MEASURED]
-        return [*found[-1:], *measured[-1:]]
+        measured = [(verb, said) for verb, said in sound if verb in OF_MEASURED]
+        field = [said.partition(". ")[0] + "." for verb, said in measured[:-1] if verb == "infer"]
+        return [*found[-1:], *field[-1:], *(said for _, said in measured[-1:])]
 
     def _concerns(self) -> list[str]:
         """Return what is bad about the magnet, unless a later result of that command is good."""
+        concerned = self._concerned()
         return list(dict.fromkeys(answer.concern for chapter, _, answer in self.answered
-                                  if answer.concern and self.replaced(chapter) is None))
+                                  if answer.concern and chapter in concerned))
+
+    def _concerned(self) -> list[Chapter]:
+        """Return the chapters that say something bad about the magnet."""
+        return [chapter for chapter, _, answer in self.answered
+                if answer.concern and self.replaced(chapter) is None]
 
     def _next(self) -> Answer | None:
         """Return the answer whose next step is the one to take.

@@ -36,7 +36,8 @@ magnet that is built with care."""
 
 
 REMEDIES = {
-    "block_flipped": "turn the block of {} the right way round",
+    "block_flipped": "the block of {} is the wrong way round or wrongly magnetized: turn it, or "
+                     "replace it by one that is not",
     "block_missing": "put the missing block of {} in",
     "blocks_swapped": "exchange the blocks of {}"}
 """What to do at the magnet about an effect that is an error of assembly, by the effect's name."""

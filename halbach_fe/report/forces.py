@@ -68,16 +68,17 @@ def answer(found: Forces) -> Answer:
         return Answer(question, f"No block feels a force. {_mass(found)}",
                       "Yes: nothing else is there.", *plan)
     block = found.blocks[worst]
-    text = [f"The largest force is {_newton(size)} (as heavy as {_heavy(size)}), on "
+    text = ["In the finished magnet the largest force is "
+            f"{_newton(size)} (as heavy as {_heavy(size)}), on "
             f"{place_of(block)}, {direction_in_words(block, found.in_place.force_N[worst])}."
             f"{_as_large(found, worst)}"]
     if len(found.blocks) > 1:
         next_one = int(np.argmax(found.inserted.magnitude))
         inserted, block = found.inserted.magnitude[next_one], found.blocks[next_one]
         text.append(
-            "During the assembly, of blocks in their places before the next ones are there, the "
-            f"largest is {_newton(inserted)} ({_heavy(inserted)}), on {place_of(block)}, the "
-            f"{_ordinal(int(found.step[next_one]))} of {len(found.blocks)}, "
+            "While it is assembled block by block, the largest is on "
+            f"{place_of(block)}, the {_ordinal(int(found.step[next_one]))} of {len(found.blocks)}, "
+            f"when it has come to its place: {_newton(inserted)} ({_heavy(inserted)}), "
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
     error = float(found.in_place.error_N[worst])
     return Answer(

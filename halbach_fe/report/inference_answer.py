@@ -48,11 +48,20 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
-        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}",
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}",
         f"{mend}See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
         f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
         f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
         "-o DIR")
+
+
+def _of_the_probe(result: InferenceResult) -> str:
+    """Say that the error bars take the probe's calibration as exact, unless the study does not."""
+    study = result.study
+    known = [study.instrument_sd, *(one.instrument_sd or study.instrument_sd for one in study.maps)]
+    return "" if any(one.gain for one in known) else (
+        " The error bars take the calibration of the probe as exact ([instrument_sd] can say how "
+        "well it is known): a common factor of the map is one of the magnet.")
 
 
 def _largest_field(result: InferenceResult) -> str:

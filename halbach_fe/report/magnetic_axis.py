@@ -23,7 +23,8 @@ def axis_rows(axis: MagneticAxis | None) -> list[dict[str, str]]:
         for name, value, sd in zip("xy", axis.slope_rad, axis.slope_sd_rad, strict=True):
             rows.append({"of the updated magnet": f"magnetic axis, d{name}/dz",
                          "value": f"{with_error(1e3 * value, 1e3 * sd)}\u00a0mrad"})
-    rows.append({"of the updated magnet": "roll about z",
+    where = "" if axis.slope_rad is None else ", mean of the middle half"
+    rows.append({"of the updated magnet": f"roll about z{where}",
                  "value": f"{with_error(1e3 * axis.roll_rad, 1e3 * axis.roll_sd_rad)}\u00a0mrad"})
     return rows
 

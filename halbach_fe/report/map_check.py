@@ -55,9 +55,10 @@ def answer(check: MapCheck) -> Answer:
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
     trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. More "
-             f"than {100 * VIOLATED:g}\u00a0% would fail. A model of the magnet that predicts "
-             "readings worse than this fit lacks something; close to the edges of blocks, where "
-             "the field varies more than the fit can follow, it can do better.")
+             f"than {100 * VIOLATED:g}\u00a0% of the largest field would fail. A model of the "
+             "magnet that predicts readings worse than this fit lacks something; close to the "
+             "edges of blocks, where the field varies more than the fit can follow, it can do "
+             "better.")
     if _violates(check):
         return Answer(
             question, f"{verdict(check)} {_noise(check)}",
@@ -115,11 +116,11 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
     noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
-    where = "that is sigma_T of the study, unless you know it better"
+    where = "put that into the study as sigma_T, unless you know better"
     if check.position_noise_m >= SCATTERED_M:
         noise += (", and where the field is steep, readings scatter like positions that are "
                   f"{check.position_noise_m * 1e6:.0f} µm off")
-        where = "these are sigma_T and position_sd_m of the study, unless you know them better"
+        where = "put these into the study as sigma_T and position_sd_m, unless you know better"
     return f"{noise}: {where}." if keys else f"{noise}."
 
 
@@ -184,7 +185,10 @@ def verdict(check: MapCheck) -> str:
                 f"{_where(check, check.reach)}, and to "
                 f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
                 f"{flux_density(check.size_T)}.")
-    return (f"Passed. The map obeys div B = 0 and curl B = 0 to {size}.")
+    axes = (", once its columns are put along the axes that they show" if check.is_reoriented
+            else "")
+    return f"Passed{axes}. The map then obeys div B = 0 and curl B = 0 to {size}." if axes else (
+        f"Passed. The map obeys div B = 0 and curl B = 0 to {size}.")
 
 
 def _where(check: MapCheck, reach: Reach) -> str:

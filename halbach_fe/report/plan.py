@@ -126,8 +126,8 @@ def answer(plan: MeasurementPlan) -> Answer:
         "tell nearly as much as the best choice of all at once."
         + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
            else ""),
-        "Set plan.points for a shorter plan, or name other places in plan.candidates. Measure "
-        "there, and update the blocks." if everything else
+        "Measure in this order, as far as there is time, and update the blocks. (Set plan.points "
+        "for a shorter plan, or plan.candidates for other places.)" if everything else
         "Measure there, and update the blocks." if same else
         "Measure there, and update the blocks. Ask for more positions (--points) to learn as much "
         "as from all of the study's.",

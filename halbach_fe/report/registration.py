@@ -14,7 +14,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.pose_result import ProbePrior, Registration
+from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, axes_of_map, odds, turn_from_axes
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
@@ -175,9 +175,13 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     elif alike:
         said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
                     "how the map was measured which one is real.")
-    if unlike:
+    if unlike and found[0].explains and found[0].at_rest:
         said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out, with a probability "
                     f"of {in_a_row(unlike)} beside {100 * probability[0]:.0f} % of this one.")
+    elif unlike:
+        said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out. (In this one chi² "
+                    f"is {decimals(found[0].chi2)} per reading, where about 1 is expected, so that "
+                    "the odds of poses mean little.)")
     return said
 
 
@@ -310,14 +314,16 @@ def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
             for number, each in enumerate(found, 1)]
 
 
-def probe_table(instrument: Instrument, sd: ProbePrior) -> list[dict[str, str]]:
-    """Return rows of text: what the fit says about the probe, with standard deviations."""
+def probe_table(best: Registration) -> list[dict[str, str]]:
+    """Return rows of text: what the fit says about the sensors of the map, with their sd."""
+    instrument, sd = best.instrument, best.probe
+    there = _measured(best)
     rows = [{"of the probe": f"B{name[0]} sees B{name[1]}",
              "value": with_error(1e3 * value, 1e3 * sd.crosstalk) + "\u00a0mrad"}
-            for name, value in instrument.crosstalk.items()]
+            for name, value in instrument.crosstalk.items() if name[0] in there]
     for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
                                          instrument.sensor_position_m, strict=True):
-        rows += [{"of the probe": f"gain of B{name}",
+        rows += [] if name not in there else [{"of the probe": f"gain of B{name}",
                   "value": with_error(100 * gain, 100 * sd.gain) + "\u00a0%"},
                  {"of the probe": f"offset of B{name}",
                   "value": with_error(1e3 * offset, 1e3 * sd.offset_T) + "\u00a0mT"},
@@ -325,6 +331,11 @@ def probe_table(instrument: Instrument, sd: ProbePrior) -> list[dict[str, str]]:
                     "value": with_error(1e3 * value, 1e3 * sd.sensor_m) + "\u00a0mm"}
                    for axis, value in zip(COMPONENTS, place, strict=True))]
     return rows
+
+
+def _measured(best: Registration) -> list[str]:
+    """Return the components that the map has."""
+    return [name for name, rms in zip(COMPONENTS, best.rms_T, strict=True) if not np.isnan(rms)]
 
 
 def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
@@ -400,7 +411,7 @@ def _write_page(
                provenance, answer=answer(found, before, name),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
-               name=study.name, probe=probe_table(best.instrument, best.probe), map=name)
+               name=study.name, probe=probe_table(best), map=name)
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:
@@ -412,6 +423,8 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
                                     (SECOND, POSTERIOR, MEASURED), strict=True):
+        if not np.isfinite(values).any():
+            continue
         along.plot(points[:, 2], 1e3 * values, ".", ms=2, color=colour, label=f"B{name} of the map")
     along.set_xlabel("z in the magnet in mm")
     along.set_ylabel("B in mT")

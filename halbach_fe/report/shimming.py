@@ -210,8 +210,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             said = (f"No block: with {moves} {said} That is {100 * _gained(shim):.2g} %, hardly "
                     "worth the work.")
         else:
-            said = (f"{'The block' if len(shim.steps) == 1 else 'The blocks'} of the {moves} "
-                    f"listed below: {said}{_first_moves(shim)}")
+            said = f"With {moves} of blocks {said}{_first_moves(shim)}{_remainder(shim)}"
     else:
         said = (f"No move is worthwhile. Leave it as it is: {what} {before} {unit}, including the "
                 f"uncertainty{_unknown_part(shim)}.")
@@ -252,6 +251,20 @@ def _first_moves(shim: Shim) -> str:
         return ""
     return (f" The first {'one makes' if first == 1 else f'{first} make'} "
             f"{100 * part[first]:.0f}\u00a0% of that gain.")
+
+
+def _remainder(shim: Shim) -> str:
+    """Name the multipole that is most of what remains, if it is; the moves do not lower it."""
+    if shim.fields is not None:
+        return ""
+    squares = shim.after.mean**2
+    number = int(np.argmax(squares))
+    if squares[number] < shim.after.expected_square / 2:
+        return ""
+    orders = shim.after.orders
+    name = f"{'b' if number < len(orders) else 'a'}_{orders[number % len(orders)]}"
+    return (f" What remains is mostly {name}, {shim.after.mean[number]:+.3g} units (before: "
+            f"{shim.before.mean[number]:+.3g}).")
 
 
 def _unknown_part(shim: Shim) -> str:

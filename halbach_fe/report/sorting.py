@@ -42,6 +42,9 @@ T = TypeVar("T")
 SLOTS_A_ROW = 8
 """Largest number of slots in a row of the table of places."""
 
+LITTLE = 0.05
+"""Part of the rms below which the gain of sorting is called hardly worth the work."""
+
 QUANTILES = (0.025, 0.5, 0.975)
 """Quantiles of the rms of random orders that sort.json states: the outer ones hold 95 % of them, as
 all ranges of the page do."""
@@ -168,15 +171,23 @@ def answer(found: SortedBlocks) -> Answer:
     known = ["the measured moments", *(words for words, there in (
         ("the calibration of the coil", prior.common_mode_sd > 0),
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
+    orders = (f"in all random orders about {text(low)}" if text(low) == text(high) else
+              f"in 95 % of random orders {text(low)} to {text(high)}")
+    gain = 1 - best / min(own, float(np.median(found.random)))
+    hardly = "" if gain >= LITTLE else (
+        f"The order hardly matters: sorting gains {100 * gain:.2g}\u00a0%. ")
     return Answer(
         question,
-        f"The table of places says it, as blocks.sorted.csv does. In these slots {what} "
+        f"{hardly}The table of places says it, as blocks.sorted.csv does. In these slots {what} "
         f"{text(best)} {unit}{sizes}; with the blocks {found.own_order} it would be "
-        f"{text(own)}, and in 95 % of random orders {text(low)} to {text(high)}.{left}{turned}",
+        f"{text(own)}, and {orders}.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "
         "added by squares, whatever the order"
         f"{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
-        "Assemble the magnet in this order, measure it, and update the blocks.",
+        "Assemble the magnet in this order, measure it, and update the blocks." if not hardly else
+        "Assemble the magnet in any order that the table of blocks.sorted.csv records, measure it, "
+        "and update the blocks. To gain more, let more slots take the same blocks by prior.types "
+        f"of the study{types_in_words(found.alike)}.",
         "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")
 
 

@@ -315,7 +315,7 @@ def test_command(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["forces", str(path), "-o", str(out), "--price-per-kg", "80"]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "The largest force is" in said
+    assert "the largest force is" in said
     assert "(as heavy as" in said
     assert "in the currency of the price, at 80 per kg" in said
     header, *rows = [line for line in (out / "forces.csv").read_text().splitlines()
@@ -339,7 +339,7 @@ def test_command(tmp_path, capsys):
 def test_page(tmp_path):
     found = found_of(cuboids.DOCUMENT, tmp_path)
     page = write_report(found, tmp_path / "page").read_text()
-    assert "The largest force is" in page
+    assert "the largest force is" in page
     flat = parse_study(BASE | {"dimension": 2, "array": {
         key: value for key, value in cuboids.DOCUMENT["array"].items()
         if key not in ("rings", "ring_length_m")}})

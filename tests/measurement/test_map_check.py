@@ -362,10 +362,10 @@ def test_what_is_no_noise_is_not_recommended_as_such(generator):
     said = answer(coarse).said
     assert said.startswith("Passed. ")
     assert f"at z from {1e3 * start:.0f} to {1e3 * end:.0f}\u00a0mm" in said
-    assert "sigma_T of the study" not in said
+    assert "as sigma_T" not in said
     even = check_map(field_map(GRID, read_by(generator)))
     assert even.uneven is None
-    assert "that is sigma_T of the study" in answer(even).said
+    assert "into the study as sigma_T, unless" in answer(even).said
     scattered = replace(coarse, position_noise_m=5e-5)
     assert scattered.uneven is None
     assert "sigma_T and position_sd_m" in answer(scattered).said
