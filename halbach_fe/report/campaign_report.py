@@ -150,6 +150,8 @@ class Campaign:
         if any(chapter.verb == "demagnetization" for chapter in self._concerned()):
             step = (f"Settle first what is said above of losses at its temperature, as what comes "
                     f"after rests on the magnetization. Then: {step}")
+        if simulated:
+            step = f"If this were a measured magnet: {step}"
         if self.doubts and not left:
             step = f"Mend what does not fit together, as the list below says. After that: {step}"
         return Answer("What is known of this magnet?", said, trust, step,
@@ -209,8 +211,11 @@ class Campaign:
         if not found.sound:
             return next(own.with_paths({"DIR": found.folder}) for one, _, own in self.answered
                         if one is found)
-        repeat = (f"Repeat {chapter.label} with {found.label}/{DIAGNOSED}, which has what its "
-                  "study lacks.")
+        again = [one.label for one in dict.fromkeys(each for each, _, own in self.answered
+                                                    if not own.sound)
+                 if self.replaced(one) is None and not one.has_study_of(found)]
+        repeat = (f"Repeat {in_a_row(again)} with {found.label}/{DIAGNOSED}, which has what "
+                  f"{'its' if len(again) == 1 else 'their'} study lacks.")
         concern = next((own.concern for one, _, own in self.answered
                         if one is found and own.concern), "")
         return replace(answer, command="", step=repeat if not concern else (

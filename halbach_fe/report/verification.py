@@ -109,7 +109,8 @@ def answer(found: Verification) -> Answer:
         finer = ("Most of the error is that the computed region ends too near. Make "
                  + " and ".join(f"{key} larger (now {1e3 * size:.3g} mm)"
                                 for key, size in keys.items()) + ", and verify again.", finer[1])
-    return Answer(question, said, " ".join(filter(None, (trust, noise))),
+    bars = "The error bars of halbach-fe solve come from one comparison only, and may be larger."
+    return Answer(question, said, " ".join(filter(None, (trust, noise, bars))),
                   *(finer if rough or noisy else measure), sound=not rough)
 
 
@@ -142,9 +143,11 @@ def _boundary_keys(found: Verification) -> dict[str, float]:
     return {f"open_boundary.{name}": size for name, size in stated.items()}
 
 
-def _comparison(change: str) -> str:
-    """Return a change of the model, of those after the refinements, as the caption names it."""
-    return f"a {change}" if change == BOUNDARY else f"the {change}"
+def _compared(found: Verification) -> str:
+    """Name the changes of the model besides refinements, if there are any, for a caption."""
+    others = [f"{'a' if each.what == BOUNDARY else 'the'} {each.what}"
+              for each in found.differences[STEPS:]]
+    return f"; for comparison, the change by {in_a_row(others)}" if others else ""
 
 
 def error_basis(found: Verification) -> str:
@@ -187,9 +190,8 @@ def write_verification(
     if found.changes[:STEPS].any():
         figures["verification_convergence.png"] = _convergence_figure(found), (
             "Change of the field against element size, both logarithmic: change by the "
-            "next finer mesh with the slope of the order, estimated error of the study's own "
-            "mesh, and for comparison the change by "
-            f"{in_a_row([_comparison(each.what) for each in found.differences[STEPS:]])}")
+            "next finer mesh with the slope of the order, and estimated error of the study's own "
+            f"mesh{_compared(found)}")
         figures["verification_along.png"] = _change_figure(found), (
             "Change of B at every position of the study, for each change of the model")
     figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (

@@ -176,7 +176,7 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
     page = Page((out / "diagnosis.html").read_text())
     assert page.headings == [
         "small: what the model lacks", "What is missing", "What else it could be",
-        "What to measure next", "Pictures", "Where model and map disagree", "How sure that is",
+        "What would tell it from other causes", "Pictures", "Where model and map disagree", "How sure that is",
         "What changed", "Structure in the magnetizations", "The magnet",
         "The study with what was missing", "Provenance"]
     assert len(page.pictures) == 5
