@@ -130,6 +130,7 @@ class Campaign:
                    for each in unsound if (better := self.replaced(each)) is not None]
         simulated = [f"folder {one.label}" for one in self.chapters
                      if one.verb == "simulate-measurement"]
+        loses = any(chapter.verb == "demagnetization" for chapter in self._concerned())
         said = " ".join([
             *self._newest(), *self._concerns(),
             f"{counted(len(self.chapters), 'result')} of one magnet.",
@@ -137,6 +138,7 @@ class Campaign:
               else []), *instead,
             f"Not to be trusted as they are: {', '.join(f'folder {each}' for each in left)}."
             if left else "They do not all fit together." if self.doubts else
+            "The other answers hold as far as the magnet keeps its magnetization." if loses else
             f"{'All others' if instead else 'The answers'} may be used"
             f"{', for a test' if simulated else ' as they stand'}."])
         trust = (
@@ -147,7 +149,7 @@ class Campaign:
             "stands with it below.")
         last = self._next()
         step = last.step if last else "Nothing that the results name is left to do."
-        if any(chapter.verb == "demagnetization" for chapter in self._concerned()):
+        if loses:
             step = (f"Settle first what is said above of losses at its temperature, as what comes "
                     f"after rests on the magnetization. Then: {step}")
         if simulated:

@@ -72,8 +72,9 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
                 f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
         "How strong is the field?",
-        f"{said} The error that mesh and boundary make in {reading} is estimated as "
-        f"{flux_density(error)} at most, {relative(error / high)} of the largest |B|.",
+        f"{said} By comparison with one other mesh and boundary, {reading} is off by up to "
+        f"{flux_density(error)}, {relative(error / high)} of the largest |B|; halbach-fe verify "
+        "estimates that from more of them.",
         f"{compared}{of_blocks}",
         "Test that estimate with more meshes, which also say how far B at a point is off."
         if fine else
