@@ -203,19 +203,21 @@ class Campaign:
     def _with_what_was_found(self, chapter: Chapter, answer: Answer) -> Answer:
         """Return the next step of an answer that may not be used.
 
-        It is its own, or to repeat the command if the study has been diagnosed already; if that
-        diagnosis may not be used either, it is what the diagnosis says.
+        It is its own, or for results of the measured magnet to repeat their commands if the study
+        has been diagnosed already; if that diagnosis may not be used either, it is what the
+        diagnosis says.
         """
         found = next((one for one in self.chapters if one.verb == "diagnose"
                       and DIAGNOSED in one.record.files and not chapter.has_study_of(one)), None)
-        if found is None:
+        if found is None or chapter.verb not in OF_MEASURED:
             return answer
         if not found.sound:
             return next(own.with_paths({"DIR": found.folder}) for one, _, own in self.answered
                         if one is found)
         again = [one.label for one in dict.fromkeys(each for each, _, own in self.answered
                                                     if not own.sound)
-                 if self.replaced(one) is None and not one.has_study_of(found)]
+                 if one.verb in OF_MEASURED and self.replaced(one) is None
+                 and not one.has_study_of(found)]
         repeat = (f"Repeat {in_a_row(again)} with {found.label}/{DIAGNOSED}, which has what "
                   f"{'its' if len(again) == 1 else 'their'} study lacks.")
         concern = next((own.concern for one, _, own in self.answered

@@ -61,16 +61,18 @@ def _of_the_probe(result: InferenceResult) -> str:
     known = [study.instrument_sd, *(one.instrument_sd or study.instrument_sd for one in study.maps)]
     return "" if any(one.gain for one in known) else (
         " The error bars take the calibration of the probe as exact ([instrument_sd] can say how "
-        "well it is known): a common factor of the map is one of the magnet.")
+        "well it is known): if its gain is 0.1\u00a0% off, so is the field of the magnet.")
 
 
 def _largest_field(result: InferenceResult) -> str:
     """Say how strong the updated field is at its strongest reading; empty if none is a field."""
     if result.study.observation.quantity != "flux_density":
         return ""
-    known = result.prediction_posterior
+    known, observation = result.prediction_posterior, result.observation
     most = int(np.argmax(np.abs(known.mean)))
-    return ("The strongest component of the updated field at the map's positions is "
+    at = ", ".join(f"{1e3 * value:.4g}" for value in observation.positions[most])
+    return (f"The strongest component of the updated field at the map's positions, "
+            f"{observation.labels[most]} at ({at}) mm, is "
             f"{with_error(1e3 * abs(known.mean[most]), 1e3 * known.sd[most])} mT.")
 
 

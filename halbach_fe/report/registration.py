@@ -116,7 +116,9 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
 
 
 def _is_as_assumed(best: Registration) -> bool:
-    """Tell whether pose and probe are those of a map that no study describes, within errors."""
+    """Tell whether the registration found, within its errors, what a study without [instrument]
+    assumes: a map in the axes of the magnet, read by a probe without errors.
+    """
     found, assumed, probe = best.instrument, Instrument(), best.probe
     far = [(found.translation_m, best.translation_sd_m), (found.rotation_rad, best.rotation_sd_rad),
            (found.gain, probe.gain), (found.offset_T, probe.offset_T),

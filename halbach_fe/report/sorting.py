@@ -175,7 +175,8 @@ def answer(found: SortedBlocks) -> Answer:
               f"in 95 % of random orders {text(low)} to {text(high)}")
     gain = 1 - best / min(own, float(np.median(found.random)))
     hardly = "" if gain >= LITTLE else (
-        f"The order hardly matters: sorting gains {100 * gain:.2g}\u00a0%. ")
+        f"The order hardly matters: the sorted one is {100 * gain:.2g}\u00a0% better than that of "
+        "the table or a random one. ")
     return Answer(
         question,
         f"{hardly}The table of places says it, as blocks.sorted.csv does. In these slots {what} "
@@ -185,9 +186,9 @@ def answer(found: SortedBlocks) -> Answer:
         "added by squares, whatever the order"
         f"{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks." if not hardly else
-        "Assemble the magnet in any order that the table of blocks.sorted.csv records, measure it, "
-        "and update the blocks. To gain more, let more slots take the same blocks by prior.types "
-        f"of the study{types_in_words(found.alike)}.",
+        "Assemble the magnet in this order, or in another one that you write into "
+        "blocks.sorted.csv, measure it, and update the blocks. To gain more, let more slots take "
+        f"the same blocks by prior.types of the study{types_in_words(found.alike)}.",
         "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")
 
 

@@ -178,7 +178,7 @@ def verify(
              "the study's mesh to a finer": (base, fine)}
     pairs |= {description: (base, fields[purpose]) for purpose, description in (
         (FARTHER, BOUNDARY), (f"the dual route, {DUAL.get(route)}",
-                                             f"dual route, {DUAL.get(route)}"))
+                              f"dual route, {DUAL.get(route)}"))
         if purpose in fields}
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)

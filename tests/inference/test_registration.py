@@ -32,6 +32,7 @@ from halbach_fe.report.registration import (
     is_symmetric_to,
     magnet_on_stage,
     place_table,
+    probe_table,
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import Instrument
@@ -113,10 +114,33 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     assert not is_symmetric_to(best, moved)
     nearly = replace(twin, log_evidence=best.log_evidence - 1)
     assert "1 other pose cannot be ruled out" in answer([best, nearly]).trust
-    # and a fit that has not come to rest is not to be used
-    restless = answer([replace(best, at_rest=False)])
+    # and a fit that has not come to rest is not to be used, nor has it odds
+    restless = answer([replace(best, at_rest=False), nearly])
+    assert "so that the odds of poses mean little" in restless.trust
     assert restless.trust.startswith(NOT_AT_REST)
     assert "register" in restless.command
+
+
+def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path):
+    """Within its error bars; controls: it is displaced by ten of them, or a sensor reads more."""
+    data = measured(truth(generator, 0.0), generator, Rotation.identity(), np.zeros(3))
+    best = register(magnet, data, Session.open(tmp_path))[0]
+    own = best.instrument
+    assert not answer([best]).changes_study
+    for changes in ({"translation_m": tuple(own.translation_m + 10 * best.translation_sd_m)},
+                    {"gain": (10 * best.probe.gain, 0.0, 0.0)},
+                    {"field_axes": ("y", "x", "z")}):
+        other = best.study.with_(instrument=own.with_(**changes))
+        assert answer([replace(best, study=other)]).changes_study
+
+
+def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator, tmp_path):
+    data = measured(truth(generator, 0.0), generator, Rotation.identity(), np.zeros(3))
+    best = register(magnet, data, Session.open(tmp_path))[0]
+    assert {row["of the probe"] for row in probe_table(best)} >= {"gain of Bx", "gain of By"}
+    alone = replace(best, rms_T=np.array([1e-5, np.nan, np.nan]))
+    assert not any(name in row["of the probe"] for row in probe_table(alone)
+                   for name in ("of By", "of Bz", "the By", "the Bz", "By sees", "Bz sees"))
 
 
 def test_a_mirrored_magnet_is_refused(magnet, generator, tmp_path):

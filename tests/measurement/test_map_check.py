@@ -22,7 +22,14 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel
-from halbach_fe.report.map_check import answer, oriented, sentences, undetermined, verdict
+from halbach_fe.report.map_check import (
+    answer,
+    oriented,
+    sentences,
+    undetermined,
+    verdict,
+    weighted_note,
+)
 from tests.support.short_dipole import FRINGE, truth
 
 NOISE_T = 2e-5
@@ -108,6 +115,10 @@ def test_a_perfect_instrument(generator):
     assert len(steps) >= 2  # a clean map has one orientation, and the last step is one fit
     assert check.orientation == ("x", "y", "z")
     assert not check.is_reoriented
+    assert "once its columns" not in verdict(check)
+    # what is weighted may be larger than what is not, which the page then explains
+    assert weighted_note(replace(check, rms_T=2 * check.rms_as_given_T))
+    assert not weighted_note(replace(check, rms_T=check.rms_as_given_T / 2))  # the control
     assert check.suffices
     assert not [term.name for term in check.terms if term.found]
     assert not check.broken
@@ -129,6 +140,7 @@ def test_an_imperfect_instrument(generator):
     # a common sign cannot be known: that of the first column is taken as it is
     assert check.orientation == ("y", "x", "-z")
     assert check.broken == {"zero": [51], "spike": [121]}
+    assert verdict(check).startswith("Passed, once its columns are put along the axes that they")
     for sensor, (name, place) in enumerate(zip("xyz", sensors, strict=True)):
         for axis, along in enumerate("xyz"):
             term = named(check, f"{along} of the B{name} sensor from the mean of all")

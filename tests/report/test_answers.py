@@ -278,6 +278,7 @@ def test_without_a_choice_no_order_stands_beside_another(given, tmp_path, rings,
     text = (tmp_path / "sort.html").read_text()
     assert said in text
     assert ("as placed in the table" in text) == (said == "random orders")
+    assert "The order hardly matters" not in text  # the control of the test of that
     named = ", ".join(row["blocks, slot by slot"] for row in sorting.place_table(found))
     order = np.lexsort((found.table.slot, found.table.ring)).tolist()
     assert named.split(", ") == [found.table.serial[row] for row in order]
@@ -711,11 +712,34 @@ def test_an_update_without_circles_states_its_strongest_reading(given):
     """The control has a table of multipoles, whose main one is said instead."""
     said = inference_answer.answer(given.updated).said
     strongest = 1e3 * np.abs(given.updated.prediction_posterior.mean).max()
-    value = re.match("The strongest component of the updated field at the map's positions is "
-                     "([0-9.]+)\xa0±", said)[1]
+    name, value = re.match("The strongest component of the updated field at the map's positions, "
+                           r"(B[xyz]) at \([^)]+\) mm, is ([0-9.]+)\xa0±", said).groups()
+    assert name == "Bx"  # a dipole along x
     assert float(value) == pytest.approx(strongest, rel=1e-3)
     model, magnets = hf.multipoles(
         given.magnet, given.session, hf.MultipoleReference(z_m=0.0), posterior=given.updated
     ).tables[0]
     assert "strongest component" not in inference_answer.answer(
         given.updated, [(model, magnets)]).said
+
+
+def test_an_order_that_hardly_matters(given):
+    """The one that was found is as good as the table's; the control of more gain is above."""
+    magnet = build_magnet(given.study.with_(array__rings=2))
+    found = hf.sort(magnet, given.campaign.blocks, given.session)
+    own = found.numbered
+    alike = replace(found, best=replace(own, mean=0.99 * own.mean),
+                    random=own.rms_of_mean * np.linspace(1, 1.0003, len(found.random)))
+    said = sorting.answer(alike)
+    assert said.said.startswith("The order hardly matters: the sorted one is 1\u00a0% better")
+    assert "in all random orders about" in said.said
+    assert "or in another one that you write into blocks.sorted.csv" in said.step
+
+
+def test_error_bars_that_take_the_probe_as_exact_say_so(given):
+    """Not if the study says how well its gain is known."""
+    exact = inference_answer.answer(given.updated).trust
+    assert "take the calibration of the probe as exact" in exact
+    known = given.updated.magnet.with_(instrument_sd={"gain": 1e-3})
+    updated = replace(given.updated, magnet=known)
+    assert "as exact" not in inference_answer.answer(updated).trust

@@ -460,6 +460,9 @@ def test_what_is_bad_about_the_magnet_is_said_first(home):
     assert bad.concern in said
     assert said.index(bad.concern) < said.index("results of one magnet")
     assert bad.concern not in found_in(home, "field", "inferred").answer.said  # the control
+    assert "as far as the magnet keeps its magnetization" in said
+    assert found_in(home, "field", "a-hot", "inferred").answer.step.startswith("Settle first")
+    assert "Settle" not in found_in(home, "field", "inferred").answer.step
     results(home / "b-cool", "demagnetization", answer=replace(bad, said="Yes.", concern=""))
     assert bad.concern not in found_in(home, "field", "a-hot", "b-cool").answer.said
 
@@ -501,6 +504,10 @@ def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
     assert by_hand.step.startswith("Put right what was not assembled as designed, and measure "
                                    "again. Or, if it stays, repeat shimmed with diagnosis/")
     assert "turn a block" in by_hand.said
+    # what is not of the measured magnet is not repeated with the diagnosis
+    results(home / "rough", "solve", reads=[home / "study.toml"], answer=Answer(
+        "How?", "Some.", "No.", "Refine.", "halbach-fe verify STUDY", False))
+    assert found_in(home, "rough", "shimmed", "diagnosis").answer.step == "Refine."
 
 
 def test_a_diagnosis_that_is_not_sound_says_itself_what_to_do(home):
