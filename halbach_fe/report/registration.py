@@ -19,6 +19,7 @@ from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, axes_of_map, o
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points, turn_of
+from halbach_fe.measurement.instrument_terms import CROSSTALK
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -70,10 +71,15 @@ UPDATED = "magnet as the maps before have updated it"
 """What the readings are compared with before they update the blocks."""
 
 
-def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "") -> Answer:
+def answer(
+    found: Sequence[Registration], before: str = NOMINAL, name: str = "",
+    assumed: Instrument | None = None,
+) -> Answer:
     """Say where the map lies, how sure that is, and what to do next.
 
     ``name`` is that of a map that the study lists, so that no option has to say which it is.
+    ``assumed`` is the instrument that the study states (default: none): to find it again changes
+    nothing.
     """
     best = found[0]
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
@@ -112,22 +118,30 @@ def answer(found: Sequence[Registration], before: str = NOMINAL, name: str = "")
             if best.explains else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound,
-        changes_study=not _is_as_assumed(best))
+        changes_study=not _is_as_assumed(best, assumed or Instrument()))
 
 
-def _is_as_assumed(best: Registration) -> bool:
-    """Tell whether the registration found, within its errors, what a study without [instrument]
-    assumes: a map in the axes of the magnet, read by a probe without errors.
+def _is_as_assumed(best: Registration, assumed: Instrument) -> bool:
+    """Tell whether the registration found, within its errors, the instrument that the study
+    states; without [instrument] that is a probe without errors in the axes of the magnet.
     """
-    found, assumed, probe = best.instrument, Instrument(), best.probe
-    far = [(found.translation_m, best.translation_sd_m), (found.rotation_rad, best.rotation_sd_rad),
-           (found.gain, probe.gain), (found.offset_T, probe.offset_T),
-           (list(found.crosstalk.values()), probe.crosstalk),
-           (found.sensor_position_m, probe.sensor_m)]
-    return not best.open_keys and (found.position_axes, found.field_axes) == (
+    probe = best.probe
+    sizes = [best.translation_sd_m, best.rotation_sd_rad, probe.gain, probe.offset_T,
+             probe.crosstalk, probe.sensor_m]
+    return not best.open_keys and (best.instrument.position_axes, best.instrument.field_axes) == (
         assumed.position_axes, assumed.field_axes) and all(
-        np.all(np.abs(np.array(value, float)) <= CERTAIN_SD * np.array(sd, float))
-        for value, sd in far)
+        np.all(np.abs(new - old) <= CERTAIN_SD * np.asarray(sd)) for new, old, sd in zip(
+            _numbers(best.instrument), _numbers(assumed), sizes, strict=True))
+
+
+def _numbers(instrument: Instrument) -> list[Floats]:
+    """Return the shifts, turns, gains, offsets, crosstalk and places of sensors that a registration
+    finds.
+    """
+    return [np.array(value, float) for value in (
+        instrument.translation_m, instrument.rotation_rad, instrument.gain, instrument.offset_T,
+        [instrument.crosstalk.get(pair, 0.0) for pair in CROSSTALK],
+        instrument.sensor_position_m)]
 
 
 def _magnet_on_stage(best: Registration) -> str:
@@ -410,7 +424,7 @@ def _write_page(
         "The readings along the magnet's axis and in its cross-section, where the registration "
         "puts them"))}
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, answer=answer(found, before, name),
+               provenance, answer=answer(found, before, name, study.instrument),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
                name=study.name, probe=probe_table(best), map=name)

@@ -250,7 +250,8 @@ def _first_moves(shim: Shim) -> str:
     if first == len(shim.steps):
         return ""
     return (f" The first {'one makes' if first == 1 else f'{first} make'} "
-            f"{100 * part[first]:.0f}\u00a0% of that gain.")
+            f"{100 * part[first]:.0f}\u00a0% of that gain: stop after "
+            f"{'it' if first == 1 else 'them'} if a move costs more than the rest is worth.")
 
 
 def _remainder(shim: Shim) -> str:

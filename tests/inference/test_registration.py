@@ -122,7 +122,9 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
 
 
 def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path):
-    """Within its error bars; controls: it is displaced by ten of them, or a sensor reads more."""
+    """Within its error bars; controls: it is displaced by ten of them, or a sensor reads more, and
+    the study does not say so.
+    """
     data = measured(truth(generator, 0.0), generator, Rotation.identity(), np.zeros(3))
     best = register(magnet, data, Session.open(tmp_path))[0]
     own = best.instrument
@@ -131,7 +133,10 @@ def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path
                     {"gain": (10 * best.probe.gain, 0.0, 0.0)},
                     {"field_axes": ("y", "x", "z")}):
         other = best.study.with_(instrument=own.with_(**changes))
-        assert answer([replace(best, study=other)]).changes_study
+        again = replace(best, study=other)
+        assert answer([again]).changes_study
+        # a study that states that already is confirmed
+        assert not answer([again], assumed=other.instrument).changes_study
 
 
 def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator, tmp_path):

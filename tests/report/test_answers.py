@@ -679,7 +679,8 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
                                           for part in parts))
 
     said = shimming.answer(of_sizes(0.5, 0.3, 0.28, 0.27), given.updated).said
-    assert " The first 2 make 96\u00a0% of that gain. What remains is mostly b_9, " in said
+    assert (" The first 2 make 96\u00a0% of that gain: stop after them if a move costs more than "
+            "the rest is worth. What remains is mostly b_9, ") in said
     assert "The first" not in shimming.answer(of_sizes(0.8, 0.5), given.updated).said  # control
     still = replace(found, steps=(), within=None)
     vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],

@@ -441,6 +441,11 @@ def test_the_next_step_is_not_one_that_is_done_or_was_before(home):
     results(home / "tray", "shim-tray", reads=[study, home / "other.h5"], answer=Answer(
         "Which?", "Some.", "Yes.", "Look.", "halbach-fe homogeneity STUDY -o DIR"))
     assert part_of("tray")["next"] is None
+    # of the readings, as the posterior that was read there is; a control: of other ones
+    for read, number in ((readings, part_of("ppm")["number"]), (home / "other.h5", None)):
+        results(home / "moves", "shim", reads=[study, read], answer=Answer(
+            "Which?", "None.", "Yes.", "Look.", "halbach-fe homogeneity STUDY -o DIR"))
+        assert part_of("moves")["next"] == number
 
 
 def test_the_next_command_names_the_folder_of_its_answer(home):
