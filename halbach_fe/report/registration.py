@@ -73,7 +73,7 @@ UPDATED = "magnet as the maps before have updated it"
 
 def answer(
     found: Sequence[Registration], before: str = NOMINAL, name: str = "",
-    assumed: Instrument | None = None,
+    *, assumed: Instrument | None = None,
 ) -> Answer:
     """Say where the map lies, how sure that is, and what to do next.
 
@@ -140,7 +140,7 @@ def _numbers(instrument: Instrument) -> list[Floats]:
     """
     return [np.array(value, float) for value in (
         instrument.translation_m, instrument.rotation_rad, instrument.gain, instrument.offset_T,
-        [instrument.crosstalk.get(pair, 0.0) for pair in CROSSTALK],
+        list({**dict.fromkeys(CROSSTALK, 0.0), **instrument.crosstalk}.values()),
         instrument.sensor_position_m)]
 
 
@@ -424,7 +424,7 @@ def _write_page(
         "The readings along the magnet's axis and in its cross-section, where the registration "
         "puts them"))}
     write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, answer=answer(found, before, name, study.instrument),
+               provenance, answer=answer(found, before, name, assumed=study.instrument),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
                name=study.name, probe=probe_table(best), map=name)
