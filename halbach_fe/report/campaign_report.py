@@ -105,7 +105,8 @@ class Campaign:
     def done_before(self, chapter: Chapter, answer: Answer) -> Chapter | None:
         """Return an earlier chapter of the command of an answer, if it read what this one did.
 
-        Or if it is of a result that did, as of the posterior by the same map. A command that names files which ``chapter`` has written, or new ones, was not run before.
+        Or if it is of a result that did, as of the posterior by the same map. A command that names
+        files which ``chapter`` has written, or new ones, was not run before.
         """
         verb = re.match("halbach-fe ([a-z-]+)", answer.command)
         new = {*(PurePath(name).name for name in chapter.record.files), "NEW_MAP"}
@@ -116,7 +117,7 @@ class Campaign:
                      and set(chapter.record.inputs.values()) <= self._read_for(one)), None)
 
     def _read_for(self, chapter: Chapter) -> set[str]:
-        """Return digests of all that a chapter read, and that the results which it used have read."""
+        """Return the digests of all that a chapter and the results behind it have read."""
         return set(chapter.record.inputs.values()).union(*(
             other.record.inputs.values() for other in self.chapters if chapter.uses(other)))
 

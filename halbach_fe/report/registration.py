@@ -138,10 +138,10 @@ def _numbers(instrument: Instrument) -> list[Floats]:
     """Return the shifts, turns, gains, offsets, crosstalk and places of sensors that a registration
     finds.
     """
+    crosstalk = dict[str, float](instrument.crosstalk.items())
     return [np.array(value, float) for value in (
         instrument.translation_m, instrument.rotation_rad, instrument.gain, instrument.offset_T,
-        list({**dict.fromkeys(CROSSTALK, 0.0), **instrument.crosstalk}.values()),
-        instrument.sensor_position_m)]
+        [crosstalk.get(pair, 0.0) for pair in CROSSTALK], instrument.sensor_position_m)]
 
 
 def _magnet_on_stage(best: Registration) -> str:
