@@ -1,7 +1,8 @@
 """The field of the deviations of magnetizations from the nominal ones.
 
-It is exact in vacuum. What permeable blocks and iron answer to deviations is a few per cent of a
-field that is small itself. It is neglected, but for what blocks answer where that is asked for.
+It is exact in vacuum. What permeable blocks and iron answer to deviations is some per cent of a
+field that is small itself, up to a quarter near an iron tube. It is neglected, but for what blocks
+answer where that is asked for: use the field for error bars and small corrections.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ squares. Its point at z = 0 is the centre of a 3D magnet.
 vanishes: that is where a homogeneous magnet is most homogeneous. It is a saddle point, since the
 component is harmonic. The axis of a dipole is not defined.
 
-The field is that of the nominal magnet, to which the deviations' field in vacuum is added, see
-`halbach_fe.response.deviation_field`.
+The field is linear in the magnetizations, as in `halbach_fe.response.matrix`: permeable blocks and
+iron answer to deviations too. (Of an iron tube close to the blocks, that is a quarter of a roll.)
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 
@@ -121,13 +121,12 @@ def magnetic_axis(
     points = np.vstack([around, cross]) if order == 1 and not flat else around
     if magnet.contains(points).any():  # something stands in the bore
         return None
-    deviations = Deviations.of(magnet)
     size = magnet.dimension
-    nominal = solve_nominal(magnet, points, session.within("axis"))
-    columns = deviations.columns(points).reshape(len(points), 3, -1)[:, :size]
-    change = magnetizations.mean.copy()
-    change[:len(magnet.parameter_names)] -= magnet.nominal_magnetization
-    field = nominal[:, :size] + columns @ change
+    response = response_matrix(magnet, flux_density_at(points), session.within("axis"))
+    columns = response.whole.reshape(len(points), 3, -1)[:, :size]
+    external = response.offset.reshape(len(points), 3)[:, :size]
+    field, nominal = (columns @ values + external
+                      for values in (magnetizations.mean, response.nominal))
     on_circles = slice(0, len(around))
 
     def multipole(number: int, values: Floats) -> Complexes:
@@ -137,7 +136,7 @@ def magnetic_axis(
         return np.einsum("hp...,p->h...", parts[:, :, 1] + 1j * parts[:, :, 0], wave)
 
     main, root = multipole(order, field), multipole(order, columns)
-    was = multipole(order, nominal[:, :size])
+    was = multipole(order, nominal)
     if not np.abs(was).max() > NOTHING_THERE * np.abs(root).sum(axis=1).max() * np.abs(
             magnet.nominal_magnetization).max():
         return None
