@@ -238,9 +238,18 @@ def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
                         help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
 
 
+SIMULATED = b"# source: synthetic"
+"""How a map (CSV) begins that `halbach-fe simulate-measurement` wrote."""
+
+
 def digest(path: Path) -> str:
-    """Return the name of a file and the SHA-256 of what was read, for the provenance of a page."""
-    return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    """Return the name of a file and the SHA-256 of what was read, for the provenance of a page.
+
+    It says if the file is a map that `halbach-fe simulate-measurement` wrote.
+    """
+    content = path.read_bytes()
+    simulated = ", simulated" if content.startswith(SIMULATED) else ""
+    return f"{path.name}{simulated}, SHA-256 {hashlib.sha256(content).hexdigest()}"
 
 
 def digests(files: Mapping[str, Path | None]) -> dict[str, str]:

@@ -34,7 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(plan_summary(plan))
     else:
-        common.print_table(plan_table(plan), "The plan beside the positions of the study (* with "
-                           "equally many positions)")
+        rows = plan_table(plan)
+        common.print_table(rows, "The plan beside the positions of the study (* with equally many "
+                           "positions)" if "plan" in rows[0] else "What the readings leave unknown")
         common.say_answer(arguments, answer(plan), arguments.output / "plan.html")
     return 0

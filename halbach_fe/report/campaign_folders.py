@@ -30,9 +30,10 @@ ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", 
          "homogeneity", "diagnose", "shim", "shim-tray")
 """Commands in the order in which data flow; others come last."""
 
-TELLING = {"solve": "field.png", "diagnose": "diagnosis_profile.png", "shim": "shim_moves.png",
-           "simulate-measurement": "campaign_field.png"}
-"""The figure that says most, where that is not the first which is not of the geometry."""
+TELLING = {"solve": "field", "diagnose": "diagnosis_profile", "shim": "shim_moves",
+           "simulate-measurement": "campaign_field", "infer": "profile"}
+"""How the name of the figure begins that says most, where that is not the first which is not of the
+geometry."""
 
 SAME_PLACE = 0.03
 """Distance of nominal places, as a fraction of a block's width, up to which two studies describe
@@ -183,7 +184,7 @@ def _picture(results: Results, folder: PurePath, said: PageRecord) -> Picture | 
     """Return the most telling figure of a page, if there is one."""
     verb = results.record.command.rpartition(" ")[2]
     figures = [one for one in said.figures if "geometry" not in one.file]
-    figures.sort(key=lambda one: one.file != TELLING.get(verb))
+    figures.sort(key=lambda one: not one.file.startswith(TELLING.get(verb, one.file)))
     for one in figures:
         try:
             content = results.read(str(folder / one.file), MOST_FIGURE_BYTES)

@@ -335,7 +335,7 @@ def _html(campaign: Campaign, path: Path) -> str:
         "campaign_report.html.j2", campaign.study, answer=campaign.answer, pictures=[],
         magnet=in_one_line(magnet), picture=Picture(
             base64.b64encode(png_of(picture)).decode(),
-            "The blocks with their magnetization, and the positions of the study"),
+            "The blocks with their magnetization and slots, and the positions of the study"),
         doubts=campaign.doubts, versions=campaign.versions,
         parts=_parts(campaign, path),
         folders=_folder_rows(campaign), inputs=_input_rows(campaign),

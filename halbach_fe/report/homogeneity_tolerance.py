@@ -27,6 +27,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.words import ppm, share_in_words
+from halbach_fe.study.inference import Prior
 
 ENOUGH = 0.9
 """Share of the magnets within the limit from which the tolerances suffice."""
@@ -82,8 +83,6 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     if share is not None and found.limit is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
-    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
-               if prior.mounting_sd_deg > 0 else "")
     enough = share is not None and share >= ENOUGH
     step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
@@ -98,10 +97,20 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
-        f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
-        f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
-        f"those tolerances come on top. {len(found.rms_ppm)} magnets were drawn. {text}", *step,
+        f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
+        f"{len(found.rms_ppm)} magnets were drawn. {text}", *step,
         sound=small)
+
+
+def tolerances_in_words(prior: Prior) -> str:
+    """Say which tolerances of the blocks were drawn, and which were not, in sentences."""
+    together = (f", all of them together by {100 * prior.common_mode_sd:g} %"
+                if prior.common_mode_sd > 0 else "")
+    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
+               if prior.mounting_sd_deg > 0 else "")
+    return (f"each block varies by {100 * prior.magnitude_sd:g} % and "
+            f"{prior.direction_sd_deg:g}°{together}{mounted}. Shapes and places count as nominal: "
+            "what their tolerances make comes on top of these numbers.")
 
 
 @own_style

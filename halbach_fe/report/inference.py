@@ -150,7 +150,7 @@ def write_inference_report(
     said = answer(result, multipoles)
     write_page(
         folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
-        provenance=provenance, result=result, multipoles=middle_table(multipoles),
+        provenance=provenance, result=result, multipoles=middle_table(multipoles, result.study),
         rows=score_table(result, published), published=published, assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet),
         answer=said,

@@ -54,8 +54,13 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, o
             "nominal_main": model.nominal_main, "main_unit": model.unit}
 
 
-def reference_text(model: MultipoleModel) -> str:
-    """Return a sentence that states the reference and the convention of multipoles."""
+def reference_text(model: MultipoleModel, study: Study) -> str:
+    """Return sentences that state the reference and the convention of multipoles, and which orders
+    of the magnet as designed are higher than those of the table.
+    """
+    own = [model.main + count for count in study.array.blocks_by_ring]
+    higher = "" if study.array.free_blocks or min(own) <= max(model.orders) else (
+        f" The lowest unwanted order of rings as designed is {min(own)}, not in the table.")
     where = ("of the field integrated along z" if model.integrated
              else "of the cross-section" if model.z is None
              # the middle of a magnet is 0 to rounding
@@ -63,7 +68,8 @@ def reference_text(model: MultipoleModel) -> str:
     return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
             f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
             "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
-            "about z such that the main multipole of the nominal magnet is normal.")
+            "about z such that the main multipole of the nominal magnet is normal."
+            f"{higher}")
 
 
 def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
@@ -77,7 +83,7 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
         for number, (name, known) in enumerate(magnets.items()):
             axis.errorbar(place + SHIFT * (number - (len(magnets) - 1) / 2), known.mean[part],
                           2 * known.sd[part], fmt=MARKERS[number], color=COLOURS[number], ms=5,
-                          capsize=3, label=name)
+                          capsize=3, label=name or None)
         axis.axhline(0, color=PUBLISHED, lw=0.8)
         for sign in (-1, 1) if limit is not None else ():
             axis.axhline(sign * (limit or 0.0), color=PUBLISHED, lw=0.8, ls="--",
@@ -85,7 +91,8 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("units of 1e-4")
-    legend_above(figure, axes[1], columns=4)
+    if limit is not None or len(magnets) > 1 or "" not in magnets:
+        legend_above(figure, axes[1], columns=4)
     return figure
 
 
@@ -141,14 +148,14 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     return f"{where} the {name} is {size}\u00a0{unit}{by}."
 
 
-def middle_table(tables: Sequence[MultipoleTable]) -> dict[str, object]:
+def middle_table(tables: Sequence[MultipoleTable], study: Study) -> dict[str, object]:
     """Return the template variables of the table of `middle_circle`; empty without circles."""
     if not tables:
         return {}
     model, magnets = middle_circle(tables)
     mains = "; ".join(f"{name} {main_in_words(model, known)}" for name, known in magnets.items())
-    return {"reference": reference_text(model), "mains": mains, "rows": text_table(**magnets),
-            "circles": len(tables)}
+    return {"reference": reference_text(model, study), "mains": mains,
+            "rows": text_table(**magnets), "circles": len(tables)}
 
 
 def multipoles_summary(
@@ -256,7 +263,7 @@ def write_multipoles(
             multipole_figure(magnets, limit), "Unwanted multipoles, normal (left) and "
             "skew (right); bars are two standard deviations")
         for model, magnets in tables}, folder)
-    parts = [{"title": _location(model), "reference": reference_text(model),
+    parts = [{"title": _location(model), "reference": reference_text(model, study),
               "rows": multipole_rows(magnets), "picture": picture}
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
     said = answer(tables, limit, disagreement, faults_in_words(study))

@@ -213,17 +213,20 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
+MOST_NUMBERED = 40
+"""Largest number of blocks in a cross-section whose slots are numbered."""
+
+
 def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
     """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
 
-    ``colour`` is that of the blocks.
+    ``colour`` is that of the blocks. Their slots have numbers, unless there are too many to read.
     """
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
-    for block in magnet.blocks:
-        if magnet.dimension == 3 and abs(block.middle[2] - height) > (
-                block.z_max - block.z_min) / 2 - 1e-9:
-            continue
+    shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
+        block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
+    for block in shown:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
         outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
         axis.plot(*outline.T, color=colour, lw=0.6)
@@ -232,6 +235,13 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
+        distance = float(np.hypot(*middle))
+        if len(shown) <= MOST_NUMBERED and distance > 0:
+            # between the arrow and the block's outer side
+            outwards = middle / distance
+            edge = float((outline @ outwards).max())
+            axis.annotate(str(block.slot), outwards * (0.25 * distance + 0.75 * edge),
+                          ha="center", va="center", fontsize=SMALL, color=colour)
     for body in magnet.iron:
         if body.outline is not None:
             axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])

@@ -211,10 +211,13 @@ def _patterns(plan: MeasurementPlan) -> Floats:
 
 
 def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
-    """Return rows of text that compare the plan with the positions of the study."""
+    """Return rows of text that compare the plan with the positions of the study.
+
+    A plan that only orders these is not compared with itself.
+    """
     prior, same = _rms(plan.prior_sd), plan.same_information
     patterns = _patterns(plan)
-    return [
+    rows = [
         {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
         {"": "positions that tell as much as all of the study's",
          "plan": str(same) if same else str(len(plan.points)) if _is_the_study(plan)
@@ -228,6 +231,10 @@ def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
         *([] if plan.deviation is None else [
             {"": "sd of the deviation of |B| in ppm rms*",
              "plan": ppm(plan.deviation.planned[-1]), "the study's": ppm(_of_study(plan))}])]
+    if _only_orders(plan):
+        rows = [{"": row[""].rstrip("*"), "at all positions": row["plan"]}
+                for row in (rows[0], *rows[2:])]
+    return rows
 
 
 def _is_the_study(plan: MeasurementPlan) -> bool:
@@ -235,6 +242,11 @@ def _is_the_study(plan: MeasurementPlan) -> bool:
     chosen, study = (set(map(tuple, points.round(9).tolist()))
                      for points in (plan.points, plan.baseline))
     return study <= chosen
+
+
+def _only_orders(plan: MeasurementPlan) -> bool:
+    """Tell whether the plan only orders the study's positions."""
+    return _is_the_study(plan) and len(plan.points) == len(plan.baseline)
 
 
 def _rms(values: Floats) -> float:
@@ -331,8 +343,11 @@ def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
         return np.sqrt(np.where(sums > 0, sums, np.nan))
 
     before = by_slot(plan.prior_sd)
-    for name, sd, colour, shift in (("plan", plan.planned_sd, POSTERIOR, -0.2),
-                                    ("positions of the study", plan.baseline_sd, PRIOR, 0.2)):
+    bars = [("plan", plan.planned_sd, POSTERIOR, -0.2),
+            ("positions of the study", plan.baseline_sd, PRIOR, 0.2)]
+    if _only_orders(plan):
+        bars = [("at all positions", plan.planned_sd, POSTERIOR, 0.0)]
+    for name, sd, colour, shift in bars:
         axis.bar(places + shift, 100 * by_slot(sd) / before, 0.4, color=colour, label=name)
     axis.set(xlabel="slot", ylabel="sd of a block in % of the prior's", ylim=(0, None))
     axis.set_xticks(places[::max(1, len(places) // 16)])

@@ -23,6 +23,9 @@ SAME = 1e-3
 FEW_RADII = 3
 """Largest number of radii for which points count as circles about the axis."""
 
+MOST_ASPECT = 4.0
+"""Largest ratio of the sides of a slice that is drawn to scale. A longer one would be a line."""
+
 FEWEST = 12
 """Fewest points in a slice; with fewer all points are drawn by angle and z."""
 
@@ -44,7 +47,7 @@ class Panel:
         Abscissae and ordinates, in the units of the labels.
     labels : tuple of two str
     lengths : bool
-        Whether both are lengths, and drawn to scale.
+        Whether both are lengths, drawn to scale if that leaves something to see.
     """
 
     title: str
@@ -156,7 +159,8 @@ def draw(axis: Axes, panel: Panel, values: Floats, **colours: Any) -> ScalarMapp
                              s=float(np.clip(6000 / len(values), 4, 60)), **colours)
     axis.set(xlabel=panel.labels[0], ylabel=panel.labels[1])
     if panel.lengths:
-        axis.set_aspect("equal")
+        sides = sorted(float(np.ptp(side)) for side in (panel.first, panel.second))
+        axis.set_aspect("equal" if sides[1] <= MOST_ASPECT * sides[0] else "auto")
     else:
         axis.set_yticks(range(0, 361, 90))
     axis.set_facecolor("#eeeeee")
@@ -208,6 +212,8 @@ def _not_zero(rows: Mapping[str, Floats]) -> dict[str, Floats]:
 def _grid(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and its axes in rows and columns."""
     figure = figure_of(0.4 + 2.4 * rows, max(4.6 * columns, 6.0))
+    # the layout is made before axes are drawn to scale, which moves their labels outwards
+    figure.set_layout_engine("constrained", rect=(0.03, 0.0, 0.95, 1.0))
     return figure, figure.subplots(rows, columns, squeeze=False).tolist()
 
 

@@ -143,8 +143,8 @@ def answer(prior: MeasuredPrior) -> Answer:
             f"{with_error(100 * abs(strength), 100 * common)}\u00a0% {side} than the study says. "
             "In length and direction together they deviate from it by "
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
-            + (f", most of which ({fraction(common)}) all blocks share, as they share the "
-               "calibration of the coil" if common > MOSTLY * spread else "") + ". " + (
+            + (", most of which is the calibration of the coil, which all blocks share"
+               if common > MOSTLY * spread else "") + ". " + (
                 "Ring and slot of every block are known: each has its own measurement."
                 if prior.placed else "Which block is in which slot is not known: all blocks of a "
                 "type have its mean and spread."))

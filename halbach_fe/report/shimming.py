@@ -153,8 +153,11 @@ def value_table(shim: Shim) -> list[dict[str, str]]:
 
 
 def _compared(shim: Shim, before: T, after: T) -> dict[str, T]:
-    """Return what is before and after the moves by its name; without moves there is one magnet."""
-    return {"before": before, "after": after} if shim.steps else {"as it is": before}
+    """Return what is before and after the moves by its name; without moves there is one magnet,
+    which needs no name in a table of multipoles.
+    """
+    only = "" if shim.fields is None else "as it is"
+    return {"before": before, "after": after} if shim.steps else {only: before}
 
 
 def _placement_text(shim: Shim, placement: Placement) -> str:
@@ -326,8 +329,9 @@ def _convention(shim: Shim) -> str:
                      for name, each in known.items())
     roll = ", ".join(f"{with_error(1e3 * each.roll, 1e3 * each.roll_sd)} mrad{when[name]}"
                      for name, each in known.items())
-    return (f"{reference_text(shim.model)} ± is the standard deviation, including the error of the "
-            f"solver. Main multipole: {main}. It is rotated about the z axis by {roll}.")
+    return (f"{reference_text(shim.model, shim.study)} ± is the standard deviation, "
+            f"including the error of the solver. Main multipole: {main}. It "
+            f"is rotated about the z axis by {roll}.")
 
 
 def _moves_figure(shim: Shim) -> Figure:

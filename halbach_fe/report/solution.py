@@ -108,8 +108,8 @@ def write_solution_report(
     """
     figures = {
         "geometry.png": (geometry_figure(solution.magnet, solution.points), "The blocks of a ring "
-                         "with their magnetization, the iron if there is any, and the study's "
-                         "positions"),
+                         "with their magnetization and slots, the iron if there is any, and the "
+                         "study's positions"),
         "field.png": (field_figure(solution),
                       "The field at the study's positions"
                       + (", and the solver's error bar of each reading"
@@ -125,7 +125,8 @@ def write_solution_report(
         folder / "report.html", "solution.html.j2", save(figures, folder),
         study=solution.magnet.study,
         magnet_rows=magnet_rows(solution.magnet),
-        multipoles=middle_table(multipoles), exact=not solution.errors.any(), provenance=provenance,
+        multipoles=middle_table(multipoles, solution.magnet.study),
+        exact=not solution.errors.any(), provenance=provenance,
         answer=said, rows=field_table(solution),
         stray=stray_section(solution.stray_field),
         view=view_of_nominal_magnet(

@@ -126,8 +126,11 @@ def order_table(found: SortedBlocks) -> list[dict[str, str]]:
 
 
 def _compared(found: SortedBlocks, best: T, own: T) -> dict[str, T]:
-    """Return what is sorted after what is in the table's order; the former alone without choice."""
-    return {found.own_order: own, "sorted": best} if _chose(found) else {"every order": best}
+    """Return what is sorted after what is in the table's order; the former alone without choice,
+    which needs no name in a table of multipoles.
+    """
+    only = "" if found.fields is None else "every order"
+    return {found.own_order: own, "sorted": best} if _chose(found) else {only: best}
 
 
 def _chose(found: SortedBlocks) -> bool:
@@ -244,8 +247,9 @@ def _convention(found: SortedBlocks) -> str:
     if isinstance(found.model, DeviationModel):
         return (f"{SIZES} Ranges hold 95 % of the magnets that the uncertainty of the measured "
                 "blocks allows.")
-    return (f"{reference_text(found.model)} ± is the standard deviation, including the error of "
-            f"the solver. Main multipole of {'the sorted' if _chose(found) else 'these'} blocks: "
+    return (f"{reference_text(found.model, found.study)} ± is the standard deviation, "
+            f"including the error of the solver. Main multipole of "
+            f"{'the sorted' if _chose(found) else 'these'} blocks: "
             f"{main_in_words(found.model, found.best)}.")
 
 

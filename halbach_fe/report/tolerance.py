@@ -17,6 +17,7 @@ from halbach_fe.report.homogeneity_tolerance import (
     homogeneity_quantiles,
     homogeneity_tolerance_answer,
     homogeneity_tolerance_summary,
+    tolerances_in_words,
     write_homogeneity_tolerance,
 )
 from halbach_fe.report.multipoles import main_in_words, reference_summary, reference_text
@@ -106,8 +107,6 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
-    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
-               if prior.mounting_sd_deg > 0 else "")
     step = (("Measure the blocks before assembly, and see what sorting them into the slots that "
              "they fit gains.",
              "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
@@ -115,9 +114,8 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
              "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(
         "Which multipoles do the tolerances of the blocks make?", said,
-        f"Yes, as far as the study's prior is right: blocks vary by {100 * prior.magnitude_sd:g} % "
-        f"and {prior.direction_sd_deg:g}°{mounted}. Their shapes and places are nominal, so that "
-        f"those tolerances come on top. {whole(len(found.sizes))} magnets were drawn.", *step)
+        f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
+        f"{whole(len(found.sizes))} magnets were drawn.", *step)
 
 
 @own_style
@@ -137,7 +135,8 @@ def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> No
             "unwanted multipole is below a limit"),
     }, folder)
     write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
-               study=found.study, answer=answer(found), reference=reference_text(found.model),
+               study=found.study, answer=answer(found),
+               reference=reference_text(found.model, found.study),
                rows=quantile_table(found), draws=whole(len(found.sizes)),
                main=main_in_words(found.model, found.known))
 

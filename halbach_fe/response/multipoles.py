@@ -603,7 +603,8 @@ MAIN_UNITS = 9000.0
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     """Return a row of text per order, with ``b_n ± sd`` and ``a_n ± sd`` in units.
 
-    The columns are multipoles of the same orders, each by a name for the heading. The main
+    The columns are multipoles of the same orders, each by a name for the heading, which may be
+    empty if there is one. The main
     multipole, 10 000 units by definition, is no error: its cell has a word. What is exact has no
     standard deviation.
     """
@@ -619,7 +620,7 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     for i, order in enumerate(first.orders):
         row = {"n": str(order)}
         for letter, number in (("b", i), ("a", len(first.orders) + i)):
-            row |= {f"{letter}_n {name}": text(column, number)
+            row |= {f"{letter}_n {name}".strip(): text(column, number)
                     for name, column in columns.items()}
         rows.append(row)
     return rows
