@@ -174,8 +174,8 @@ def _solver_error(result: InferenceResult) -> str:
     if not error.any():
         return "none: the blocks are in vacuum"
     return (f"at most {flux_density(float(error.max()), 2)}, "
-            f"{decimals(float((error / result.noise.sd).max()), 2)} times the sd of the noise; "
-            "included in the error bars")
+            f"and at most {decimals(float((error / result.noise.sd).max()), 2)} times the noise "
+            "of a reading; included in the error bars")
 
 
 def _percent(value: float | None) -> str:

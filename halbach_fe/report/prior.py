@@ -151,8 +151,8 @@ def answer(prior: MeasuredPrior) -> Answer:
     odd = [samples.label for samples in prior.types if not samples.normal]
     tested = _tested(prior)
     trust = ("Yes: it is what the table says. No type has enough blocks to test whether their "
-             "deviations are distributed normally"
-             + (", which does not matter where each block is known." if prior.placed else ".")
+             "deviations are distributed normally."
+             if not tested and not prior.placed else "Yes: it is what the table says of each block."
              if not tested else
              "Yes: nothing speaks against normally distributed deviations, which the prior "
              "assumes." if not odd else

@@ -36,7 +36,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import counted, place_of, ppm, probability, with_error
+from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
 from halbach_fe.study.edit_file import write_edited
@@ -215,8 +215,8 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         else:
             said = f"With {moves} of blocks {said}{_first_moves(shim)}{_remainder(shim)}"
     else:
-        said = (f"No move is worthwhile. Leave it as it is: {what} {before} {unit}, including the "
-                f"uncertainty{_unknown_part(shim)}.")
+        said = (f"No move is worthwhile{_of_possible(shim)}. Leave it as it is: {what} {before} "
+                f"{unit}, including the uncertainty{_unknown_part(shim)}.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
@@ -243,6 +243,13 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
              f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")))
+
+
+def _of_possible(shim: Shim) -> str:
+    """Say how many moves there are in the magnet, of which kinds."""
+    kinds = {"swap": "exchange", "cycle": "cycle", "turn": "turn", "replace": "replacement"}
+    found = [counted(count, kinds[kind]) for kind, count in shim.tried.items() if count]
+    return f": of {in_a_row(found)}, none gains more than its uncertainty" if found else ""
 
 
 def _first_moves(shim: Shim) -> str:

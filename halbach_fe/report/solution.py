@@ -74,9 +74,9 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
         "How strong is the field?",
         f"{said} By comparison with one other mesh and boundary, {reading} is off by up to "
         f"{flux_density(error)}, {relative(error / high)} of the largest |B|; halbach-fe verify "
-        "estimates that from more of them.",
+        "estimates it from several meshes.",
         f"{compared}{of_blocks}",
-        "Test that estimate with more meshes, which also say how far B at a point is off."
+        "Check that error with several meshes."
         if fine else
         "See how the error falls with the mesh, then refine mesh.block_size_m.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)

@@ -167,8 +167,9 @@ def answer(found: SortedBlocks) -> Answer:
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
             f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, and here "
-            "every slot has its own.", "Let slots take the same blocks by prior.types of the study"
-            f"{types_in_words(found.alike)}, or measure spare blocks, and sort again.",
+            "every slot has its own.", "If blocks of some slots are alike, say so in the study "
+            f"(prior.types{types_in_words(found.alike)}); or measure spare blocks; and sort "
+            "again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
     spread, prior = _uncertainty(found), found.study.prior
     known = ["the measured moments", *(words for words, there in (

@@ -99,8 +99,8 @@ def answer(found: Verification) -> Answer:
     noisy, noise = _beside_the_noise(found)
     trust = ("No: the last refinement does not change the field less than the one before. The "
              "estimate is rough, and the mesh should be finer." if rough else
-             "Yes: the field converges. Elements of half the size divide its change by "
-             f"{2**found.order:.2g} (order {found.order:.1f}).")
+             "Yes: the field converges. Elements of half the size divide its change from "
+             f"mesh to mesh by {2**found.order:.2g} (order {found.order:.1f}).")
     finer = (f"Make mesh.block_size_m smaller (elements are now "
              f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
              "halbach-fe verify STUDY -o DIR")
@@ -109,7 +109,8 @@ def answer(found: Verification) -> Answer:
         finer = ("Most of the error is that the computed region ends too near. Make "
                  + " and ".join(f"{key} larger (now {1e3 * size:.3g} mm)"
                                 for key, size in keys.items()) + ", and verify again.", finer[1])
-    bars = "The error bars of halbach-fe solve come from one comparison only, and may be larger."
+    bars = ("This estimate is from several meshes; that of halbach-fe solve is from one "
+            "comparison, and differs.")
     return Answer(question, said, " ".join(filter(None, (trust, noise, bars))),
                   *(finer if rough or noisy else measure), sound=not rough)
 

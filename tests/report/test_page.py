@@ -105,7 +105,8 @@ def test_texts_of_figures_can_be_read(tmp_path):
                results={})
     style = f"min-width: {picture.legible_px}px; --width: {picture.width_in}in"
     assert f'style="{style}"' in path.read_text()
-    assert re.search(r'<div class="wide"><img [^>]*><div class="more"></div></div><figcaption>', path.read_text())
+    assert re.search(r'<div class="wide"><img [^>]*><div class="more"></div></div><figcaption>',
+                     path.read_text())
 
 
 def test_figures_are_made_no_wider_than_paper():
