@@ -168,7 +168,7 @@ def answer(found: SortedBlocks) -> Answer:
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
             f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, and here "
             "every slot has its own.", "If blocks of some slots are alike, say so in the study "
-            f"(prior.types{types_in_words(found.alike)}); or measure spare blocks; and sort "
+            f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
             "again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
     spread, prior = _uncertainty(found), found.study.prior
