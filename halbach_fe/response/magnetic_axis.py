@@ -16,6 +16,8 @@ component is harmonic. The axis of a dipole is not defined.
 
 The field is linear in the magnetizations, as in `halbach_fe.response.matrix`: permeable blocks and
 iron answer to deviations too. (Of an iron tube close to the blocks, that is a quarter of a roll.)
+With non-linear iron the field is that of the updated magnet, which is solved for, and standard
+deviations are those of the blocks in vacuum: columns of all blocks take as long as an update.
 """
 
 from __future__ import annotations
@@ -27,8 +29,10 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 
@@ -122,11 +126,8 @@ def magnetic_axis(
     if magnet.contains(points).any():  # something stands in the bore
         return None
     size = magnet.dimension
-    response = response_matrix(magnet, flux_density_at(points), session.within("axis"))
-    columns = response.whole.reshape(len(points), 3, -1)[:, :size]
-    external = response.offset.reshape(len(points), 3)[:, :size]
-    field, nominal = (columns @ values + external
-                      for values in (magnetizations.mean, response.nominal))
+    field, nominal, columns = (
+        values[:, :size] for values in _fields(magnet, points, session, magnetizations.mean))
     on_circles = slice(0, len(around))
 
     def multipole(number: int, values: Floats) -> Complexes:
@@ -165,6 +166,25 @@ def magnetic_axis(
         return (float(line[number].real), float(line[number].imag)), tuple(sd.tolist())
 
     return MagneticAxis(order, roll, roll_sd, *both(0), *(() if flat else both(1)))
+
+
+def _fields(
+    magnet: Magnet, points: Floats, session: Session, mean: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return B at points (n, 3) in m with the magnetizations ``mean`` in A/m, and with the nominal
+    ones, (n, 3) in T, and the derivative (n, 3, parameters) of the former.
+    """
+    own = session.within("axis")
+    if magnet.is_nonlinear:
+        uniform = mean[:len(magnet.parameter_names)]
+        updated = Magnet(magnet.study, with_magnetizations(magnet, uniform))
+        nominal = solve_nominal(magnet, points, own.within("nominal"))
+        field = solve_nominal(updated, points, own.within("updated"))
+        return field, nominal, Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
+    response = response_matrix(magnet, flux_density_at(points), own)
+    columns, external = (values.reshape(len(points), 3, *values.shape[1:])
+                         for values in (response.whole, response.offset))
+    return columns @ mean + external, columns @ response.nominal + external, columns
 
 
 _DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1]], float)

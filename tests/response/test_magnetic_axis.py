@@ -168,12 +168,14 @@ def test_a_cross_section(tmp_path, dipole):
     assert abs(axis.roll_rad) == pytest.approx(0.01, rel=1e-6)
 
 
-def test_iron_answers_to_what_turns_the_field(tmp_path, dipole):
+@pytest.mark.parametrize("iron", [{"relative_permeability": 1000.0},
+                                  {"curve": {"kind": "steel", "name": "aisi_1010"}}])
+def test_iron_answers_to_what_turns_the_field(tmp_path, dipole, iron):
     """Around iron that is the same at all angles the field turns as its magnetizations do; the
-    deviations' field in vacuum turns it by 3 % more. Measured 1.5e-7.
+    deviations' field in vacuum turns it by 3 % more. Measured 1.5e-7, and 4e-6 with a curve.
     """
-    magnet = build_magnet(dipole(iron_ring={"inner_radius_m": 0.19, "outer_radius_m": 0.2,
-                                            "relative_permeability": 1000.0}))
+    magnet = build_magnet(dipole(iron_ring={
+        "inner_radius_m": 0.19, "outer_radius_m": 0.2, **iron}))
     nominal = magnet.nominal_magnetization
     turn = np.array([[np.cos(0.01), -np.sin(0.01)], [np.sin(0.01), np.cos(0.01)]])
     turned = (nominal.reshape(-1, 2) @ turn.T).ravel()
