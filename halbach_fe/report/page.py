@@ -217,6 +217,15 @@ MOST_NUMBERED = 40
 """Largest number of blocks in a cross-section whose slots are numbered."""
 
 
+OUTERMOST = 0.9
+"""Distance from the axis, relative to that of the farthest block, from which blocks are numbered:
+those of an inner layer have the same slots."""
+
+SMALL_BLOCK = 0.15
+"""Distance from a block's middle to its outer side, relative to that from the axis, below which a
+number has no place in it."""
+
+
 def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
     """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
 
@@ -226,6 +235,8 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
+    reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
+    numbered = reach > 0 and len(shown) <= MOST_NUMBERED
     for block in shown:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
         outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
@@ -236,12 +247,17 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
         distance = float(np.hypot(*middle))
-        if len(shown) <= MOST_NUMBERED and distance > 0:
-            # between the arrow and the block's outer side
+        if numbered and distance > OUTERMOST * reach:
             outwards = middle / distance
             edge = float((outline @ outwards).max())
-            axis.annotate(str(block.slot), outwards * (0.25 * distance + 0.75 * edge),
-                          ha="center", va="center", fontsize=SMALL, color=colour)
+            # between the arrow and the outer side of a large block, beyond that of a small one
+            beyond = edge - distance < SMALL_BLOCK * reach
+            if beyond:
+                axis.margins(0.12)
+            axis.annotate(
+                str(block.slot), outwards * (edge if beyond else 0.25 * distance + 0.75 * edge),
+                outwards * (SMALL if beyond else 0), textcoords="offset points",
+                ha="center", va="center", fontsize=SMALL, color=colour)
     for body in magnet.iron:
         if body.outline is not None:
             axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])
