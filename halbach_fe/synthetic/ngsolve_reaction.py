@@ -163,8 +163,7 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
         _name(parts[-1], f"block{number}", flat)
     for solid in magnet.all_iron.bodies if magnet.all_iron else ():
         parts.append(_iron(solid, flat))
-        sizes.append(min(*sizes, solid.outer - solid.inner) if isinstance(solid, Tube)
-                     else min(sizes))
+        sizes.append(min(sizes))
         _name(parts[-1], "iron", flat)
     for part, size in zip(parts, sizes, strict=True):
         (part.faces if flat else part).maxh = size
