@@ -139,7 +139,8 @@ def _note_diagnosis(
     """Note the ratio of both times, and the new one."""
     note(f"diagnosis.speedup_{name}", old["processor_s"] / new["processor_s"], "ratio",
          f"processor time of the code before, commit {BEFORE}: {old['processor_s']:.3g} s; now "
-         f"{new['processor_s']:.3g} s; displaced block named: {old['named']:g}, {new['named']:g}")
+         f"{new['processor_s']:.3g} s; displaced block named: {old['named']:g}, {new['named']:g}; "
+         f"other effects named: {old['others']:g}, {new['others']:g}")
     note(f"diagnosis.seconds_{name}", new["wall_s"], "s",
          f"wall time; before {old['wall_s']:.3g} s")
 

@@ -162,7 +162,7 @@ def diagnose(document: dict[str, Any]) -> dict[str, float]:
 
 def diagnose_map(folder: Path) -> dict[str, float]:
     """Run the command on ``study.toml`` and ``map.csv`` of a folder; say whether it named the
-    displaced block alone.
+    displaced block, and how many other effects.
     """
     from halbach_fe.cli import main
 
@@ -175,7 +175,9 @@ def diagnose_map(folder: Path) -> dict[str, float]:
         raise SystemExit(code)
     found = json.loads(shown.getvalue())
     names = [each["effect"] for each in found["effects"]]
-    return {"named": float(names == ["block_displaced"]), "wall_s": time.perf_counter() - begin}
+    return {"named": float("block_displaced" in names),
+            "others": float(sum(name != "block_displaced" for name in names)),
+            "wall_s": time.perf_counter() - begin}
 
 
 def solve(study: Path) -> dict[str, float]:

@@ -106,12 +106,14 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
                 "same magnet in the same state.", again)
     if diagnosis.found_anything:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
+        if any(map(rivals, diagnosis.identified)):
+            return ("Measure what tells apart the causes that explain the map equally well: the "
+                    f"page says what. Until then {STUDY_FILE} has the first of them.", infer)
         if remedies := _remedies(diagnosis):
             changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
                        "found.")
-        return (f"{changed} What else it could be, and which measurement would tell, is below."
-                if any(map(rivals, diagnosis.identified)) else changed), infer
+        return changed, infer
     return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
 
 
@@ -258,7 +260,9 @@ def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> st
     effect = identified.hypothesis.effect
     parts = [title_of(effect.name, titles), place_in_words(identified.place),
              "; ".join(text for text in amounts(identified) if text != PRESENT)]
-    return ", ".join(part for part in parts if part)
+    others = titles_of_rivals(identified, titles)
+    return ", ".join(part for part in parts if part) + (
+        f" (or, as well: {joined_by_or(others)})" if others else "")
 
 
 def catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from halbach_fe.geometry.blocks import bore_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import iron_of
 
@@ -15,7 +16,8 @@ def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
     array, blocks = magnet.array, magnet.blocks
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
             ("radius of the bore, outer radius",
-             f"{1e3 * magnet.bore_radius:.6g} mm, {1e3 * magnet.array_outer_radius:.6g} mm"),
+             f"{1e3 * bore_radius(magnet.blocks):.6g} mm, "
+             f"{1e3 * magnet.array_outer_radius:.6g} mm"),
             ("remanence", f"{_range((abs(block.remanence) for block in blocks), 4)} T"),
             ("recoil permeability along, across the easy axis",
              f"{_range((block.recoil_permeability for block in blocks), 3)}, "
@@ -31,8 +33,8 @@ def in_one_line(magnet: Magnet) -> str:
     length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
               else ", in cross-section")
     iron = "without iron" if iron_of(magnet.study) is None else f"iron: {iron_description(magnet)}"
-    return (f"{layout(magnet)}{length}, bore {2e3 * magnet.bore_radius:.4g} mm, outer diameter "
-            f"{2e3 * magnet.array_outer_radius:.4g} mm, remanence "
+    return (f"{layout(magnet)}{length}, bore {2e3 * bore_radius(magnet.blocks):.4g} mm, "
+            f"outer diameter {2e3 * magnet.array_outer_radius:.4g} mm, remanence "
             f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")
 
 

@@ -56,6 +56,14 @@ COLOURS = (THIRD, PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("v", "^", "o", ".", "s", "x")
 
 
+def _coarsest(found: Verification) -> int:
+    """Return the number of the first refinement that changes the mesh: one that cannot be made any
+    coarser changes nothing.
+    """
+    changed = [number for number in range(STEPS) if found.differences[number].pointwise > 0]
+    return min([*changed, STEPS - 1])
+
+
 def difference_table(found: Verification) -> list[dict[str, str]]:
     """Return rows of text: the change of the field for each change of the model, and the error, in
     ppm of the largest field; none if the field is exact.
@@ -71,7 +79,7 @@ def difference_table(found: Verification) -> list[dict[str, str]]:
     several = regions if len(regions) > 1 else ()  # the only one is the whole map
     rows = [row(difference.what, difference.pointwise, difference.fourier)
             | {f"{name} in ppm": ppm(1e6 * difference.by_region[name]) for name in several}
-            for difference in found.differences]
+            for difference in found.differences[_coarsest(found):]]
     rows.append(row(f"estimated error (order {found.order:.1f})", found.error_pointwise,
                     found.error_fourier) | {f"{name} in ppm": "" for name in several})
     return rows
@@ -161,7 +169,8 @@ def error_basis(found: Verification) -> str:
                 if found.route != "moments" else "")
     text = ("The estimated error is the total change that all further refinements would make"
             f"{boundary}. It assumes that the changes by successive refinements go on to decrease "
-            f"by the same factor as these {STEPS} do, or as the last two if these decrease less "
+            f"by the same factor as these {STEPS - _coarsest(found)} do"
+            f"{', or as the last two if these decrease less' if not _coarsest(found) else ''} "
             f"(order {found.order:.1f}{limit} in the element size).")
     if len(found.differences) > STEPS + 1:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
@@ -216,8 +225,9 @@ def _convergence_figure(found: Verification) -> Figure:
     figure = figure_of(4.6)
     axis = figure.subplots()
     size = 1e3 * found.element_size_m
-    sizes = size * np.array([REFINEMENT**2, REFINEMENT, 1.0])
-    steps = 1e6 * np.array([difference.pointwise for difference in found.differences[:STEPS]])
+    sizes = (size * np.array([REFINEMENT**2, REFINEMENT, 1.0]))[_coarsest(found):]
+    steps = 1e6 * np.array([difference.pointwise
+                            for difference in found.differences[_coarsest(found):STEPS]])
     line = size * np.array([REFINEMENT**2, 1 / REFINEMENT])
     axis.plot(sizes, steps, "o", color=POSTERIOR, label="change by the next finer mesh")
     axis.plot(line, steps[-1] * (line / size)**found.order, "-", color=POSTERIOR, lw=0.8,
@@ -232,7 +242,7 @@ def _convergence_figure(found: Verification) -> Figure:
     axis.set(xscale="log", yscale="log", xlabel="element size at the magnet in mm",
              ylabel="change of B in ppm of the largest field")
     label_logarithmic(axis.yaxis)
-    axis.set_xticks(size * np.array([1 / REFINEMENT, 1, REFINEMENT, REFINEMENT**2]))
+    axis.set_xticks([*sizes, size / REFINEMENT])
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.3, which="both")
@@ -246,6 +256,8 @@ def _change_figure(found: Verification) -> Figure:
     place, label = axis_of_points(found.points)
     for difference, change, colour, marker in zip(
             found.differences, found.changes, COLOURS, MARKERS, strict=False):
+        if not change.any():
+            continue
         seen = change > 0
         axis.semilogy(place[seen], 1e6 * change[seen], marker, ms=4, color=colour,
                       label=difference.what.replace("_", " "))
