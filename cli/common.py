@@ -212,7 +212,7 @@ def _described(arguments: argparse.Namespace) -> dict[str, str]:
     if isinstance(posterior := getattr(arguments, "posterior", None), InputFile) and (
             behind := inputs_behind(posterior)):
         found["read for the posterior"] = "; ".join(
-            printable(f"{Path(path).name}, SHA-256 {value}", MAX_QUOTED)
+            printable(f"{Path(path).name}{_if_simulated(Path(path))}, SHA-256 {value}", MAX_QUOTED)
             for path, value in behind.items())
     return found
 
@@ -250,6 +250,15 @@ def digest(path: Path) -> str:
     content = path.read_bytes()
     simulated = ", simulated" if content.startswith(SIMULATED) else ""
     return f"{path.name}{simulated}, SHA-256 {hashlib.sha256(content).hexdigest()}"
+
+
+def _if_simulated(path: Path) -> str:
+    """Return a word for a simulated map that an earlier run has read, if it is still there."""
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as file:
+                return ", simulated" if file.read(len(SIMULATED)) == SIMULATED else ""
+    return ""
 
 
 def digests(files: Mapping[str, Path | None]) -> dict[str, str]:

@@ -97,7 +97,9 @@ def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
     found = []
     for one in chapters:
         found_nothing = not any(page.said.answer is None or page.said.answer.changes_study
-                                for page in one.pages)
+                                for page in one.pages) or (
+            # a pose in which the magnet does not explain the map is none to use
+            one.verb == "register" and not one.sound)
         written = [] if found_nothing or not one.record.inputs else [
             name for name in one.digests.values() if name.endswith(".toml")]
         later = [other for other in chapters if other.verb in OF_MEASURED]

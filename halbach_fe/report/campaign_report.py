@@ -214,14 +214,14 @@ class Campaign:
         """
         found = next((one for one in self.chapters if one.verb == "diagnose"
                       and DIAGNOSED in one.record.files and not chapter.has_study_of(one)), None)
-        if found is None or chapter.verb not in OF_MEASURED:
+        if found is None or chapter.verb not in (*OF_MEASURED, "register"):
             return answer
         if not found.sound:
             return next(own.with_paths({"DIR": found.folder}) for one, _, own in self.answered
                         if one is found)
         again = [one.label for one in dict.fromkeys(each for each, _, own in self.answered
                                                     if not own.sound)
-                 if one.verb in OF_MEASURED and self.replaced(one) is None
+                 if one.verb in (*OF_MEASURED, "register") and self.replaced(one) is None
                  and not one.has_study_of(found)]
         repeat = (f"Repeat {in_a_row(again)} with {found.label}/{DIAGNOSED}, which has what "
                   f"{'its' if len(again) == 1 else 'their'} study lacks.")

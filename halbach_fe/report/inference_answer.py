@@ -120,7 +120,7 @@ def _blocks(result: InferenceResult) -> str:
     start = (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
              f"rms, the most {place_of(block)}")
     if result.disagreement:  # error bars that are not to be used are not stated
-        return (f"{start}, which seems to be reversed." if mean[worst] < -1 else
+        return (f"{start}, which seems to be missing or reversed." if mean[worst] < -1 else
                 f"{start} by {100 * mean[worst]:+.2g}\u00a0%.")
     if mean[worst] < -1:
         return (f"{start}, which is reversed: magnetized the other way round, with "

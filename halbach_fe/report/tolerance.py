@@ -39,6 +39,11 @@ LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a mean is 0 in the table."""
 
 
+OF_THE_DESIGN = 0.9
+"""Largest multipole of the magnet as ordered, relative to what half of the magnets have at most,
+from which on the answer says that it is the design's."""
+
+
 def tolerance_summary(found: Tolerance | HomogeneityTolerance) -> dict[str, object]:
     """Return the content of tolerance.json."""
     if isinstance(found, HomogeneityTolerance):
@@ -103,6 +108,10 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     worst = found.model.orders[int(np.argmax(found.quantiles[1]))]
     said = (f"Half of the magnets have all unwanted multipoles below {half:.3g} units of 1e-4, "
             f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
+    ordered = float(found.known.sizes.max())
+    if ordered > OF_THE_DESIGN * half:
+        said += (f" That is the magnet as designed ({ordered:.3g} units with blocks as ordered), "
+                 "to which their tolerances add little.")
     share, prior = found.share, found.study.prior
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
@@ -169,5 +178,6 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     axis.axhline(1, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02))
     begin_at_zero(axis)
+    axis.ticklabel_format(axis="x", useOffset=False)
     axis.grid(alpha=0.3)
     return figure

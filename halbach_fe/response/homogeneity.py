@@ -414,7 +414,7 @@ class HomogeneityModel:
             float(size[0]), float(np.std(sizes)), direction,
             float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)), float(rms[0]), float(whole[0]),
             _quantiles(every_rms), _quantiles(every_whole),
-            self._harmonics(field, drawn, direction, float(size[0])))
+            self._harmonics(field, drawn, direction, float(size[0]), sizes))
 
     def slices(self, mean: Floats) -> list[Slice]:
         """Return |B| in three planes for magnetizations (parameters,) in A/m."""
@@ -436,13 +436,17 @@ class HomogeneityModel:
                 np.asarray(deviation.max(axis=0) - deviation.min(axis=0)))
 
     def _harmonics(
-        self, field: Floats, drawn: Floats, direction: Floats, size: float
+        self, field: Floats, drawn: Floats, direction: Floats, size: float, sizes: Floats
     ) -> tuple[Harmonic, ...]:
+        """Return the harmonics of a field, in ppm of its mean |B| ``size``, and how much those of
+        drawn fields vary, each in ppm of its own mean (d,): a strength of all blocks changes none.
+        """
         if self.region.shape != "sphere":
             return ()
         terms, functions = real_harmonics(self.degrees, self.surface_degree)
         mean = PPM / size * functions @ (field[:self.surface] @ direction)
-        every = PPM / size * functions @ np.einsum("ncd,c->nd", drawn[:self.surface], direction)
+        every = PPM / sizes * (functions @ np.einsum(
+            "ncd,c->nd", drawn[:self.surface], direction))
         return tuple(Harmonic(*term, float(value), float(sd)) for term, value, sd in zip(
             terms, mean, np.std(every, axis=1), strict=True))
 

@@ -176,6 +176,14 @@ def test_harmonics_are_the_derivatives_at_the_centre(generator, tmp_path):
     for name, value in expected.items():
         # differences over 0.5 mm have an error of (0.5/20)^2
         assert by_name[name] == pytest.approx(scale * value, abs=1e-3 * largest)
+    # a common strength of all blocks changes no harmonic; the control: one of every point
+    nominal = found.model.field(np.array([found.magnet.nominal_magnetization]).T)
+    stronger = 1 + 0.01 * generator.standard_normal(50)
+    alike = found.model.of_fields(nominal[..., 0], nominal * stronger)
+    apart = found.model.of_fields(nominal[..., 0], nominal * (
+        1 + 0.01 * generator.standard_normal((len(nominal), 1, 50))))
+    assert max(each.sd_ppm for each in alike.harmonics) < 1e-6 * largest
+    assert max(each.sd_ppm for each in apart.harmonics) > 1e-4 * largest
 
 
 def test_mean_squares_of_harmonics():
