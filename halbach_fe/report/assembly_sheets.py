@@ -248,7 +248,7 @@ def _arrow(
     flat = float(np.linalg.norm(direction))
     if flat < FLAT:
         return None
-    along = 0.34 * width * direction / flat
+    along = 0.33 * width * direction / flat
     start, end = middle - along, middle + along
     return float(start[0]), -float(start[1]), float(end[0]), -float(end[1])
 
