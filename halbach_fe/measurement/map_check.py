@@ -110,6 +110,10 @@ ENOUGH = 0.2
 """Smallest share of readings beyond those that determine the field. With fewer, a field obeys any
 map."""
 
+LEAST_LEFT = 0.05
+"""Smallest share of a reading's noise variance that its residual counts to have: where the field
+takes nearly all of it along, what is left tells of the field."""
+
 VIOLATED = 0.02
 """A map whose floor is above this share of the largest field does not obey Maxwell's equations."""
 
@@ -438,8 +442,9 @@ def check_map(
     residual = turned - model.readings(whole)
     beyond = _rms(floor * model.weights[held_out]) / _rms(residual[chosen] * model.weights[chosen])
     redundancy = 1 - whole.used / (3 * int(chosen.sum()))
-    # a fit takes its part of the noise along
-    left = residual[chosen] / np.sqrt(max(redundancy, ENOUGH))
+    # a fit takes its part of the noise along, the most at the edges of a map
+    left = residual[chosen] / np.sqrt(np.maximum(
+        model.noise_left(whole, chosen, fit.sigma**2 / fit.penalty), LEAST_LEFT))
     noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes), left)
     (as_given,) = fit_fields(charges, places, [readings])
     given = readings - charges.fields(places) @ as_given.amplitudes

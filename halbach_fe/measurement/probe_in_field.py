@@ -27,6 +27,9 @@ ROUNDING = 1e-13
 """Added to the information of the amplitudes, relative to its mean, so that maps without noise have
 positive definite matrices too."""
 
+AT_ONCE = 4096
+"""Number of readings whose remaining noise is computed at a time, which limits the memory."""
+
 HALVINGS = 8
 """Number of times that a step is halved until it improves the fit."""
 
@@ -219,6 +222,27 @@ class ProbeModel:
             places, reads = self._sensor(at, some, sensor)
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
+
+    def noise_left(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> Floats:
+        """Return the variance (n, 3) of residuals that noise makes, relative to its own.
+
+        The rest the field takes along, the most at the edges of a map. With the matrix H that makes
+        fitted values of readings, for the prior variance ``width2`` of the amplitudes in T^2, it is
+        the diagonal of (1 - H) (1 - H)^T. The few numbers of the instrument are left out.
+        """
+        by_amplitude = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
+        information = by_amplitude.T @ by_amplitude
+        with_prior = information.copy()
+        with_prior[np.diag_indices(len(with_prior))] += (
+            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
+        factor = linalg.cho_factor(with_prior)
+        left = np.empty(len(by_amplitude))
+        for first in range(0, len(left), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            solved = linalg.cho_solve(factor, by_amplitude[part].T)
+            left[part] = 1 - 2 * np.sum(by_amplitude[part].T * solved, axis=0) + np.sum(
+                solved * (information @ solved), axis=0)
+        return left.reshape(-1, 3)
 
     def expected(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.

@@ -166,8 +166,9 @@ def answer(found: SortedBlocks) -> Answer:
     if not _chose(found):
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
-            f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, and here "
-            "every slot has its own.", "If blocks of some slots are alike, say so in the study "
+            f"{text(best)} {unit}.", "Yes: blocks go only into slots of their own type, as they "
+            "lie, and here every slot has its own. (halbach-fe shim also turns blocks upside "
+            "down.)", "If blocks of some slots are alike, say so in the study "
             f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
             "again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
