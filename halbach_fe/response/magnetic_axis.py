@@ -180,7 +180,9 @@ def _fields(
         updated = Magnet(magnet.study, with_magnetizations(magnet, uniform))
         nominal = solve_nominal(magnet, points, own.within("nominal"))
         field = solve_nominal(updated, points, own.within("updated"))
-        return field, nominal, Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
+        columns = Deviations.of(magnet).columns(points).reshape(len(points), 3, -1)
+        inside = columns[..., len(uniform):] @ mean[len(uniform):]  # variations inside blocks
+        return field + inside, nominal, columns
     response = response_matrix(magnet, flux_density_at(points), own)
     columns, external = (values.reshape(len(points), 3, *values.shape[1:])
                          for values in (response.whole, response.offset))

@@ -604,9 +604,8 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     """Return a row of text per order, with ``b_n ± sd`` and ``a_n ± sd`` in units.
 
     The columns are multipoles of the same orders, each by a name for the heading, which may be
-    empty if there is one. The main
-    multipole, 10 000 units by definition, is no error: its cell has a word. What is exact has no
-    standard deviation.
+    empty if there is one column. The main multipole, 10 000 units by definition, is no error: its
+    cell has a word. What is exact has no standard deviation.
     """
     def text(known: Multipoles, number: int) -> str:
         if known.mean[number] > MAIN_UNITS:
