@@ -243,13 +243,16 @@ def _upright(
 def _arrow(
     one: AssembledBlock, middle: Floats, width: float
 ) -> tuple[float, float, float, float] | None:
-    """Return start and end of the arrow of a magnetization, None if it is along z."""
+    """Return start and end of the line of a magnetization's arrow, None if it is along z.
+
+    The point of the arrow is beyond the line's end, so that the whole is about the block's middle.
+    """
     direction = one.direction[:2]
     flat = float(np.linalg.norm(direction))
     if flat < FLAT:
         return None
     along = 0.33 * width * direction / flat
-    start, end = middle - along, middle + along
+    start, end = middle - along, middle + 2 / 3 * along
     return float(start[0]), -float(start[1]), float(end[0]), -float(end[1])
 
 

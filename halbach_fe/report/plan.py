@@ -159,8 +159,9 @@ def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
             "of the study"),
         "plan_blocks.png": (
             _block_sd_figure(magnet, plan), "Standard deviation of a block's magnetization in per "
-            "cent of the prior's, by slot" + ("" if _only_orders(plan) else ", for the plan and for "
-                                              "equally many positions of the study")),
+            "cent of the prior's, by slot" + (
+                "" if _only_orders(plan) else ", for the plan and for equally many positions of "
+                "the study")),
     }, folder)
     write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
                summary=summary, answer=answer(plan), rows=plan_table(plan),
