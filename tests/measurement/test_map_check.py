@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement import map_check
+from halbach_fe.measurement import map_check, probe_in_field
 from halbach_fe.measurement.field_map import (
     field_map,
     points_of,
@@ -76,6 +76,30 @@ def test_charges_make_any_field_in_free_space(generator):
     curl = field + 1e-3 * np.column_stack([-GRID[:, 1], GRID[:, 0], 0 * GRID[:, 0]]) / STEP_M
     (wrong,) = fit_fields(Charges.around(GRID, 2.5 * STEP_M), GRID, [curl])
     assert wrong.sigma > 10 * NOISE_T
+
+
+def test_noise_that_a_fit_leaves(generator, monkeypatch):
+    """Beside the whole matrix, and beside drawn noise; the control is the same share everywhere."""
+    monkeypatch.setattr(probe_in_field, "AT_ONCE", 100)
+    points = GRID[::3]
+    field = read_by(generator)[::3]
+    charges = Charges.around(points, 2.5 * STEP_M)
+    (fit,) = fit_fields(charges, points, [field])
+    model = ProbeModel(charges, points, field, np.linspace(-1, 1, len(points)), 0 * points)
+    at, rows = model.start(fit), np.ones(len(points), bool)
+    width2 = fit.sigma**2 / fit.penalty
+    left = model.noise_left(at, rows, width2)
+    by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(charges))
+    information = by_amplitude.T @ by_amplitude
+    prior = at.sigma**2 / width2 + probe_in_field.ROUNDING * np.trace(information) / len(charges)
+    fitted = by_amplitude @ np.linalg.solve(
+        information + prior * np.eye(len(charges)), by_amplitude.T)
+    rest = np.eye(len(fitted)) - fitted
+    np.testing.assert_allclose(left.ravel(), np.sum(rest**2, axis=1), rtol=1e-5, atol=1e-6)
+    drawn = np.mean((rest @ generator.standard_normal((len(rest), 4000)))**2, axis=1)
+    # of 4000 draws a variance is known to 2.2 %
+    assert np.abs(drawn / left.ravel() - 1).max() < 0.12
+    assert np.abs(drawn / left.mean() - 1).max() > 0.12
 
 
 def test_gradient_of_charges(generator):
