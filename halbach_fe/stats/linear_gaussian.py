@@ -138,7 +138,7 @@ def update(
         Rows of ``matrix`` that belong to the n readings. Default: all rows, in their order.
     """
     def response_and_residual(indices: Ints) -> Floats:
-        response = matrix[indices if rows is None else rows[indices]]
+        response = _selected(matrix, indices if rows is None else rows[indices])
         return np.column_stack([response, readings[indices] - response @ prior.mean])
 
     columns = len(prior.mean) + 1
@@ -196,8 +196,18 @@ def whitened_row_blocks(
         weights = noise.whitening[block]
         needed, place = np.unique(weights.indices, return_inverse=True)
         shape = weights.shape[0], len(needed)
-        yield np.asarray(sparse.csr_array((weights.data, place, weights.indptr), shape=shape)
-                         @ rows(needed))
+        if shape[0] == shape[1] == weights.nnz and (np.diff(place) == 1).all():
+            yield rows(needed) * weights.data[:, None]  # independent noise
+        else:
+            yield np.asarray(sparse.csr_array((weights.data, place, weights.indptr), shape=shape)
+                             @ rows(needed))
+
+
+def _selected(matrix: Rows, indices: Ints) -> Floats:
+    """Return the rows of a matrix with given indices, without a copy of consecutive ones."""
+    if isinstance(matrix, np.ndarray) and (np.diff(indices) == 1).all():
+        return matrix[indices[0]:indices[-1] + 1]
+    return matrix[indices]
 
 
 def row_slices(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
@@ -242,7 +252,8 @@ def _information_by_product(
     product = np.zeros((columns, columns))
     for block in blocks:
         product += block.T @ block
-    squares, directions = linalg.eigh((product[:-1, :-1] @ root).T @ root)
+    # by numpy as the products are: scipy's threads would compete with those that just multiplied
+    squares, directions = np.linalg.eigh((product[:-1, :-1] @ root).T @ root)
     squares, projected = np.maximum(squares, 0), directions.T @ (product[-1, :-1] @ root)
     return Information(directions, np.sqrt(squares), projected,
                        float(product[-1, -1] - np.sum(projected**2 / (1 + squares))))
