@@ -268,7 +268,6 @@ class PoseFit:
         state = self._state(pose, values, columns)
         self._check_effects(state)
         for blurred in self._blur(state):
-            # noise of positions grows with the gradient: a fit would look for one, so it is held
             sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
             at_rest, renewed = False, False
 
@@ -278,7 +277,10 @@ class PoseFit:
                     NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
 
             for _ in range(ITERATIONS):
-                state = state.with_noise(sigma)
+                # noise of positions grows with the gradient, and a fit would look for one: so it
+                # is held, on a line always, and elsewhere while a step is tried
+                held = state.sigma if sigma is None else sigma
+                state = state.with_noise(held)
                 step, sd, chi2 = state.step(rows, self.scaled(pose, values, start), self._damping)
                 if float(np.abs(step / sd).max()) < AT_REST:
                     at_rest = True
@@ -290,9 +292,9 @@ class PoseFit:
                     other, changed = moved_by(pose, share * step[:6]), values + share * step[6:]
                     if self.is_possible(changed, other):
                         moved = self._middle(other, changed) - columns.places
-                        near = columns if np.abs(moved).max() < reach(state) else (
-                            self._columns(other, changed))
-                        tried = self._state(other, changed, near).with_noise(sigma)
+                        near = columns if not renewed and np.abs(moved).max() < reach(state) else (
+                            self._columns(other, changed))  # whose own gradient may decide, too
+                        tried = self._state(other, changed, near).with_noise(held)
                         now = tried.chi2(rows, self.scaled(other, changed, start))
                         if now <= chi2:
                             break

@@ -88,14 +88,21 @@ def _of_study(plan: MeasurementPlan) -> float:
 def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
     points, same = len(plan.points), plan.same_information
-    said = f"At the {counted(points, 'position')} of plan.csv. "
+    everything = points == len(plan.candidates)
+    said = (f"At the {counted(points, 'position')} of plan.csv"
+            + (", in their order: these are all the candidates"
+               f"{', the positions of the study' if _is_the_study(plan) else ''}, and the plan "
+               "only orders them. " if everything else ". "))
     if plan.deviation is None:
         left, of_study = _patterns(plan)
         beside = "" if _is_the_study(plan) else (
             f"; with as many of the study's own positions to {fraction(of_study)}"
             f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
-        said += ("With them the standard deviation of a pattern of blocks, in the geometric mean "
-                 f"over all patterns, falls to {fraction(left)} of the prior's{beside}. ")
+        blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
+        said += (f"After them a block's magnetization is uncertain by {fraction(blocks)} of what "
+                 "it is before (rms over the blocks). What blocks that deviate together do to the "
+                 "field is known better: the uncertainty of such a pattern, by which the positions "
+                 f"are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
         if left > VAGUE:
             said += ("So such a map tells little of the single blocks, at whatever positions of "
                      "these it is measured. Measure the blocks before assembly, or the field "
@@ -105,15 +112,12 @@ def answer(plan: MeasurementPlan) -> Answer:
                  f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms"
                  + ("" if _is_the_study(plan) else ", after as many of the study's positions to "
                     f"{ppm(_of_study(plan))}") + f", and before to {ppm(plan.deviation.prior)}. ")
-    everything = points == len(plan.candidates)
     if everything:
         nearly = _nearly(plan)
-        said += ("These are all the candidates"
-                 f"{', the positions of the study' if _is_the_study(plan) else ''}: the plan only "
-                 "orders them.")
         if 1 < nearly < points:  # a single one that suffices only shows that none tells much
-            said += (f" With the first {nearly}, {_what_is_left(plan)} is at most "
-                     f"{NEARLY:g} times that with all of them.")
+            said += (f"The first {nearly} nearly suffice: the uncertainty "
+                     f"{'of a pattern ' if plan.deviation is None else ''}that they leave is at "
+                     f"most {NEARLY:g} times that of all.")
     else:
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else
@@ -196,12 +200,6 @@ def _of_all(plan: MeasurementPlan) -> str:
     if plan.deviation is not None:
         return f": they leave {ppm(plan.deviation.baseline[-1])} ppm rms"
     return f": they leave {fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))}"
-
-
-def _what_is_left(plan: MeasurementPlan) -> str:
-    """Return in words by what `_nearly` counts positions."""
-    return ("the standard deviation of a pattern of blocks (geometric mean over all patterns)"
-            if plan.deviation is None else "the standard deviation of this deviation")
 
 
 def _patterns(plan: MeasurementPlan) -> Floats:

@@ -213,7 +213,8 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             said = (f"No block: with {moves} {said} That is {100 * _gained(shim):.2g} %, hardly "
                     "worth the work.")
         else:
-            said = f"With {moves} of blocks {said}{_first_moves(shim)}{_remainder(shim)}"
+            said = (f"With {moves} of blocks {said}{_first_moves(shim)}{_together(shim)}"
+                    f"{_remainder(shim)}")
     else:
         said = (f"No move is worthwhile{_of_possible(shim)}. Leave it as it is: {what} {before} "
                 f"{unit}, including the uncertainty{_unknown_part(shim)}.")
@@ -262,6 +263,20 @@ def _first_moves(shim: Shim) -> str:
     return (f" The first {'one makes' if first == 1 else f'{first} make'} "
             f"{100 * part[first]:.0f}\u00a0% of that gain: stop after "
             f"{'it' if first == 1 else 'them'} if a move costs more than the rest is worth.")
+
+
+def _together(shim: Shim) -> str:
+    """Name the moves that gain only together, as the first of them alone would be a loss."""
+    sizes = np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
+    said, last = "", 0
+    for first in np.flatnonzero(np.diff(sizes) > 0):
+        less = sizes[first + 1:] < sizes[first]
+        if first < last or not less.any():
+            continue
+        last = int(first) + 1 + int(np.argmax(less))
+        moves = in_a_row([str(number) for number in range(first + 1, last + 1)])
+        said += f" Moves {moves} gain only together: make all of them, or none."
+    return said
 
 
 def _remainder(shim: Shim) -> str:

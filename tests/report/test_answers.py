@@ -543,7 +543,7 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
 def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     everything = hf.plan(given.magnet, given.session)
     said = plan.answer(everything)
-    few = int(said.said.split("the first ")[1].split(",")[0])
+    few = int(said.said.split("The first ")[1].split(" ")[0])
     assert 0 < few < len(everything.points)
     left = np.exp(-everything.gain / len(everything.parameters))
     assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
@@ -682,6 +682,10 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
     assert (" The first 2 make 96\u00a0% of that gain: stop after them if a move costs more than "
             "the rest is worth. What remains is mostly b_9, ") in said
     assert "The first" not in shimming.answer(of_sizes(0.8, 0.5), given.updated).said  # control
+    assert "together" not in said
+    paired = shimming.answer(of_sizes(0.5, 0.52, 0.53, 0.45, 0.46, 0.3), given.updated).said
+    assert "Moves 2, 3 and 4 gain only together" in paired
+    assert "Moves 5 and 6 gain only together" in paired
     still = replace(found, steps=(), within=None)
     vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],
                                           root=found.before.root))
@@ -700,14 +704,14 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
 def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     """And says that a map which tells little of the blocks does so."""
     every = plan.answer(hf.plan(given.magnet, given.session)).said
-    assert "the positions of the study: the plan only orders them" in every
+    assert "the positions of the study, and the plan only orders them" in every
     assert "as many of the study's own positions" not in every
-    assert "With the first 1," not in every
+    assert "The first 1 " not in every
     assert "tells little of the single blocks" not in every  # the control
     noisy = build_magnet(given.study.with_(noise={"regions": [{"name": "all", "sigma_T": 1.0}]}))
     vague = plan.answer(hf.plan(noisy, given.session)).said
     assert "tells little of the single blocks" in vague
-    assert "With the first 1," not in vague
+    assert "The first 1 " not in vague
 
 
 def test_an_update_without_circles_states_its_strongest_reading(given):
